@@ -1,12 +1,13 @@
-"""Compute the force over depth of a pushed cylinder with the finite elements of felupe.
+"""Compute the force over depth of a pushed cylinder with the finite-element library felupe.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.force_reference [SCENE_FILE] [--output FILE]
 
 The stored result is the independent reference of `flexsheet experiment compliance`. It uses the
 material law of the scene's object and a rigid, frictionless sphere, but no code of flexsheet's soft
-body: felupe's 27-node hexahedra on a mesh of `benchmarks.hexahedra`, its assembly and material, and
-the solver Pardiso. `combine_runs` describes how the meshes give the force and its uncertainty. All
-lengths are in finger radii, forces in Young's modulus times the square of the finger radius.
+body. Elements (27-node hexahedra), assembly and material come from felupe, the mesh from
+`benchmarks.hexahedra`, and the linear solver is Pardiso. `combine_runs` describes how the meshes
+give the force and its uncertainty. All lengths are in finger radii, forces in Young's modulus times
+the square of the finger radius.
 
 felupe (GPL) and pypardiso are tools for development, not dependencies: `pip install felupe
 pypardiso`. A run takes 10 to 40 minutes of one core. Solved curves in FILE are kept, so that an
@@ -37,8 +38,8 @@ Floats = NDArray[np.float64]
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 PENALTY, STIFFER = 1000.0, 4000.0
-"""Stiffness of the contact (pressure per penetration), in Young's modulus per finger radius; the
-second value, to estimate the effect of the first."""
+"""Stiffness of the contact (pressure per penetration), in Young's modulus per finger radius. The
+second value serves to estimate the error that the first one causes."""
 DEPTHS = tuple(depth / 7.0 for depth in (0.5, 1.0, 2.0, 3.5, 6.0, 10.0, 13.0, 16.0))
 SCALES = (3.0, 2.0, 1.4)
 """Scales of the meshes, the coarsest first."""
@@ -55,14 +56,15 @@ CURVE_KEYS = (
 POINTS_PER_EDGE = 6
 TOLERANCE, MAX_ITERATIONS = 1e-4, 25
 MAX_STEP, MIN_FRACTION = 0.3, 1.0 / 16.0
-"""Largest load step, in finger radii, and smallest fraction of the way to a depth."""
+"""Maximum load step, in finger radii, and minimum load step as a fraction of a depth increment."""
 
 
 @dataclass(frozen=True, slots=True)
 class Push:
     """Inputs of one force curve; lengths in finger radii.
 
-    along, angle_rad: pushed position. scale: factor of all element sizes. penalty: see `PENALTY`.
+    along, angle_rad: pushed position along and around the axis. scale: factor of all element sizes.
+    penalty: stiffness of the contact, see `PENALTY`.
     """
 
     radius: float
@@ -233,7 +235,7 @@ class FelupeBody:
             yield self.mesh.copies * float(pressed.sum(axis=0) @ self._normal)
 
     def _predict(self, moved: Floats, at: float, target: float) -> Floats:
-        """Return `moved`, continued to first order, where that lowers the energy."""
+        """Return `moved`, extrapolated linearly to a depth if this lowers the energy."""
         if at == 0.0:
             return moved
         here, there = self.centre(at), self.centre(at + 1e-4)
@@ -252,7 +254,7 @@ def _quadratic_slope(t: Floats) -> Floats:
 
 
 def reference_pushes(scene: Scene) -> list[Push]:
-    """Return the pushes of the reference of a scene with a cylinder."""
+    """Return the pushes whose force curves the reference of a scene with a cylinder needs."""
     geometry, support = scene.object.geometry, scene.object.support
     if not (isinstance(geometry, Cylinder) and isinstance(support, StripSupport)):
         raise SystemExit("the force reference needs a cylinder on a strip; choose another scene")
@@ -278,7 +280,7 @@ def reference_pushes(scene: Scene) -> list[Push]:
 
 
 def solve_runs(pushes: Sequence[Push], output: Path) -> None:
-    """Solve the pushes whose complete force curves the file lacks; store each solved depth."""
+    """Solve the pushes whose force curves are not complete in the file; store each depth."""
     runs = json.loads(output.read_text())["runs"] if output.exists() else []
     for push in pushes:
         inputs = asdict(push)
@@ -306,7 +308,7 @@ def solve_runs(pushes: Sequence[Push], output: Path) -> None:
 
 
 def write_result(runs: list[dict[str, Any]], output: Path) -> None:
-    """Write the runs and the curves that follow from them."""
+    """Write the runs and the force curves that are computed from them."""
     result = {
         "command": "python -m benchmarks.force_reference",
         "method": "NeoHookeCompressible, 27-node hexahedra, penalty contact of a rigid sphere",
@@ -322,12 +324,13 @@ def combine_runs(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return a force curve for each position that was solved.
 
     At the first position, the force is extrapolated from the two finest meshes with the order
-    `ORDER` of convergence; the uncertainty is the difference from the finest one. Deeper than the
-    finest mesh was solved, the ratio to the second one at the last common depth is used; the
-    uncertainty is the whole correction. At the other positions, the force on a coarser mesh is
-    multiplied by the ratio of extrapolated to coarse force at the first position, since the
-    elements at the finger are the same; a quarter of the correction is added to the uncertainty.
-    The effect of a stiffer contact, where it was computed, is added too (all as squares).
+    `ORDER` of convergence. Its uncertainty is the difference from the force of the finest mesh.
+    At depths that were not solved on the finest mesh, the force of the second mesh is multiplied
+    by the correction at the last common depth; the uncertainty is the whole correction. At other
+    positions, the force on a coarser mesh is multiplied by the ratio of the extrapolated force to
+    the force on that mesh at the first position, since the elements at the finger are the same. A
+    quarter of the correction is added to the uncertainty, and so is the effect of a stiffer
+    contact where it was computed (all as squares).
     """
 
     def find(place: dict[str, Any], scale: float, penalty: float = PENALTY) -> Floats:

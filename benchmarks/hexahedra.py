@@ -1,6 +1,6 @@
 """Mesh a half, quarter or whole cylinder with 27-node hexahedra that are fine near one push.
 
-The meshes serve the independent force reference and share no code with the package's own meshes.
+The independent force reference uses the meshes; they share no code with the package's own meshes.
 The frame has x along the axis and z away from the support.
 """
 
@@ -18,12 +18,12 @@ Ints = NDArray[np.int64]
 TOP_RAD = 1.7
 """Half angle of the arc, centred on +z, that is one of the four sides of a meshed cross-section."""
 SIZE, NEAR = 0.17, 0.36
-"""Element size within the distance `NEAR` of the push, in finger radii, at a scale of 1."""
+"""Element size near the push, and distance from it with this size, in finger radii at scale 1."""
 GROWTH, MAX_SIZE_RATIO = 0.35, 0.3
-"""Increase of the element size per distance from the push, and its maximum as a fraction of the
-radius of the cylinder, at a scale of 1."""
+"""Increase of the element size per distance from the push, and maximum element size as a fraction
+of the radius of the cylinder, at a scale of 1."""
 DEPTH_RATIO = 1.3
-"""Element size along the depth over that along the skin."""
+"""Ratio of the element size along the depth to that along the skin."""
 OFFSETS = np.array(
     [(x, y, z) for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     + [(x, y, z) for z in (-1, 1) for x, y in ((0, -1), (1, 0), (0, 1), (-1, 0))]
@@ -50,9 +50,10 @@ class HexMesh:
 
 
 def grade(ends: tuple[float, float], focus: float, size: float, scale: float, cap: float) -> Floats:
-    """Return stations whose distances grow with the distance from the focus.
+    """Return coordinates whose spacing grows with the distance from the focus.
 
-    size: distance near the focus. cap: largest distance. A station is at the focus.
+    size: spacing near the focus. cap: maximum spacing. One coordinate is the focus if it is
+    not near an end.
     """
     inner = [focus] if ends[0] + 0.5 * size < focus < ends[1] - 0.5 * size else []
     stations = [np.array([ends[0]])]

@@ -1,16 +1,16 @@
-"""Measure errors, latency and safety of the whole system against load, and draw them.
+"""Measure how errors, latency and safety of the whole system depend on load, and draw charts.
 
 python -m benchmarks.load --output FOLDER [--factor NAME ...] [--seconds 20] [--quick] [--json]
 
-Each factor varies alone, from the demo's values: processes that compute, camera rate, speed of the
-finger, stiffness of the object, stretch of the sheet, and delay, jitter and loss on the cables of
-the arms. Network factors need root: three computers are simulated by network namespaces, without
-soft body and image (`tests/lab.py`). The other factors run `launch/demo.yaml` with the linear soft
-body. A level that has a result in the folder is not measured again, so an interrupted measurement
-continues.
+Each factor is varied alone; the others keep the demo's values. Factors are: busy processes, camera
+rate, speed of the finger, stiffness of the object, stretch of the sheet, and delay, jitter and loss
+on the cables of the arms. Network factors need root: three computers are simulated by network
+namespaces, without soft body and image (`tests/lab.py`). The other factors run `launch/demo.yaml`
+with the linear soft body. A level that has a result in the folder is not measured again, so an
+interrupted measurement continues.
 
-Each row has a state, the worst that occurred: within_tolerance, out_of_tolerance, holds (an arm
-held its position), stops (an arm stopped), failed (no result). `violations` lists limits that were
+Each row has the worst state that occurred: within_tolerance, out_of_tolerance, holds (an arm held
+its position), stops (an arm stopped), failed (no result). `violations` lists limits that were
 exceeded: the joints' speed and range, and the length of the sheet. The exit code is 1 if there is a
 violation or a failed level.
 """
@@ -61,7 +61,7 @@ from tests.lab_bags import Arm, Span, bags, measure_hold, read_arm, wanted
 SCENE_FILE = DEMO_FILE.parent / "scenes" / "cylinder.yaml"
 SETTINGS = ("fem_solver.method=linear",)
 MAX_EXCESS_RATIO = 0.07
-"""Length of the sheet, over its maximum stretch, above which a limit is violated."""
+"""Excess of the sheet's length over its maximum, above which the limit counts as violated."""
 
 ARMS = ("left", "right")
 RECOVERY_S = 60.0
@@ -90,8 +90,8 @@ MARKERS = {State.WITHIN: "o", State.OUT: "s", State.HOLDS: "^", State.STOPS: "X"
 class Factor:
     """Quantity that is varied.
 
-    key: path of the value in the scene file; None: it is not in the scene. on_cables: whether it is
-    a property of the arms' cables.
+    levels: values, in `unit`. key: path of the value in the scene file; None: it is not in the
+    scene. on_cables: whether it is a property of the arms' network cables.
     """
 
     unit: str
@@ -117,7 +117,7 @@ JITTER_DELAY_S = 0.02
 
 
 def make_cable(factor: str, level: float) -> dict[str, float]:
-    """Return the properties of the arms' cables at a level of a network factor."""
+    """Return the simulated properties of the arms' cables for a value of a network factor."""
     match factor:
         case "delay":
             return {"delay_s": 1e-3 * level}
@@ -128,7 +128,7 @@ def make_cable(factor: str, level: float) -> dict[str, float]:
 
 
 def write_scene(name: str, level: float, target: Path) -> Path:
-    """Write the demo's scene with a factor's level; the stretch is then fixed at its level."""
+    """Write the demo's scene with a value of a factor; for the stretch, it is held constant."""
     yaml = YAML()
     values = yaml.load(SCENE_FILE.read_text())
     key = FACTORS[name].key
@@ -145,7 +145,7 @@ def write_scene(name: str, level: float, target: Path) -> Path:
 
 
 def run_level(name: str, level: float, seconds: float, folder: Path) -> dict[str, Any]:
-    """Run the demo at a level of a factor without cables, and evaluate it."""
+    """Run the demo with a value of a factor that is not on the network, and evaluate it."""
     scene_file = write_scene(name, level, folder / "scene.yaml")
     launch_file = write_launch_file(DEMO_FILE, scene_file, folder / "launch.yaml")
     bag = folder / "main.mcap"
@@ -175,7 +175,7 @@ def run_level(name: str, level: float, seconds: float, folder: Path) -> dict[str
 
 
 async def run_network_level(name: str, level: float, seconds: float) -> dict[str, Any]:
-    """Run the three computers with bad cables of the arms, and evaluate the time of the fault."""
+    """Run three simulated computers with disturbed arm cables; evaluate the disturbed time."""
     async with Lab() as lab:
         await lab.start_all()
         lab.stroke()
@@ -214,7 +214,7 @@ def evaluate_arms(
 ) -> dict[str, Any]:
     """Compute the sheet's error to its target, the arms' modes and violated limits in a time span.
 
-    host: host whose bags contain the states of both arms; None: each arm's own.
+    host: host whose bags contain the states of both arms; None: the host of each arm.
     """
     left, right = arms
     hold = measure_hold((left, right), wanted(folder), span)
@@ -255,7 +255,7 @@ def read_value(row: Mapping[str, Any], key: str) -> float | None:
 
 
 def find_state(row: Mapping[str, Any], scene: Scene) -> State:
-    """Return the state of a level, from the arms' modes and from errors over tolerances."""
+    """Return the state of a level, from the arms' modes and the ratios of errors to tolerances."""
     if "error" in row:
         return State.FAILED
     if row["modes"].keys() - {"follow", "hold"}:
@@ -267,7 +267,7 @@ def find_state(row: Mapping[str, Any], scene: Scene) -> State:
 
 
 def list_ratios(row: Mapping[str, Any], scene: Scene) -> dict[str, float]:
-    """Return each measured value over its tolerance, by the label of the value."""
+    """Return the ratio of each measured value to its tolerance, by the label of the value."""
     found = {
         label: (read_value(row, key), limit(scene)) for key, (label, limit) in MEASURED.items()
     }
@@ -321,7 +321,7 @@ def run_one(name: str, level: float, seconds: float) -> dict[str, Any]:
 
 
 def draw_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw each factor's errors and latency over their tolerances; markers show the states."""
+    """Draw the ratios of errors and latency to their tolerances; markers show the states."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 

@@ -50,7 +50,7 @@ connected again."""
 
 STANDS_RAD = 1e-3
 STOPPED_NS = 200_000_000
-"""Time in which joints follow a command with their lag."""
+"""Time that joints need to reach a command, because servos lag."""
 
 MAX_MORE_DESCRIPTORS = 10
 MAX_MORE_BYTES = 20 << 20

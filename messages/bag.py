@@ -425,7 +425,7 @@ class BagReader:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Return the names of the recorded topics, mapped to those of their types."""
+        """Return the names of the recorded topics, mapped to the names of their types."""
         return {channel.topic: _find_type_name(channel) for channel in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:

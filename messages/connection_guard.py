@@ -136,7 +136,7 @@ class ConnectionGuard:
                 self._accept(int(news["value"]), int(endpoint.rpartition(":")[2]), publisher)
 
     def _accept(self, fd: int, port: int, publisher: _Publisher) -> None:
-        """Monitor a connection, or close it if its address has too many or sent too much."""
+        """Monitor a connection; close it if its address is excluded or has too many connections."""
         with suppress(OSError), socket.socket(fileno=os.dup(fd)) as opened:
             local, remote = _ends(opened)
             if not remote or local[1] != port:

@@ -21,7 +21,7 @@ MAX_TRIAL_S, MIN_REPEATS = 3.0, 3
 """Time after which a trial is not repeated further, and minimum number of repetitions."""
 
 NORMAL_95 = 1.96
-"""Half-width of the 95 % confidence interval of a normal distribution, in standard deviations."""
+"""Half-width of the central 95 % interval of a normal distribution, in standard deviations."""
 
 Progress = Callable[[int, int], None]
 Case = dict[str, float | int | str]
@@ -50,7 +50,7 @@ def estimate_rms(errors: NDArray[np.float64]) -> Interval:
 
 
 def estimate_median(values: Sequence[float]) -> Interval:
-    """Estimate the median of values by order statistics; of fewer than six values, by their range.
+    """Estimate the median; the limits are order statistics (the range for fewer than 6 values).
 
     Source: Conover, Practical Nonparametric Statistics, 1999, section 3.2.
     """
@@ -131,7 +131,7 @@ class Point:
     error_range: tuple[float, float] | None = None
 
     def costs(self) -> tuple[Interval, Interval]:
-        """Return the median time and the error with their intervals."""
+        """Return the median time and the error, with their confidence intervals."""
         return (
             Interval(self.median_s, *(self.median_range_s or (self.median_s, self.median_s))),
             Interval(self.error, *(self.error_range or (self.error, self.error))),
@@ -190,9 +190,9 @@ def pareto_front(points: Sequence[Point]) -> list[str]:
 
 
 def dominates(one: Sequence[Interval], other: Sequence[Interval]) -> bool:
-    """Return whether one of the costs of `one` is lower than that of `other` and none is higher.
+    """Return whether `one` has at least one lower cost than `other`, and no higher cost.
 
-    Costs with overlapping intervals count as equal.
+    Costs with overlapping confidence intervals count as equal.
     """
     pairs = list(zip(one, other, strict=True))
     better = any(mine.high < theirs.low for mine, theirs in pairs)

@@ -359,7 +359,7 @@ def test_the_report_names_residuals_limits_and_advice(tmp_path: Path) -> None:
     [
         (lambda folder: open_lab(folder, "seed:4").write(), "belongs to seed:4, .* gives seed:3"),
         (lambda folder: (folder / "notes.txt").write_text("x"), "not empty and has no commission"),
-        (lambda folder: (folder / "commission.json").write_text("{]"), "not the state of a"),
+        (lambda folder: (folder / "commission.json").write_text("{]"), "not a valid state of a"),
     ],
 )
 def test_a_folder_of_something_else_is_refused(tmp_path: Path, prepare: Any, words: str) -> None:
@@ -462,8 +462,8 @@ def test_real_devices_stop_at_the_first_step_without_data(tmp_path: Path) -> Non
     ("arguments", "words"),
     [
         (("--step", "lens"), "--step lens: expected one of camera, arms"),
-        (("--skip", "camera="), "expected STEP=TEXT with a text"),
-        (("--data", "camera"), "expected STEP=TEXT with a text"),
+        (("--skip", "camera="), "expected STEP=TEXT with a non-empty text"),
+        (("--data", "camera"), "expected STEP=TEXT with a non-empty text"),
         (("--data", "camera=nowhere"), "--data camera=nowhere: does not exist"),
         (("--check",), "--check: the steps camera, arms, .* are not done"),
         (("--check", "--step", "arms"), "--check only repeats the verification"),

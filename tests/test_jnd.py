@@ -142,7 +142,7 @@ def test_a_file_cut_within_the_header_starts_again(tmp_path: Path) -> None:
         (SessionPlan("k7x2", 4, 30, 2000.0, "abc"), 'seed is "3", but this session has "4"'),
         (SessionPlan("k7x2", 3, 30, 1000.0, "abc"), "reference_pa"),
         (SessionPlan("k7x2", 3, 30, 2000.0, "other"), "scene"),
-        (SessionPlan("k7x2", 3, 5, 2000.0, "abc"), "the session has 5 trials"),
+        (SessionPlan("k7x2", 3, 5, 2000.0, "abc"), "the file has more than 5 trials"),
     ],
 )
 def test_a_file_of_another_session_is_refused(

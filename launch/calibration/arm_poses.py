@@ -318,9 +318,9 @@ def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
 class SimulatedArm:
     """Simulated arm without a sheet: true pose of its base, and true errors of its joints.
 
-    Without an apparatus, the base deviates at random from the scene's, and each joint has random
-    errors of SIMULATED_JOINT_RAD. With one, its values count, and the backlash leaves each joint
-    anywhere within the play.
+    Without an apparatus (true hardware parameters), the base deviates at random from the scene's,
+    and each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, its base pose and
+    joint offsets are used, and each joint rests at a random angle within its backlash.
     """
 
     def __init__(self, scene: Scene, side: Side, apparatus: Apparatus | None, *, seed: int) -> None:

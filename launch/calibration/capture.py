@@ -39,10 +39,10 @@ NEAR, FAR = 0.55, 0.35
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Quantity of which the image pairs must cover a minimum count.
+    """Condition (such as an image cell or a tilt) that a minimum number of image pairs must meet.
 
-    group: "left cell", "right cell", "tilt", "distance" or "pairs". name: for a cell its column and
-    row.
+    group: "left cell", "right cell", "tilt", "distance" or "pairs". name: column and row of a cell,
+    or the name of the range.
     """
 
     group: str

@@ -1,8 +1,9 @@
-"""Run the calibrations of a laboratory in sequence, and store their results in one folder.
+"""Run all calibrations of a laboratory in sequence, and store their results in one folder.
 
-The folder holds the state (`commission.json`), the calibration files, the scene and the launch file
-that use them, and a report. A step starts from the scene with the results of all steps before it. A
-repeated step therefore invalidates the later ones, which must be run again.
+This is commissioning: `flexsheet commission`. The folder holds the state (`commission.json`), the
+calibration files, the scene and the launch file that use them, and a report. A step starts from
+the scene with the results of all steps before it. A repeated step therefore invalidates the later
+ones, which must be run again.
 """
 
 from __future__ import annotations
@@ -31,19 +32,19 @@ REPORT_FILE, APPARATUS_FILE = "report.md", "apparatus.yaml"
 
 
 class CommissionError(FlexsheetError, ValueError):
-    """Raised for a folder of a commissioning that cannot be continued, and for wrong data."""
+    """Raised if the folder of a commissioning cannot be continued, or for invalid data."""
 
     code = "commission"
     remedy = "Correct the option that the error names, or use a new folder."
 
 
 class StepName(StrEnum):
-    """Steps of a commissioning, in their order.
+    """Steps of a commissioning, in the order in which they run.
 
     camera: optics of the stereo camera. arms: poses of the arm bases in the frame of the camera.
-    edges: clamped edges of the sheet on the flanges, joint offsets and compliance of the flanges.
-    sheet: force model of the sheet. projector: pose and lens. marker: position of the marker on the
-    finger. verification: a stroke with the result.
+    edges: pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of
+    the flanges. sheet: force model of the sheet. projector: pose and lens of the projector. marker:
+    position of the marker on the finger. verification: errors during a stroke of the finger.
     """
 
     CAMERA = "camera"
@@ -61,10 +62,10 @@ STEPS = tuple(StepName)
 class StepResult(LimitedModel):
     """Result of one step.
 
-    residual: in `unit`; above `limit`, `advice` states what to do. uncertainty: standard deviations
-    with their units in the names. scene_values: values by dotted path in the scene. parameters:
-    node parameters by TYPE.PARAMETER; file names are relative to the folder. figures: further
-    results.
+    residual: error of the fit in `unit`. advice: what to do if it is above `limit`. uncertainty:
+    standard deviations, whose names end in their units. scene_values: values by dotted path in the
+    scene. parameters: names of calibration files in the folder, by node type and parameter
+    (TYPE.PARAMETER). figures: further results.
     """
 
     residual: float
@@ -92,7 +93,7 @@ class StepRecord(LimitedModel):
 
 
 class State(LimitedModel):
-    """Content of the state file: files from which the commissioning started, and finished steps."""
+    """Content of the state file: input files of the commissioning, and finished steps."""
 
     version: Literal[1] = 1
     launch_file: str
@@ -102,7 +103,7 @@ class State(LimitedModel):
 
 
 class MissingDataError(CommissionError):
-    """Raised by a step that needs data of real devices; the text says how to capture them."""
+    """Raised by a step that needs data of real devices; its text says how to capture them."""
 
     code = "commission-data"
     remedy = "Capture the data as the error says, and give the folder or file by --data STEP=PATH."
@@ -117,7 +118,7 @@ Step = Callable[["Commissioning"], StepResult]
 
 @dataclass(slots=True)
 class Commissioning:
-    """Commissioning of one laboratory in a folder; continues the state that the folder holds.
+    """Commissioning of one laboratory; an existing folder is continued from its stored state.
 
     launch_file, scene_file: files to start from. apparatus: value of --apparatus for a simulated
     laboratory, or None. Raises CommissionError if the folder belongs to other files.
@@ -141,8 +142,8 @@ class Commissioning:
             before, now = getattr(self.state, key), getattr(given, key)
             if before != now:
                 raise CommissionError(
-                    f"{self.folder / STATE_FILE}: {key}: the folder belongs to {before}, the "
-                    f"command gives {now}; give the same, or a new folder"
+                    f"{self.folder / STATE_FILE}: {key}: the folder belongs to {before}, but "
+                    f"the command gives {now}; give the same file or value, or a new folder"
                 )
 
     def _load_state(self) -> State | None:
@@ -158,21 +159,21 @@ class Commissioning:
             return State.model_validate_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, ValidationError) as error:
             raise CommissionError(
-                f"{path}: not the state of a commissioning: {error}; use a new folder"
+                f"{path}: not a valid state of a commissioning: {error}; use a new folder"
             ) from error
 
     @property
     def scene_copy(self) -> Path:
-        """Return the scene file with the results so far."""
+        """Return the path of the scene file with the results of all finished steps."""
         return self.folder / SCENE_FILE
 
     @property
     def launch_copy(self) -> Path:
-        """Return the launch file with the results so far."""
+        """Return the path of the launch file with the results of all finished steps."""
         return self.folder / LAUNCH_FILE
 
     def find_file(self, name: str) -> Path | None:
-        """Return a calibration file that a finished step uses, or None."""
+        """Return the path of a calibration file if a finished step wrote it, else None."""
         used = [value for one in self._results(STEPS) for value in one.parameters.values()]
         return self.folder / name if name in used else None
 
@@ -187,12 +188,12 @@ class Commissioning:
         return [name for name in STEPS if name not in self.state.steps]
 
     def skip(self, name: StepName, reason: str) -> None:
-        """Skip a step, and invalidate all later ones."""
+        """Skip a step, and invalidate all later steps."""
         self._invalidate_from(name)
         self._record(StepRecord(name=name, date=_now(), skipped_because=reason))
 
     def run(self, name: StepName, step: Step) -> StepResult:
-        """Run a step with the results of the steps before it; invalidate all later ones."""
+        """Run a step with the results of the previous steps; invalidate all later steps."""
         self._invalidate_from(name)
         started_s = time.monotonic()
         result = step(self)
@@ -251,7 +252,7 @@ class Commissioning:
 
 
 def _make_yaml(value: Any) -> Any:
-    """Return a value for a YAML tree; lists are written on one line."""
+    """Convert a value to one of a YAML tree in which lists are written on one line."""
     if not isinstance(value, list):
         return value
     row = CommentedSeq([_make_yaml(one) for one in value])
@@ -266,7 +267,7 @@ def _now() -> str:
 MEASURED_IN_OPERATION = (
     "Servo lag and actuation delay of each arm, the camera's rate and the age of its images are "
     "measured while the graph runs. The position of the eyes comes from the head tracker. No step "
-    "measures the delay of the projector and the time between exposure and time stamp."
+    "measures the delay of the projector and the time between exposure and timestamp."
 )
 
 

@@ -1,15 +1,15 @@
 """Fit where each arm holds its edge of the sheet, from marks on the clamps that the camera sees.
 
-A mark at m in the frame of the clamped edge is measured at
+A mark with the position m in the frame of the clamped edge is measured at the world position
 
 world_from_base exp(b) forward(q + d) flange_from_edge exp(e) m + c f
 
 where q are the reported joint angles and f is the force of the stretched sheet on the edge. Unknown
-are the errors b of the base and e of the edge (rotation vector and translation), the joint offsets
-d and the compliance c of the flange. The marks alone do not separate them, but only their sum
-matters in the measured working range. Therefore each unknown has a normal prior, and the maximum
-of the posterior is taken. The finger is measured by the same camera, so errors of the camera's pose
-and lenses cancel.
+are the pose errors b of the base and e of the edge (rotation vector and translation; exp gives the
+matrix), the joint offsets d and the compliance c of the flange. The marks do not determine each
+unknown, but their sum, which is sufficient in the measured working range. Therefore each unknown
+has a normal prior, and the maximum of the posterior is taken. The finger is measured by the same
+camera, so that errors of the camera's pose and lenses cancel.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from flexsheet.nodes.models.sheet import edge_force_n
 Floats = NDArray[np.float64]
 
 BASE, JOINTS, EDGE, COMPLIANCE = slice(0, 6), slice(6, 12), slice(12, 18), 18
-"""Positions of the unknowns: error of the base, joint offsets, error of the edge, compliance."""
+"""Indices of the unknowns: error of the base, joint offsets, error of the edge, compliance."""
 
 PRIOR_SIGMA = np.array([*[0.02] * 3, *[0.005] * 3, *[5e-4] * 6, *[0.005] * 3, *[1e-3] * 3, 5e-5])
 """Standard deviations of the unknowns before the measurement: rad, m, and m/N."""
@@ -46,10 +46,10 @@ PRIOR_COMPLIANCE_M_PER_N = 7.5e-5
 MAX_COMPLIANCE_M_PER_N = 1e-2
 
 INITIAL_SIGMA_M, MIN_SIGMA_M = 2e-4, 1e-6
-"""Standard deviation of a coordinate of a mark: initial value and lower bound of the estimate."""
+"""Standard deviation of a measured coordinate: initial value and minimum of the estimate."""
 
 OUTLIER_SIGMAS = 3.0
-"""Deviation above which a coordinate's influence no longer grows (Huber 1964)."""
+"""Deviation above which a coordinate's influence on the fit no longer grows (Huber 1964)."""
 
 MIN_POSES = 8
 MAX_RESIDUAL_M = 1e-3
@@ -68,7 +68,7 @@ class EdgeFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class EdgeMark:
-    """Mark on a clamp: its arm, its position (3,) in the frame of the edge and in the world, m."""
+    """Mark on a clamp: arm, known position (3,) in the frame of the edge, and measured one, m."""
 
     side: Side
     mark_edge_m: Floats
@@ -92,8 +92,8 @@ class EdgeFit:
     """Fitted arm, and the errors of the fit.
 
     residual_rms_m: root mean square distance of a mark from its fitted position.
-    edge_std_m: standard deviation of the fitted position of a mark in the measured poses, all axes
-    together. compliance_std_m_per_n: standard deviation of the compliance.
+    edge_std_m: root sum square over the axes of the standard deviation of a mark's fitted
+    position in the measured poses. compliance_std_m_per_n: standard deviation of the compliance.
     """
 
     arm: ArmSpec
@@ -106,7 +106,7 @@ class EdgeFit:
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """Measured mark with everything that its model needs; force_n: (3,) on the edge, world."""
+    """Measured mark, joint angles, and force (3,) of the sheet on the edge in the world frame."""
 
     joints_rad: Floats
     mark_edge_m: Floats
@@ -115,7 +115,7 @@ class _Row:
 
 
 def fit_edges(poses: Sequence[HeldPose], scene: Scene) -> dict[Side, EdgeFit]:
-    """Fit both arms; raises EdgeFitError if the marks do not determine them."""
+    """Fit the parameters of both arms; raises EdgeFitError for insufficient or wrong marks."""
     sides: tuple[tuple[Side, ArmSpec], ...] = (
         ("left", scene.arms.left),
         ("right", scene.arms.right),
@@ -150,13 +150,13 @@ def _make_rows(poses: Sequence[HeldPose], side: Side, sheet: SheetSpec) -> list[
     count = len({tuple(row.joints_rad.tolist()) for row in rows})
     if count < MIN_POSES:
         raise EdgeFitError(
-            f"{side} arm: {count} poses with marks on both clamps, at least {MIN_POSES} are needed"
+            f"{side} arm: {count} poses have marks on both clamps, at least {MIN_POSES} are needed"
         )
     return rows
 
 
 class _ArmModel:
-    """Model of the marks of one arm as a function of the unknowns (19,)."""
+    """Positions of the marks of one arm as a function of the unknowns (19,)."""
 
     def __init__(self, arm: ArmSpec, rows: Sequence[_Row]) -> None:
         self._rows = rows
@@ -203,12 +203,13 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
         )
         unknowns = found.x
         off = model.positions(unknowns) - model.measured
-        # The median is not affected by single wrong marks; 0.6745 is that of a normal deviate.
+        # The median is not affected by single wrong marks; 0.6745 is the median of |x| for standard
+        # normal x.
         sigma_m = max(float(np.median(np.abs(off))) / 0.6745, MIN_SIGMA_M)
     residual_rms_m = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     if not residual_rms_m <= MAX_RESIDUAL_M:
         raise EdgeFitError(
-            f"the marks are {1e3 * residual_rms_m:.2f} mm (rms) from the fitted edge, at most "
+            f"the marks are {1e3 * residual_rms_m:.2f} mm (rms) from the fitted edge, maximum "
             f"{1e3 * MAX_RESIDUAL_M:g} mm; check which mark, arm and joints belong together"
         )
     marks = off.size

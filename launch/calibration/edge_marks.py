@@ -1,4 +1,4 @@
-"""Read, record and simulate marks on the clamps of the sheet (`flexsheet calibrate edges`)."""
+"""Read, record and simulate measured marks on the sheet's clamps: `flexsheet calibrate edges`."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ Image = NDArray[np.uint8]
 SIDES: tuple[Side, Side] = ("left", "right")
 JOINT_COLUMNS = tuple(f"{side}_j{number}_deg" for side in SIDES for number in range(1, 7))
 COLUMNS = ("pose", "side", "along_mm", "x_mm", "y_mm", "z_mm", *JOINT_COLUMNS)
-"""One row for each mark: number of the pose, arm, position of the mark along the clamped edge from
-its centre, measured position in the world, and the joint angles of both arms."""
+"""Columns of the CSV file, which has one row for each mark in each pose: number of the pose, arm,
+position of the mark along the clamped edge from its centre, measured position in the world, and
+the joint angles of both arms."""
 
 MAX_PROBLEMS = 20
 
@@ -49,7 +50,7 @@ MAX_TRIES = 400
 TILT_RAD = np.array([0.5, 0.35, 0.1])
 CENTRE_MIN_M, CENTRE_MAX_M = np.array([-0.02, -0.03, -0.02]), np.array([0.02, 0.03, 0.03])
 MIN_STRETCH, STRETCH_RANGE = 1.005, 0.9
-"""Lower bound of the stretch, and the used fraction of the range above it."""
+"""Minimum stretch ratio, and fraction of the range from there to the maximum that is used."""
 
 SEARCH_M = 0.02
 """Maximum distance of a mark from its expected position."""
@@ -134,7 +135,7 @@ class MarkDetector:
         )
 
     def find(self, left: Image, right: Image, *, near_world_m: Floats) -> Floats | None:
-        """Return the position (3,) of the mark near an expected one; None without a clear mark."""
+        """Return the position (3,) of the mark near a given position; None without a clear mark."""
         found = detect_all(
             left,
             right,
@@ -149,7 +150,7 @@ class MarkDetector:
 
 
 class EdgeMarkRecorder:
-    """Recorder that appends the marks to a file when both arms rest in a new pose.
+    """Recorder that appends the marks to a CSV file whenever both arms rest in a new pose.
 
     Joint angles and images must be added in the order of their times (s, on one clock).
     """
@@ -166,15 +167,15 @@ class EdgeMarkRecorder:
             csv.writer(file).writerow(COLUMNS)
 
     def update_joints(self, side: Side, joints_rad: Floats, time_s: float) -> None:
-        """Add measured joint angles (6,), rad."""
+        """Add measured joint angles (6,), rad, of one arm."""
         before = self._joints.get(side)
         if before is None or np.abs(joints_rad - before).max() > MAX_STILL_RAD:
             self._joints[side], self._still_since_s = joints_rad, time_s
 
     def update_images(self, left: Image, right: Image, exposed_s: float) -> str:
-        """Add an image pair (h, w), record its marks if its pose is new, and return a hint."""
+        """Add an image pair (h, w); record its marks if the pose is new; return a user hint."""
         if len(self._joints) < len(SIDES):
-            return "no message from both arms yet"
+            return "no joint angles of both arms received yet"
         if exposed_s - self._still_since_s < MIN_STILL_S:
             return "the arms are moving"
         joints = np.concatenate([self._joints[side] for side in SIDES])
@@ -207,11 +208,11 @@ def simulate_edge_marks(
     seed: int,
     poses: int = SIMULATED_POSES,
 ) -> list[HeldPose]:
-    """Simulate marks on the clamps, as the simulated stereo camera sees them.
+    """Simulate marks on the clamps that the simulated stereo camera measures.
 
-    The arms hold the stretched sheet in random poses. In each pose every joint rests anywhere
-    within its backlash. A mark that the triangulator's detector does not accept is left out.
-    calibration: optics that the detector uses; None: the scene's optics.
+    The arms hold the stretched sheet in random poses. In each pose every joint rests at a
+    random angle within its backlash. Marks that the triangulator's detector rejects are left out.
+    calibration: camera parameters that the detector uses; None: those of the scene.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)

@@ -56,7 +56,7 @@ def make_patterns(width_px: int, height_px: int) -> list[Image]:
 class Decoded:
     """Lit camera pixels (n, 2) and the projector pixels (n, 2) that light them.
 
-    The projector pixels are the centres of the cells to which the images are decoded.
+    The images identify a cell of several projector pixels, whose centre is stored.
     """
 
     pixels: Floats
@@ -118,9 +118,10 @@ def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
 
 
 def _fit_pixel(offsets: Floats, pixels: Floats) -> Floats | None:
-    """Fit a quadratic map to cells; return its camera pixel (2,) at offset 0, None if poor.
+    """Fit a quadratic map from offsets to camera pixels (n, 2); return the pixel (2,) at offset 0.
 
-    offsets: (n, 2) of the cells, relative to half the window's side (-1..1).
+    offsets (n, 2): offsets of decoded cells of the projector image, relative to half the window's
+    side (-1..1). Returns None if the residual is too large, or cells are missing on one side.
     """
     for _ in range(2):
         # Require cells on all sides, because the fit would extrapolate beyond the sheet's edge.

@@ -443,7 +443,10 @@ def _unstack_rotation(stacked: Floats) -> Floats:
 def _compute_discrepancies(
     unknowns: _Unknowns, flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> Floats:
-    """Return flange motions (n, 6), in its own frame, from the pose by joints to that by images."""
+    """Return the differences (n, 6) between flange poses from joint angles and from images.
+
+    A difference is a rotation vector and a translation in the frame of the flange.
+    """
     found = []
     for flange, board in zip(flanges, boards, strict=True):
         measured = rig.world_from_left @ board @ inverse(unknowns.flange_from_board)

@@ -126,7 +126,7 @@ def _check_fit(fit: MarkerFit) -> None:
     for axis, deviation_m in zip("xyz", fit.standard_deviations_m, strict=True):
         if deviation_m > MAX_DEVIATION_M:
             raise MarkerFitError(
-                f"{axis} of the offset has an uncertainty of {1e3 * deviation_m:.2f} mm, at most "
+                f"{axis} of the offset has an uncertainty of {1e3 * deviation_m:.2f} mm, maximum "
                 f"{1e3 * MAX_DEVIATION_M:g} mm; add orientations that differ more"
             )
     length_m = float(np.linalg.norm(fit.marker_from_pad_m))

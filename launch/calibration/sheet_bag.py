@@ -1,4 +1,4 @@
-"""Read measured pushes of a finger into a sheet from a bag with the topic `force`."""
+"""Read measured pushes of a finger into the sheet from a recording with the topic `force`."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ from flexsheet.nodes.models.rigid import transform_from_rpy
 Floats = NDArray[np.float64]
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""Time before and after a force in which the depth must change by less, since gauges lag."""
+"""Time before and after a measured force, and maximum change of the depth in this time.
+
+Gauges lag, so that forces during a motion cannot be used.
+"""
 
 MAX_GAP_S = 0.05
-"""Maximum time from a force to the nearest fingertip and arm states."""
+"""Maximum time between a force and the nearest messages of fingertip and arms."""
 
 MIN_DEPTH_M = 0.003
-"""Depth below which the error of the fingertip dominates the force."""
+"""Minimum depth; below it, errors of the fingertip's position dominate the force."""
 
 REVERSAL_M = 0.001
 """Change of the depth that counts as loading or unloading."""
@@ -32,10 +35,10 @@ MAX_ROWS = 300
 
 
 def read_pushes(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
-    """Return the scene, and the pushes during which the finger rested on the sheet.
+    """Return the scene of a bag, and the pushes in which the finger rested in the sheet.
 
-    The poses are those that the nodes measured. Raises SheetModelFitError if the bag has no scene,
-    or no pushes with a valid contact force.
+    Fingertip and arm poses are those that the nodes measured. Raises SheetModelFitError if the bag
+    has no scene, or no pushes with a valid contact force.
     """
     scene: Scene | None = None
     tips: list[tuple[int, Floats]] = []
@@ -90,9 +93,10 @@ def select_pushes(
     left: SampledMotion,
     right: SampledMotion,
 ) -> list[MeasuredPush]:
-    """Return the pushes at the times of the forces (ns, N), without those in motion.
+    """Return a push for each force that was measured while the finger rested.
 
-    tips: positions (3,); left, right: flange poses as rows (16,).
+    forces: times (ns) and forces (N). tips: positions (3,) of the fingertip; left, right: flange
+    poses as rows (16,).
     """
     clamps = [
         transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)

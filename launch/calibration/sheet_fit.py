@@ -160,7 +160,7 @@ def fit_sheet_model(
     names = NAMES if with_mooney else NAMES[:3]
     if len(pushes) < 2 * len(names):
         raise SheetModelFitError(
-            f"{len(pushes)} rows; fitting {', '.join(names)} requires at least {2 * len(names)}"
+            f"{len(pushes)} rows; fitting {', '.join(names)} requires {2 * len(names)}; add rows"
         )
     start = np.array([np.log(nominal.young_modulus_pa * nominal.thickness_m), 0.0, 0.0, 0.1])
     low = np.array([start[0] - 7.0, -0.1, -2.0, 0.0])

@@ -58,7 +58,7 @@ def _push(
     *,
     cells: int = CELLS,
 ) -> tuple[float, float]:
-    """Return normal force and clamp force of `simulate_push` for a sheet between two edges (4, 4).
+    """Return normal force and clamp force of a push into a sheet between two edges (4, 4).
 
     depth_m and point_m are relative to the flat sheet halfway between the edges.
     """
@@ -86,10 +86,11 @@ def _flat_axes(left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Flo
 
 
 class SimulatedSheet:
-    """Sheet between the simulated arms of an apparatus, which are controlled by a scene.
+    """Sheet between simulated arms with the true parameters of an apparatus.
 
-    The arms move the edges to the poses that the kinematics of the scene compute. The true edges
-    deviate from them by the errors of bases, joints and clamps, and by the compliance of the arms.
+    The commanded poses of the edges are computed with the arm parameters of the scene. The true
+    edges deviate from them by the errors of bases, joints and clamps, and by the compliance of the
+    arms.
     """
 
     def __init__(self, scene: Scene, apparatus: Apparatus) -> None:
@@ -101,8 +102,7 @@ class SimulatedSheet:
     def push(
         self, distance_m: float, depth_m: float, point_m: tuple[float, float], radius_m: float
     ) -> tuple[tuple[float, float], float]:
-        """Return the normal forces of a push, while the finger moves in and out, and the clamp
-        force, N.
+        """Return the normal forces of a push during loading and unloading, and the clamp force, N.
 
         distance_m: commanded distance of the edges. radius_m: radius of the pushing ball,
         to which touched rubber sticks.

@@ -307,7 +307,7 @@ def cross_check(
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     leave_out: Annotated[
-        int, typer.Option(help="Number of image pairs excluded at a time.", min=1)
+        int, typer.Option(help="Number of image pairs that each calibration omits.", min=1)
     ] = 1,
     as_json: JsonOption = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Define the commands that measure where the arms hold the edges of the sheet."""
+"""Define the commands that calibrate the poses of the sheet's edges on the arms."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def edges(
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure where the arms hold the sheet, by marks on the clamps that the stereo camera sees.
+    """Measure where the arms hold the sheet, from marks on the clamps that the camera sees.
 
     For each arm, the pose of the base, the pose of the edge on the flange, the joint offsets and
     the compliance of the flange are fitted together, and written into a copy of the scene.
@@ -156,7 +156,7 @@ def edges_capture(
     output: Annotated[Path, output_file("New CSV file for the marks.")],
     scene_file: SceneOption = CYLINDER,
     poses: Annotated[
-        int, typer.Option(help="Number of poses to record; then the command stops.", min=1)
+        int, typer.Option(help="Number of poses after which the command stops.", min=1)
     ] = 24,
     calibration: CalibrationOption = None,
     run: RunOption = None,
@@ -166,7 +166,7 @@ def edges_capture(
 
     Fix three bright marks on each clamp: at its centre and 45 % of its length above and below. Move
     the sheet to poses that differ in position, rotation and stretch. A pose is recorded when both
-    arms are at rest. Ctrl-C stops.
+    arms are at rest. Ctrl-C ends the recording.
     """
     from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.launch.plans.plan import load_scene

@@ -85,7 +85,7 @@ def chart(
             metavar="SECONDS",
             min=2.0,
             max=600.0,
-            help="For system: duration of each simulated stroke.",
+            help="For system: duration of each simulated stroke, s.",
         ),
     ] = 10.0,
     apparatuses: Annotated[
@@ -113,7 +113,7 @@ def chart(
 
     For each method, the maximum of the median times and of the errors is printed, over all cases in
     the method's range. "front" marks methods of which no other is both faster and more accurate.
-    `system` runs whole graphs instead; if it was interrupted, the same --output continues it.
+    `system` runs whole graphs instead; if it was interrupted, repeat it with the same --output.
     """
     logs_on_stderr()
     chosen = [find_file(one, SCENES) for one in scene_files or ()]

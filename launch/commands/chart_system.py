@@ -21,7 +21,7 @@ def measure_system(
     configurations: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Measure configurations and draw a chart; the same folder continues a measurement."""
+    """Measure configurations and draw a chart; continue the measurement of an existing folder."""
     import json
 
     from flexsheet.launch.methods.results import describe_load, replace_non_finite

@@ -47,7 +47,7 @@ def commission(
             "-o",
             "--output",
             metavar="FOLDER",
-            help="Folder for state and results; an existing one is continued.",
+            help="Folder for state and results; continue the commissioning if it exists.",
         ),
     ],
     launch_file: LaunchOption = DEMO,
@@ -56,43 +56,68 @@ def commission(
     data: Annotated[
         list[str] | None,
         typer.Option(
-            "--data", metavar="STEP=PATH", help="Captured data of a step; repeat for several."
+            "--data", metavar="STEP=PATH", help="Captured data of a step; may be repeated."
         ),
     ] = None,
     finger_radius_mm: Annotated[
         float | None,
         typer.Option(
-            "--finger-radius-mm", metavar="MM", min=1.0, help="Measured radius of the fingertip."
+            "--finger-radius-mm",
+            metavar="MM",
+            min=1.0,
+            help="Measured radius of the fingertip, mm.",
         ),
     ] = None,
     board: Annotated[
-        str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the camera's board.")
+        str,
+        typer.Option(
+            metavar="COLUMNSxROWS",
+            help="Numbers of inner corners of the chessboard for the camera.",
+        ),
     ] = "9x6",
     square_mm: Annotated[
-        float, typer.Option(metavar="MM", min=1e-3, help="Square of the camera's board, mm.")
+        float,
+        typer.Option(metavar="MM", min=1e-3, help="Side of a square of the camera's board, mm."),
     ] = 25.0,
     flange_board: Annotated[
-        str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the flanges' board.")
+        str,
+        typer.Option(
+            metavar="COLUMNSxROWS",
+            help="Numbers of inner corners of the chessboard on the flanges.",
+        ),
     ] = "7x5",
     flange_square_mm: Annotated[
-        float, typer.Option(metavar="MM", min=1e-3, help="Square of the flanges' board, mm.")
+        float,
+        typer.Option(metavar="MM", min=1e-3, help="Side of a square of the flanges' board, mm."),
     ] = 15.0,
     repeated: Annotated[
         list[str] | None,
         typer.Option(
-            "--step", metavar="STEP", help="Step to repeat, with all later ones; may be repeated."
+            "--step",
+            metavar="STEP",
+            help="Step to run again, with all later steps; may be given several times.",
         ),
     ] = None,
     skipped: Annotated[
         list[str] | None,
-        typer.Option("--skip", metavar="STEP=REASON", help="Step to skip; may be repeated."),
+        typer.Option(
+            "--skip",
+            metavar="STEP=REASON",
+            help="Step to skip, and why; may be given several times.",
+        ),
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Only repeat the verification of earlier results.")
+        bool,
+        typer.Option("--check", help="Only repeat the verification step with the stored results."),
     ] = False,
     duration: Annotated[
         float,
-        typer.Option("--duration", metavar="SECONDS", min=2.0, help="Time of the stroke, s."),
+        typer.Option(
+            "--duration",
+            metavar="SECONDS",
+            min=2.0,
+            help="Duration of the finger's stroke in the verification, s.",
+        ),
     ] = 10.0,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
@@ -117,7 +142,7 @@ def commission(
         )
     if check and (repeats or skips or any(name is not StepName.VERIFICATION for name in given)):
         raise CommandError(
-            "--check only repeats the verification; remove --step, --skip and other --data",
+            "--check only repeats the verification; remove --step, --skip and other steps' --data",
             BAD_INPUT,
         )
     lab, devices = open_laboratory(
@@ -170,7 +195,9 @@ def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
     for one in given or ():
         name, _, text = one.partition("=")
         if not text.strip():
-            raise CommandError(f"{option} {one}: expected STEP=TEXT with a text", BAD_INPUT)
+            raise CommandError(
+                f"{option} {one}: expected STEP=TEXT with a non-empty text", BAD_INPUT
+            )
         pairs[_parse_step(option, name)] = text.strip()
     return pairs
 

@@ -1,7 +1,8 @@
-"""Carry out the steps of `flexsheet commission`, with simulated devices or with captured data.
+"""Run the steps of `flexsheet commission`, with simulated devices or with captured data.
 
-The steps use the functions of the commands `flexsheet calibrate`. Of an apparatus, they use only
-what its simulated devices report: images, joint angles, forces of a gauge, and a calliper.
+The steps use the functions of the commands `flexsheet calibrate`. An apparatus holds the true
+parameters of simulated devices. The steps use only what these devices measure: images, joint
+angles, the forces of a gauge, and the finger's radius.
 """
 
 from __future__ import annotations
@@ -45,13 +46,13 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 STEREO, ARMS, SHEET, MARKER = "stereo.yaml", "arms.yaml", "sheet.yaml", "marker.yaml"
 BOARD = Board(kind="chessboard", columns=9, rows=6, square_m=0.025)
 FLANGE_BOARD = Board(kind="chessboard", columns=7, rows=5, square_m=0.015)
-"""Boards of simulated laboratories, for the camera and for the flanges."""
+"""Calibration boards of simulated laboratories, for the camera and for the flanges."""
 
 CALLIPER_M = 3e-4
 """Standard deviation of the simulated measurement of the finger's radius."""
 
 GAUGE_N = 0.005
-"""Standard deviation of the simulated force gauge."""
+"""Standard deviation of the noise of the simulated force gauge."""
 
 INSTRUCTIONS: dict[StepName, str] = {
     StepName.CAMERA: "capture board images with `flexsheet calibrate stereo --device-source ... "
@@ -76,7 +77,7 @@ REPEAT: dict[str, StepName] = {
     "marker_offset": StepName.MARKER,
     "sheet_stiffness": StepName.SHEET,
 }
-"""Step to repeat for a cause that the self-checks of the nodes suspect."""
+"""Step to repeat, by the calibration error that the self-checks of the nodes suspect."""
 
 
 def open_laboratory(
@@ -88,7 +89,7 @@ def open_laboratory(
 ) -> tuple[Commissioning, Laboratory]:
     """Open the folder of a commissioning, and its devices; options: fields of `Laboratory`.
 
-    For simulated devices, write the apparatus file with which the results can be simulated.
+    For simulated devices, their true parameters are written to an apparatus file in the folder.
     """
     plan = load_graph(launch_file)
     if plan.scene_file is None:
@@ -105,10 +106,12 @@ def open_laboratory(
 
 @dataclass(slots=True)
 class Laboratory:
-    """Devices of one laboratory: simulated ones, or files with their data by step.
+    """Devices of one laboratory: simulated devices, or files with the data of real ones.
 
-    apparatus: true parameters in the world frame of the camera. finger_radius_m: measured radius
-    for real devices. pairs, arm_poses, sheet_poses: numbers of simulated observations.
+    apparatus: true parameters of simulated devices, in the world frame of the camera; None for real
+    devices. data: file or folder with the captured data of each step. finger_radius_m: measured
+    radius for real devices. seconds: duration of the verification. pairs, arm_poses, sheet_poses:
+    numbers of simulated observations.
     """
 
     apparatus: Apparatus | None
@@ -124,7 +127,7 @@ class Laboratory:
 
     @property
     def steps(self) -> dict[StepName, Step]:
-        """Return the function of each step."""
+        """Return the function that runs each step."""
         return {
             StepName.CAMERA: self.calibrate_camera,
             StepName.ARMS: self.calibrate_arms,
@@ -145,7 +148,7 @@ class Laboratory:
 
     @contextmanager
     def _folder(self, step: StepName) -> Iterator[Path]:
-        """Yield the folder with the data of a step; for simulated devices, an empty one."""
+        """Yield the folder with the data of a step; for simulated devices, an empty folder."""
         if self.apparatus is None:
             yield self._find_data(step)
             return
@@ -369,7 +372,7 @@ class Laboratory:
             source = f"twin of {scene.name}"
             true_m = apply_apparatus(scene, self.apparatus).finger.radius_m
             read_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
-            # Tables that are computed for a finger then serve for all fingers of about its size.
+            # Rounded, so that tables computed for this radius are used again for similar fingers.
             radius_m = 5e-4 * round(read_m / 5e-4)
         found = calibrate_marker.make_calibration(touches, scene, source)
         save_marker_calibration(found, lab.folder / MARKER)
@@ -390,7 +393,7 @@ class Laboratory:
         )
 
     def verify(self, lab: Commissioning) -> StepResult:
-        """Run a stroke with the result; evaluate simulated devices also at rest."""
+        """Measure the errors of the calibrated system in a stroke, and at rest if simulated."""
         if self.apparatus is None:
             stroke = _read_stroke(self._find_data(StepName.VERIFICATION))
             figures: dict[str, Any] = {"stroke": stroke, "flagged": stroke.get("flagged", [])}
@@ -408,10 +411,10 @@ class Laboratory:
 
 
 def run_verification(lab: Commissioning, seconds: float) -> dict[str, Any]:
-    """Run a stroke of a simulated laboratory, and evaluate it at rest before and after.
+    """Run a stroke of a simulated laboratory; compare errors at rest before and after calibration.
 
-    `stated_mm` are the errors that the uncertainties of the steps predict, to be compared with the
-    true errors of sheet and fingertip at rest.
+    `stated_mm` are the errors that the uncertainties of the steps predict. They can be compared
+    with the true errors of sheet and fingertip at rest.
     """
     from flexsheet.launch.experiments.offline import (
         NodeCalibrations,
@@ -459,7 +462,7 @@ def _state_errors(lab: Commissioning) -> dict[str, float]:
     arms = collect(StepName.EDGES, "left_edge_mm", "right_edge_mm") or collect(
         StepName.ARMS, "left_position_mm", "right_position_mm"
     )
-    # The middle of the sheet moves by half the error of each edge.
+    # The centre of the sheet moves by half the error of each edge.
     sheet = [0.5 * one for one in arms]
     return {"fingertip": float(np.linalg.norm(tip)), "sheet": float(np.linalg.norm(sheet))}
 

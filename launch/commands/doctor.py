@@ -108,7 +108,7 @@ def check_scene(
             draw_layout(layout, output)
         except (OSError, ValueError) as error:
             raise CommandError(
-                f"--output {output}: cannot be written: {error}; name a .png or .svg", BAD_INPUT
+                f"--output {output}: cannot be written: {error}; use .png or .svg", BAD_INPUT
             ) from error
         words.print(f"image: {output}", markup=False)
     if as_json:

@@ -153,7 +153,7 @@ def stroke(
     """Simulate a finger that strokes a cylinder over 60 degrees; measure the sheet's pose errors.
 
     This is the experiment of Furukawa et al. 2007, section V and Table I. If several strokes or
-    variants were interrupted, the same --output continues them.
+    variants were interrupted, repeat the command with the same --output to continue.
     """
     given = with_scene(settings, scene)
     if radii and scene is not None:

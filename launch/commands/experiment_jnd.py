@@ -52,10 +52,10 @@ def jnd(
         ),
     ] = "p1",
     seed: Annotated[
-        int, typer.Option("--seed", metavar="N", min=0, help="Random seed of the order of pairs.")
+        int, typer.Option("--seed", metavar="N", min=0, help="Random seed of the order of objects.")
     ] = 1,
     trials: Annotated[
-        int, typer.Option(metavar="N", min=20, max=2000, help="Number of pairs.")
+        int, typer.Option(metavar="N", min=20, max=2000, help="Number of trials, one pair each.")
     ] = 240,
     reference_pa: Annotated[
         float | None,
@@ -68,15 +68,17 @@ def jnd(
     ] = None,
     simulated: Annotated[
         bool,
-        typer.Option("--simulated-participant", help="Simulate the participant; starts no graph."),
+        typer.Option(
+            "--simulated-participant", help="Simulate the participant instead of starting a graph."
+        ),
     ] = False,
     repeats: Annotated[
         int,
         typer.Option(
             min=1,
             max=1000,
-            help="With --simulated-participant: number of participants, with the seeds from "
-            "--seed on; 0-99 are for development.",
+            help="With --simulated-participant: number of participants; the first has the seed "
+            "--seed, the next ones the following seeds. Seeds 0-99 are for development.",
         ),
     ] = 1,
     launch_file: LaunchOption = DEMO,
@@ -85,11 +87,11 @@ def jnd(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the Weber fraction of stiffness of a participant, by pairs of soft objects.
+    """Measure a participant's Weber fraction of stiffness with pairs of soft objects.
 
     The participant says which object of each pair is stiffer, and an adaptive staircase chooses the
-    next pair. Each answer is written to CODE.csv at once. If the command was interrupted, the same
-    --output continues it.
+    next pair. Each answer is immediately written to CODE.csv. An interrupted session continues if
+    the command is run again with the same --output.
     """
     from flexsheet.launch.experiments.jnd import SessionPlan
     from flexsheet.launch.experiments.run import require_scene

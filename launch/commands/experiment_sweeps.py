@@ -96,7 +96,8 @@ def robustness(
 
     For each seed, the true parameters of the simulated hardware are sampled within tolerances. A
     separate process runs a graph with one stroke; image and force are evaluated at rest, without a
-    graph. If the command was interrupted, the same --output continues it.
+    graph. To continue an interrupted command, repeat it with the same
+    --output.
     """
     from flexsheet.launch.experiments import robustness as experiment
     from flexsheet.nodes.twin.tolerance_table import Profile
@@ -171,7 +172,8 @@ def sensitivity(
     """Measure the errors that each inaccurate hardware parameter causes alone.
 
     Each parameter deviates by 1 and 3 standard deviations in both directions. Without --graph, all
-    are evaluated at rest. If the command was interrupted, the same --output continues it.
+    are evaluated at rest. To continue an interrupted command, repeat it with the same
+    --output.
     """
     from flexsheet.launch.experiments import sensitivity as experiment
     from flexsheet.launch.experiments.pictures import draw_sensitivity

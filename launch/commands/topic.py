@@ -39,7 +39,7 @@ CountOption = Annotated[
 ]
 WindowOption = Annotated[
     float,
-    typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement.", min=0.1),
+    typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement, s.", min=0.1),
 ]
 REPORT_DELAY_S = 3.0
 """Time without a message after which the command reports that none has arrived."""
@@ -116,7 +116,7 @@ def echo(
     timeout: Annotated[
         float | None,
         typer.Option(
-            metavar="SECONDS", help="Maximum time without a message; then the command fails."
+            metavar="SECONDS", help="Time without a message after which the command fails, s."
         ),
     ] = None,
     field: Annotated[

@@ -77,7 +77,7 @@ def tune(
         typer.Option(
             "--runs-folder",
             metavar="FOLDER",
-            help="Folder for the test runs; the same folder continues an interrupted command.",
+            help="Folder for the test runs; an interrupted command continues with the same folder.",
         ),
     ] = None,
     as_json: JsonOption = False,

@@ -1,9 +1,9 @@
 """Compare the force of the simulated sheet on the finger with the force of the virtual object.
 
-The finger pushes at a few positions and rests at several depths; then it moves in and out without a
-stop. The felt force is computed by the simulator's membrane model, from the true edges of the sheet
-and the true fingertip. The wanted force is read from the published force curve, at the finger's
-true depth. Errors are relative to the stored solution of an independent solver
+The finger pushes at a few positions and rests at several depths. Then it moves in and out without
+stopping. The felt force is computed by the simulator's membrane model, from the true edges of the
+sheet and the true fingertip. The wanted force is read from the published force curve, at the
+finger's true depth. Errors are relative to the stored solution of an independent solver
 (`force_reference`), or to the wanted force where the file contains no solution.
 """
 
@@ -52,7 +52,7 @@ POSITIONS_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
 """Pushed positions: distance along the object, and arc length around it from its front, m."""
 
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.007, 0.010, 0.013, 0.016)
-"""Depths at which the finger rests, in addition to the scene's push depth, which limits them."""
+"""Depths at which the finger rests, up to the scene's push depth, which is always one of them."""
 
 HOVER_M = 0.03
 APPROACH_S = 1.2
@@ -61,7 +61,7 @@ HOLD_S, EVALUATED_S = 1.0, 0.3
 """Duration of a rest, and duration of its last part, in which the force is evaluated."""
 
 MEASURED_S = 0.6
-"""Duration of the last part of a rest in which measured forces are averaged."""
+"""Duration of the last part of each rest in which forces measured by a gauge are averaged."""
 
 REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
@@ -232,9 +232,9 @@ def read_bag(bag: Path) -> ComplianceRecording:
 class ForceSample:
     """Forces at one time.
 
-    depth_m: true finger depth. wanted_n, felt_n: published force of the object, and force of the
+    depth_m: true finger depth. wanted_n: published force of the object. felt_n: force of the
     sheet. normal_offset_m: depth of the sheet's centre below the undeformed surface. method: method
-    of the soft body. reference: independent force of the object, if it is known.
+    of the soft body. reference: force of the object from an independent solver, or None.
     """
 
     depth_m: float
@@ -246,13 +246,16 @@ class ForceSample:
 
     @property
     def error_ratio(self) -> float:
-        """Return the relative error of the felt force; divisors are at least FORCE_JND_FLOOR_N."""
+        """Return the error of the felt force relative to the expected force.
+
+        The divisor is the expected force, but at least FORCE_JND_FLOOR_N.
+        """
         expected_n = self.wanted_n if self.reference is None else self.reference.force_n
         return _relative_error(self.felt_n, expected_n)
 
     @property
     def model_error_ratio(self) -> float | None:
-        """Return the relative error of the wanted force; None without a reference."""
+        """Return the error of the wanted force relative to the reference; None without one."""
         if self.reference is None:
             return None
         return _relative_error(self.wanted_n, self.reference.force_n)
@@ -331,7 +334,7 @@ class ForceReference:
         return float(np.interp(at_ns, times, ratios))
 
     def _follow_history(self, press: Press) -> tuple[Times, Floats]:
-        """Return the times (ns) of a push, and the force ratio of `_history_ratio` at them.
+        """Return the times (ns) of a push, and the ratios of `_history_ratio` at these times.
 
         The membrane is solved at a few depths only, with the edges at the deepest point of the
         push. That suffices, because the ratio depends only on the shape of the force curve.

@@ -56,7 +56,7 @@ def run_demo(
     path: FingerPath | None = None,
     apparatus: str | None = None,
 ) -> DemoResult:
-    """Stroke in 10 s and 30 s (or follow `path`), then take images of a tilted and pushed sheet."""
+    """Run two strokes (10 s, 30 s) or follow `path`; take images of a tilted and pushed sheet."""
     bag = folder / "demo.mcap"
     procedure = chain_procedures(
         make_stroke_procedure(SECONDS, progress, path=path),

@@ -72,7 +72,7 @@ class Driver:
         pids: Callable[[], Mapping[str, int]] = dict,
         publish_scene: Callable[[Scene], int] | None = None,
     ) -> None:
-        """Connect nothing yet.
+        """Store the arguments; `async with` connects to the graph.
 
         pids: function that returns the process id of each running node, for measurements.
         publish_scene: function that replaces the scene and returns its source timestamp.
@@ -121,7 +121,7 @@ class Driver:
             self._newest[name] = message
             self.on_message(message)
             if isinstance(message, Skin):
-                # The bodies of the former scene answer no more.
+                # The soft body of the previous scene no longer responds.
                 self._skin_source_ns = header.source_ns
                 self._newest.pop("soft_body", None)
             if isinstance(message, Status):

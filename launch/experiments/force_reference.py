@@ -1,8 +1,8 @@
-"""Read the stored force over depth that an independent solver computed for a pushed cylinder.
+"""Read stored curves of force over depth that an independent solver computed for a cylinder.
 
-`benchmarks.force_reference` computes the curves and states how. They are free of units: lengths
-are in finger radii, forces in Young's modulus times the squared finger radius. Therefore they are
-valid for every scene of the same proportions.
+`benchmarks.force_reference` computes the curves and describes the method. They are dimensionless:
+lengths are in finger radii, forces in Young's modulus times the squared finger radius. Therefore
+they are valid for every scene of the same proportions.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from flexsheet.messages.scene import Cylinder, Scene, StripSupport
 
 REFERENCE_FILE = Path(__file__).with_name("force_reference.json")
 SAME_RATIO = 1e-3
-"""Relative difference of two lengths, angles or Poisson's ratios that count as equal."""
+"""Relative difference up to which lengths, angles or Poisson's ratios count as equal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,18 +31,18 @@ class ReferenceForce:
 
 
 class ReferenceForceCurve:
-    """Independent force over depth at one position of the object of a scene."""
+    """Force over depth from an independent solver, at one position of the object of a scene."""
 
     def __init__(self, curve: dict[str, Any], *, finger_radius_m: float, modulus_pa: float) -> None:
         """Interpolate a curve of the file; it must contain two or more depths."""
         self._depths_m = finger_radius_m * np.array(curve["depths"])
         forces = modulus_pa * finger_radius_m**2 * np.array(curve["forces"])
-        # Hertz: the force over depth^1.5 hardly changes, so that it is interpolated most precisely.
+        # As in Hertz' theory, force / depth^1.5 hardly changes, so its interpolation is precise.
         self._hertz = PchipInterpolator(self._depths_m, forces / self._depths_m**1.5)
         self._uncertainty = np.array(curve["uncertainty_ratio"])
 
     def force(self, depth_m: float) -> ReferenceForce | None:
-        """Return the force at a depth; None outside the depths of the curve (within 1 %)."""
+        """Return the force at a depth; None if it is more than 1 % outside the curve's depths."""
         if not 0.99 * self._depths_m[0] <= depth_m <= 1.01 * self._depths_m[-1]:
             return None
         return ReferenceForce(

@@ -71,7 +71,7 @@ def select_gestures(names: Sequence[str]) -> list[str]:
 def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = ()) -> FingerPath:
     """Make a finger path in the scene of a launch file, from a gesture's name or a recorded path.
 
-    settings: as for `load_graph`; "scene=FILE" replaces the scene.
+    settings: see `load_graph`; "scene=FILE" replaces the scene.
     """
     scene = load_graph(launch_file, settings=settings).scene_message()
     if scene is None:

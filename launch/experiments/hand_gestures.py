@@ -1,7 +1,8 @@
-"""Evaluate the force that a coupled hand feels during gestures: `experiment stability --gestures`.
+"""Evaluate the force that a simulated hand feels: `experiment stability --gestures`.
 
-The gestures are voluntary motions; the sheet pushes the finger off them. The force of the sheet is
-compared with the force of the object at the finger's true depth. Runs are in simulated time.
+The gestures are voluntary motions, from which the force of the sheet deflects the finger (coupled
+hand). This force is compared with the force of the object at the finger's true depth. Runs are in
+simulated time.
 """
 
 from __future__ import annotations
@@ -54,10 +55,10 @@ SLIP_FRACTION = 0.375
 """Distance of a slip along the object, as a fraction of the sheet's width."""
 
 TRANSIENT_S = 0.1
-"""Time after a touch in which the force error counts as a transient of the contact."""
+"""Time after the start of a touch in which force errors are transients of the contact."""
 
 MIN_CONTACT_N = 2e-3
-"""Force above which finger and sheet count as touching; a tenth of what a fingertip can feel."""
+"""Force above which the finger touches the sheet: a tenth of what a fingertip can feel."""
 
 
 def _press(depth_m: float, hold_s: float, lift_s: float) -> tuple[Floats, Floats]:
@@ -106,7 +107,7 @@ def make_let_go(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
-    """Stroke around the object and back, while the depth oscillates by a half at 1 Hz."""
+    """Stroke around the object and back, while the depth oscillates between half and full, 1 Hz."""
     half_m = 0.4 * touchable(scene)[1]
     stroke_s = 2.0 * half_m / STROKE_M_PER_S * 1.875
     _, reach = minimum_jerk(
@@ -149,14 +150,14 @@ HAND_GESTURES: dict[str, tuple[Callable[[Scene, float], FingerPath], int]] = {
     "let-go": (make_let_go, 1),
     "slip": (make_slip, 1),
 }
-"""Gesture by name, and the number of touches that it consists of."""
+"""Function that makes each gesture, and the number of touches in the gesture, by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeltForce:
-    """Force that a finger feels, and force of the object at its depth.
+    """Force that a finger feels, and force of the object at the finger's depth.
 
-    times_s, depths_m, felt_n, wanted_n: (n,).
+    times_s, depths_m, felt_n, wanted_n: arrays (n,), one element per time step.
     """
 
     times_s: Floats
@@ -166,11 +167,11 @@ class FeltForce:
 
 
 def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) -> FeltForce:
-    """Compute the forces of a run; curve: force of the object over depth (m, 2)."""
+    """Compute felt and wanted force of a run; curve (m, 2): depths and forces of the object."""
     shape = make_shape(dict(scene.object.geometry))
     points = apply(inverse(object_pose(scene)), recorded.positions_m)
     nearest = shape.closest(points)
-    # Beside the object's end there is no object, at any depth.
+    # Beyond the object's end there is no contact at any depth.
     depths_m = np.where(nearest.on_edge, 0.0, -nearest.height_m)
     times_s, felt_n = recorded.steps[:, 0], recorded.steps[:, 2]
     at_steps_m = np.interp(times_s, recorded.times_s, depths_m)
@@ -182,9 +183,9 @@ def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) ->
 
 
 def evaluate_touch(recorded: TouchRecording, force: FeltForce, touches: int) -> dict[str, Any]:
-    """Return the force errors and the numbers of contacts of a run.
+    """Return force errors and numbers of contacts of one gesture.
 
-    touches: number of touches that the gesture consists of. chatter: touches beyond these.
+    touches: number of touches that the gesture consists of. chatter: number of further touches.
     transient_n: largest force error within TRANSIENT_S after a touch.
     """
     touching = force.felt_n > MIN_CONTACT_N
@@ -227,10 +228,10 @@ def hand_gestures_result(
     names: Sequence[str] = tuple(HAND_GESTURES),
     cache_dir: Path | None = None,
 ) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
-    """Simulate gestures with random hands; return the result, and the forces for the picture.
+    """Simulate gestures with random hands; return the result, and the forces for a chart.
 
-    hands: number of hands of each kind: finger, wrist and arm. curve: force of the object over
-    depth, (m, 2). The forces are by the hand's kind and the gesture.
+    hands: number of hands of each kind: finger, wrist and arm. curve (m, 2): depths and
+    forces of the object. The forces are indexed by kind of hand and gesture.
     """
     progress("computing the reaction of the sheet (only once)")
     reaction = load_or_compute_reaction(scene, None, cache_dir)
@@ -281,10 +282,10 @@ def run_gestures(
     *,
     apparatus: str | None = None,
 ) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
-    """Perform the gestures in a running graph; the result is as that of `hand_gestures_result`.
+    """Perform the gestures in a running graph; return the same as `hand_gestures_result`.
 
-    The force is sampled at the exposures only, so that shorter peaks are missed. apparatus: as for
-    `load_graph`; it has the hand's impedance.
+    The force is sampled at the exposures only, so that shorter peaks are missed. apparatus: file
+    with the true parameters of the simulated hardware, among them the hand's impedance.
     """
     coupled = [*settings, *make_settings(launch_file, "twin_finger", "hand=coupled")]
     plan = load_graph(launch_file, settings=coupled, apparatus=apparatus)
@@ -324,7 +325,7 @@ SUMMARY = ("peak_error_n", "mean_error_n", "median_error_percent", "transient_n"
 
 
 def _make_result(scene: Scene, seed: int | None, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the result with a summary: for each gesture, the worst value of all hands."""
+    """Return the result and a summary, which has the worst value of all hands for each gesture."""
     names = dict.fromkeys(row["gesture"] for row in rows)
     summary = {
         name: {key: max(row[key] for row in rows if row["gesture"] == name) for key in SUMMARY}
@@ -334,7 +335,7 @@ def _make_result(scene: Scene, seed: int | None, rows: list[dict[str, Any]]) -> 
 
 
 def read_touches(bag: Path) -> dict[str, TouchRecording]:
-    """Read the runs of a coupled finger from a bag, by the label of the finger path."""
+    """Read the touches of a coupled hand from a bag; return them by the label of the path."""
     fingers: dict[int, TwinFinger] = {}
     phases: dict[int, Phase] = {}
     valid_at: list[int] = []

@@ -1,7 +1,7 @@
-"""Measure the Weber fraction of stiffness: an adaptive staircase, and its table of trials.
+"""Measure the Weber fraction of stiffness with an adaptive staircase, and store its trials.
 
 In each trial the participant pushes two objects and names the stiffer one. One of them is the
-reference; the other one, in random order, is stiffer by the relative increment d. The probability
+reference; the other one is stiffer by the relative increment d. The probability
 of a correct answer is
 
     p(d) = lapse / 2 + (1 - lapse) * Phi(ln(1 + d) / sigma +- bias),
@@ -52,13 +52,13 @@ BIAS_SCALE = 0.25
 """Standard deviation of the normal prior of the bias, in sigmas."""
 
 CATCH_PERIOD = 20
-"""One trial of so many has the largest increment; it shows lapses of attention."""
+"""Number of trials of which one has the largest increment, in order to detect inattention."""
 
 INTERVAL_QUANTILES = (0.025, 0.975)
 
 
 class StaircaseEstimator:
-    """Posterior of Weber fraction, lapse rate and bias, and the most informative next increment."""
+    """Posterior of Weber fraction, lapse rate and bias, which selects the next increment."""
 
     def __init__(self) -> None:
         sigmas = np.log1p(WEBER_FRACTIONS) / ndtri(CRITERION)
@@ -75,20 +75,28 @@ class StaircaseEstimator:
         self._posterior /= self._posterior.sum()
 
     def add(self, increment: int, stiffer: int, correct: bool) -> None:
-        """Update by an answer to the increment of this index; stiffer: its interval, 1 or 2."""
+        """Update the posterior with the answer of one trial.
+
+        increment: index in INCREMENTS. stiffer: interval (1 or 2) with the stiffer object. correct:
+        whether the participant named this interval.
+        """
         likely = self._correct[stiffer][increment]
         self._posterior = self._posterior * (likely if correct else 1.0 - likely)
         self._posterior /= self._posterior.sum()
 
     def choose(self, stiffer: int) -> int:
-        """Return the index of the increment with the least expected entropy of the fraction."""
+        """Return the index of the increment whose answer is expected to be most informative.
+
+        It has the least expected entropy of the Weber fraction. stiffer: interval (1 or 2) with the
+        stiffer object.
+        """
         right = np.einsum("swn,wn->sw", self._correct[stiffer], self._posterior)
         expected = _expected_entropy(right) + _expected_entropy(self._marginal - right)
         return int(np.argmin(expected))
 
     @property
     def weber_fraction(self) -> float:
-        """Return the geometric mean of the posterior."""
+        """Return the geometric mean of the posterior of the Weber fraction."""
         return float(np.exp(self._marginal @ np.log(WEBER_FRACTIONS)))
 
     @property
@@ -100,7 +108,7 @@ class StaircaseEstimator:
 
     @property
     def lapse_rate(self) -> float:
-        """Return the mean of the posterior."""
+        """Return the mean of the posterior of the lapse rate."""
         rates = np.tile(LAPSE_RATES, len(BIASES))
         return float(self._posterior.sum(axis=0) @ rates)
 
@@ -118,10 +126,10 @@ def _expected_entropy(joint: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SessionPlan:
-    """Settings of a session; an interrupted session continues only with equal ones.
+    """Settings of a session, which must be the same when an interrupted session continues.
 
-    participant: random code, no name. scene: name and hash of the scene's geometry. reference_pa:
-    modulus of the reference object.
+    participant: random code, not a name. scene: name and hash of the scene's geometry.
+    reference_pa: Young's modulus of the reference object.
     """
 
     participant: str
@@ -133,10 +141,11 @@ class SessionPlan:
 
 @dataclass(frozen=True, slots=True)
 class PairTrial:
-    """Pair of stiffnesses of a trial.
+    """Pair of objects with different stiffness, which is presented in one trial.
 
-    number: from 1. increment: index in INCREMENTS. stiffer: interval with the stiffer object, 1
-    or 2. moduli_pa: moduli of both intervals.
+    number: number of the trial, from 1. increment: index in INCREMENTS. stiffer: interval with the
+    stiffer object, 1 or 2. moduli_pa: Young's moduli in both intervals. catch: whether the trial
+    checks attention.
     """
 
     number: int
@@ -151,8 +160,8 @@ class PairAnswer:
     """Answer of the participant, and what was measured while the pair was presented.
 
     stiffer: interval that the participant named, 1 or 2. response_s: time of the answer after the
-    end of the second interval. depths_m, forces_n: maximum of push depth and of measured force in
-    each interval; None if not measured.
+    end of the second interval. depths_m, forces_n: maximum push depth and maximum measured
+    force in each interval; None if not measured.
     """
 
     stiffer: int
@@ -163,7 +172,7 @@ class PairAnswer:
 
 @dataclass(frozen=True, slots=True)
 class TrialRow:
-    """One line of the CSV file; an empty cell is a quantity that was not measured."""
+    """One line of the CSV file, with the result of a trial; unmeasured quantities are empty."""
 
     participant: str
     seed: int
@@ -189,13 +198,13 @@ Present = Callable[[PairTrial], Awaitable[PairAnswer]]
 
 
 class StaircaseSession:
-    """Trials of one participant, with the CSV file that holds them.
+    """Trials of one participant, and the CSV file in which they are stored.
 
     Raises ExperimentError if an existing file belongs to another session or is damaged.
     """
 
     def __init__(self, plan: SessionPlan, file: Path, *, now: Callable[[], str]) -> None:
-        """now: function that returns the present time as text, for the rows."""
+        """Continue the session of an existing file; now: returns the present time as text."""
         self.plan, self.file, self._now = plan, file, now
         self.estimator = StaircaseEstimator()
         self.done = self.catches = self.missed_catches = 0
@@ -268,7 +277,7 @@ class StaircaseSession:
             raise ExperimentError(f"{self.file}: is not a CSV file of a session: {error}") from None
         if lines and tuple(lines[0]) != COLUMNS:
             raise ExperimentError(
-                f"{self.file}:1: the columns are not those of a session; give another folder"
+                f"{self.file}:1: the file has other columns than a session; give another folder"
             )
         for number, cells in enumerate(lines[1:], start=2):
             self._replay(f"{self.file}:{number}", dict(zip(COLUMNS, cells, strict=False)))
@@ -277,7 +286,7 @@ class StaircaseSession:
         trial = self.next_trial()
         if trial is None:
             raise ExperimentError(
-                f"{where}: the session has {self.plan.trials} trials, the file more; give --trials"
+                f"{where}: the file has more than {self.plan.trials} trials; increase --trials"
             )
         expected = {
             "participant": self.plan.participant,
@@ -302,7 +311,7 @@ class StaircaseSession:
         self._count(trial, int(cells["answer"]) == trial.stiffer)
 
     def result(self) -> dict[str, Any]:
-        """Return the estimate as a row of the command's result."""
+        """Return the estimated Weber fraction and lapse rate as a row of the command's result."""
         low, high = self.estimator.interval
         return {
             "participant": self.plan.participant,
@@ -329,7 +338,7 @@ def _csv_line(cells: Sequence[object]) -> str:
 async def run_session(
     session: StaircaseSession, present: Present, progress: Callable[[int, int], None]
 ) -> None:
-    """Present the remaining trials of a session and record each answer at once."""
+    """Present the remaining trials of a session, and store each answer immediately."""
     while (trial := session.next_trial()) is not None:
         progress(session.done, session.plan.trials)
         session.record(trial, await present(trial))

@@ -1,4 +1,4 @@
-"""Present pairs of stiffness with a running graph, and ask the participant through the operator."""
+"""Present pairs of soft objects with a running graph; the operator types the answers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Instructions for the operator
 
 
 class PeakMonitor:
-    """Largest push depth and measured force since the last reset; None without a measurement."""
+    """Maximum push depth and measured force since the last reset; None without measurements."""
 
     def __init__(self) -> None:
         self.reset()
@@ -48,7 +48,7 @@ class PeakMonitor:
 
 
 class PairPresenter:
-    """Presentation of the pairs of a session by the soft object of a running graph."""
+    """Presenter that shows the pairs of a session by changing the modulus of a graph's object."""
 
     def __init__(self, driver: Driver, scene: Scene, ask: Ask) -> None:
         self._driver, self._scene, self._ask = driver, scene, ask
@@ -85,7 +85,7 @@ class PairPresenter:
 
 
 def replace_modulus(scene: Scene, modulus_pa: float) -> Scene:
-    """Return the scene with another Young's modulus; raise ExperimentError for a rigid object."""
+    """Return the scene with this Young's modulus; raise ExperimentError for a rigid object."""
     material = scene.object.material
     if material is None:
         raise ExperimentError(
@@ -98,7 +98,7 @@ def replace_modulus(scene: Scene, modulus_pa: float) -> Scene:
 
 
 async def open_terminal() -> Ask:
-    """Return a function that asks on stderr and awaits a line of stdin, without blocking."""
+    """Return a function that prints a question on stderr and awaits the answer from stdin."""
     reader = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(
         lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
@@ -115,9 +115,9 @@ async def open_terminal() -> Ask:
 
 
 def make_jnd_procedure(run: Callable[[PairPresenter], Awaitable[None]]) -> Procedure:
-    """Make a procedure that presents pairs on the graph.
+    """Make a procedure for `run_experiment` that presents pairs on the graph.
 
-    run: coroutine function that runs the session with the presenter.
+    run: coroutine function that runs the session with the given presenter.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:

@@ -229,7 +229,7 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
 def draw_hand_gestures(forces: Mapping[tuple[str, str], FeltForce], path: Path) -> None:
     """Draw felt and wanted force over time, one row per hand and one column per gesture.
 
-    forces: by the hand and the gesture.
+    forces: felt and wanted forces by hand and gesture.
     """
     hands, names = (list(dict.fromkeys(key[number] for key in forces)) for number in (0, 1))
     figure = Figure(figsize=(3.4 * len(names), 2.2 * len(hands)), layout="constrained")

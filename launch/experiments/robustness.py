@@ -70,7 +70,7 @@ def run_robustness(
     """
     if commissioned and calibrated:
         raise ExperimentError(
-            "--commissioned calibrates the devices itself, --calibrated samples calibrated ones; "
+            "--commissioned and --calibrated exclude each other: both give calibrated devices; "
             "give one of the two"
         )
     plan = load_graph(launch_file, settings=settings)
@@ -130,8 +130,8 @@ def run_robustness(
 def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Return median, 95 % quantile and maximum of each metric, and the seed of the maximum.
 
-    For a metric without values they are None. Also count the trials with the metric, those out of
-    tolerance, and of the latter those in which no self-check suspected a cause.
+    For a metric without values they are None. Also count the trials with the metric, the trials
+    out of tolerance, and among these the trials in which no self-check suspected a cause.
     """
     summary: dict[str, dict[str, float | None]] = {}
     for metric in METRICS:

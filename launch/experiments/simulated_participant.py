@@ -1,7 +1,7 @@
-"""Simulate a participant of the stiffness experiment, independently of the estimator.
+"""Simulate a participant of the stiffness experiment, in order to test the estimator.
 
 The participant perceives the logarithm of each stiffness with normal noise, prefers one interval,
-and sometimes does not attend. The estimator knows none of these parameters and no interval bias.
+and sometimes answers at random. The estimator does not know these parameters.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ SEED_STREAM = 75
 """Second element of the random seed; it makes the participant independent of the session."""
 
 WEBER_RANGE = (0.08, 0.3)
-"""Range of Weber fractions; published ones of stiffness are 0.07 (force cue) to 0.23."""
+"""Range of Weber fractions; published values for stiffness are 0.07 (force cue) to 0.23."""
 
 MAX_LAPSE_RATE = 0.05
 BIAS_SIGMAS = 0.2
@@ -25,10 +25,10 @@ BIAS_SIGMAS = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Perception:
-    """Parameters of a participant.
+    """Parameters of the perception of a simulated participant.
 
-    noise: standard deviation of the perceived logarithm of a stiffness. bias: value added to the
-    second one. lapse_rate: fraction of trials that are answered at random.
+    noise: standard deviation of the perceived logarithm of a stiffness. bias: value added to
+    that of the second object. lapse_rate: fraction of trials that are answered at random.
     """
 
     noise: float
@@ -37,15 +37,15 @@ class Perception:
 
     @property
     def weber_fraction(self) -> float:
-        """Return the increment of 75 % correct answers of an attentive, unbiased participant."""
+        """Return the increment with 75 % correct answers if attentive and unbiased."""
         return math.expm1(NormalDist(0.0, math.sqrt(2.0) * self.noise).inv_cdf(0.75))
 
 
 class SimulatedParticipant:
-    """Participant that compares two noisy percepts; equal seeds give equal answers.
+    """Simulated participant that compares two noisy percepts; equal seeds give equal answers.
 
-    The noise of a trial depends on its number only, so that an interrupted session continues with
-    the same answers.
+    The noise of a trial depends only on the seed and the number of the trial, so that an
+    interrupted session continues with the same answers.
     """
 
     def __init__(self, seed: int, perception: Perception | None = None) -> None:
@@ -53,7 +53,7 @@ class SimulatedParticipant:
         self.perception = perception or draw_perception(seed)
 
     def answer(self, trial: int, first_pa: float, second_pa: float) -> int:
-        """Return the interval, 1 or 2, that appears to be the stiffer one."""
+        """Return the interval, 1 or 2, in which the object appears stiffer."""
         random = np.random.default_rng((self._seed, SEED_STREAM, trial))
         mind = self.perception
         if random.random() < mind.lapse_rate:
@@ -64,7 +64,7 @@ class SimulatedParticipant:
 
 
 def draw_perception(seed: int) -> Perception:
-    """Draw the parameters of a participant."""
+    """Return random parameters of a participant."""
     random = np.random.default_rng((seed, SEED_STREAM))
     low, high = np.log(WEBER_RANGE)
     weber = math.exp(random.uniform(low, high))

@@ -2,9 +2,9 @@
 
 The nodes' methods are called at the simulated times at which the nodes would call them: at the
 exposure, when its image arrives, when its target takes effect, and in each arm cycle. Results do
-not depend on the load of the computer and repeat exactly. Not simulated are images, the path check
-before the first motion, the synchronization of the arms, and stops. The soft body applies no force,
-so that the sheet keeps its stretch.
+not depend on the load of the computer and are reproducible. Images, the path check before the first
+motion, the synchronization of the arms, and stops are not simulated. The soft body applies no
+force, so that the sheet keeps its stretch.
 
 The ground truth comes from the simulator: camera, servos, flange compliance and sheet surface.
 """
@@ -64,8 +64,8 @@ CYCLE_S = 0.0071
 """Period of the commands to the arms."""
 
 READ_OUT_S, COMPUTING_S, SENDING_S = 0.004, 0.002, 0.001
-"""Time to read out the camera, unless the apparatus states it; from there to the published target;
-and from the target to the arm command that it causes."""
+"""Durations of the camera's read-out (unless the apparatus states it), of the computation from then
+to the published target, and of sending the target until an arm command uses it."""
 
 PIXEL_NOISE_PX = 0.02
 PREDICTION_STEP_S, PREDICTION_S = 0.01, 0.12
@@ -73,7 +73,7 @@ SERVO_LAG_S = 0.025
 """Servo lag of the simulated arms, unless the apparatus states it."""
 
 MAX_LAG_S, MAX_EXTRAPOLATION_S = 0.1, 0.06
-"""Parameters of the arm bridges."""
+"""Maximum measured servo lag, and maximum extrapolation time of a target, as in the bridges."""
 
 SETTLING_S = 2.0
 """Time for which the finger rests at the start of the path, until the sheet has reached it."""
@@ -83,8 +83,8 @@ SETTLING_S = 2.0
 class LoopSettings:
     """Settings of a run.
 
-    tracking: method. planner: parameters of the planner by name. lag_known: whether the bridges
-    know the true servo lag of the arms, as a reference for runs in which they measure it.
+    tracking: tracking method. planner: parameters of the planner by name. lag_known: whether the
+    bridges know the true servo lag of the arms, as a reference for runs in which they measure it.
     computing_s: time from the end of the read-out to the published target.
     """
 
@@ -96,7 +96,7 @@ class LoopSettings:
 
 
 class MeasuredFinger:
-    """Simulated camera with pixel noise, and the tracker of the triangulator."""
+    """Simulated camera with pixel noise, and the triangulator's tracking of the finger."""
 
     def __init__(self, scene: Scene, settings: LoopSettings) -> None:
         self._camera, self._geometry = scene.camera, StereoGeometry.of(scene.camera, None)
@@ -131,7 +131,7 @@ class MeasuredFinger:
 
 
 class SimulatedArm:
-    """Arm with the methods of its bridge and the simulator's servo."""
+    """Simulated arm: the control methods of its bridge, and the simulator's servo."""
 
     def __init__(
         self, scene: Scene, side: Side, truth: ArmTruth, sheet: SheetMotion, *, lag_known: bool
@@ -238,7 +238,7 @@ class SimulatedSheet:
 
 
 class SimulatedLoop:
-    """Camera, tracking, planner, arms and sheet in simulated time; a coupled finger if wanted."""
+    """Camera, tracking, planner, arms and sheet in simulated time, optionally with a hand."""
 
     def __init__(
         self,
@@ -308,7 +308,7 @@ def follow_in_simulated_time(
 ) -> dict[str, Any]:
     """Simulate the sheet for a finger path; return its errors as `FollowedFinger.figures` does.
 
-    servo_lag_ms: servo lags that the two bridges have measured at the end.
+    The key `servo_lag_ms` has the servo lags that the two bridges have measured at the end.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
@@ -345,9 +345,9 @@ def follow_in_simulated_time(
 
 @dataclass(frozen=True, slots=True)
 class TouchRecording:
-    """Run of a coupled finger, sampled at the exposures.
+    """Touch of a simulated hand that the sheet pushes, sampled at the exposures.
 
-    times_s (n,). positions_m (n, 3): true fingertip.
+    times_s (n,): times of the exposures. positions_m (n, 3): true fingertip.
     phases (n,): contact phase of the planner. delay_s: time from an exposure to the sheet's motion.
     steps (k, 3): time (s), indentation of the sheet (m) and its force (N) of each time step.
     watchdog_triggers: number of oscillations that the planner stopped; None: unknown.
@@ -371,9 +371,9 @@ def touch_in_simulated_time(
     apparatus: Apparatus | None = None,
     settings: LoopSettings | None = None,
 ) -> TouchRecording:
-    """Simulate a hand that touches the sheet and is pushed by it, along a voluntary path.
+    """Simulate a hand that moves along a voluntary path and is pushed by the touched sheet.
 
-    curve: force of the object over depth, (m, 2) in m and N. bounds: the planner's bounds on the
+    curve (m, 2): depths (m) and forces (N) of the object. bounds: the planner's bounds on the
     sheet's offset.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()

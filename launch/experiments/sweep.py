@@ -112,8 +112,8 @@ def run_sweep(
     """Run the trials that have no row yet, and return all rows by name, in the trials' order.
 
     trials: JSON description of each trial for `trial.run_trial`. workers: number of simultaneous
-    trials on this computer; a scheduler has its own. A failed trial has a row with the key `error`
-    and does not stop the others.
+    trials on this computer; ignored if a scheduler is given. scheduler: address of the scheduler
+    that runs the trials. A failed trial has a row with the key `error`; the other trials go on.
     """
     open_sweep(folder, settings)
     done = read_rows(folder, trials)

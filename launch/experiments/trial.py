@@ -42,7 +42,7 @@ Row = dict[str, Any]
 
 @contextmanager
 def _bag_of(trial: Mapping[str, Any]) -> Iterator[Path]:
-    """Yield the path of the trial's bag. If the trial names none, it is deleted afterwards."""
+    """Yield the path of the trial's bag; a bag that the trial does not name is temporary."""
     if trial.get("bag"):
         yield Path(trial["bag"])
         return
@@ -87,7 +87,7 @@ def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the errors of a random apparatus: of sheet and finger in motion, others at rest."""
+    """Return errors with a random apparatus: sheet and finger in motion, others at rest."""
     apparatus_file, launch_file = trial["apparatus"], Path(trial["launch_file"])
     commissioning: Row = {}
     if trial.get("commission_folder"):
@@ -121,9 +121,9 @@ def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def _commission(trial: Mapping[str, Any]) -> tuple[Row, Path, str]:
-    """Commission the laboratory of a trial; return its row, launch file and apparatus file.
+    """Run `commission` for a trial; return result, launch file and apparatus file.
 
-    The stroke of the trial takes the place of the verification.
+    The step "verification" is omitted, because the trial runs a stroke anyway.
     """
     from flexsheet.launch.calibration.commission import APPARATUS_FILE, StepName
     from flexsheet.launch.commands.commission import summarize

@@ -1,6 +1,6 @@
 """Compute how well the sheet of a scene can render its object's force at each push depth.
 
-The planner does so by moving the sheet along its normal, so that the finger feels the force.
+The planner renders the force by moving the sheet along its normal.
 """
 
 from __future__ import annotations
@@ -94,11 +94,11 @@ def compute_compliance(
 
 
 class LoopRisk(StrEnum):
-    """Consequence of a scene that asks the loop of sheet and hand for more than is stable.
+    """Risk that the feedback loop of sheet and hand is unstable or renders the force wrongly.
 
-    OSCILLATION: a hand of low damping can oscillate, since the sheet retreats too late.
-    DELAY: the stable advance of the sheet is too small to render the object's force.
-    SHEET: the sheet cannot render the object's force at any delay.
+    OSCILLATION: a hand of low damping can oscillate, since the sheet moves away too late.
+    DELAY: the delay limits the stable offset of the sheet too much to render the object's force.
+    SHEET: the sheet cannot render the object's force, even without delay.
     """
 
     OSCILLATION = "oscillation"
@@ -108,7 +108,7 @@ class LoopRisk(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopFinding:
-    """Result of `find_loop_risk`.
+    """Risk of the feedback loop of sheet and hand, as found by `find_loop_risk`.
 
     delay_s: time from a measured depth until the sheet has moved accordingly. error_ratio: largest
     relative error of the rendered force within the stable bounds.
@@ -119,7 +119,7 @@ class LoopFinding:
     error_ratio: float
 
     def describe(self) -> str:
-        """Return the finding as a sentence with its remedy."""
+        """Return a text that states the risk and its remedy."""
         delay_ms, error_percent = 1e3 * self.delay_s, 100.0 * self.error_ratio
         match self.risk:
             case LoopRisk.OSCILLATION:
@@ -146,7 +146,7 @@ def find_loop_risk(
     table: OffsetBoundsTable,
     delay_s: float,
 ) -> LoopFinding | None:
-    """Return what the scene asks for beyond the range of sheet, delay and hand, if anything."""
+    """Return the risk of the feedback loop of sheet and hand at a delay; None without risk."""
     bounded = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
     error_ratio = float(np.abs(bounded.centre.error_ratio).max())
     if not bounded.choose_filter_s()[1]:
@@ -159,11 +159,11 @@ def find_loop_risk(
 
 
 def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
-    """Return the risk of the loop of sheet and hand in a graph, before it starts.
+    """Return the risk of the feedback loop of sheet and hand in a graph, before it starts.
 
     The delay is that of the planner's parameters. Only cached data are used, since computing them
-    takes up to minutes: without the stability bounds or the soft body there is no finding, and the
-    planner reports the risk when it has them.
+    takes up to minutes. If the stability bounds or the soft body are not cached, None is returned;
+    the planner reports the risk when they have been computed.
     """
     scene = plan.scene_message()
     planners = [node for node in plan.nodes.values() if node.type == "planner"]

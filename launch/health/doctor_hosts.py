@@ -168,7 +168,7 @@ REQUIRED_FOR_CHECKS = {
 def check_apparatus(
     probe: HostProbe, nodes: Sequence[ResolvedNode], scene: Scene | None = None
 ) -> Iterator[HostFinding]:
-    """Report the causes that the nodes' self-checks suspect, and the checks that are off."""
+    """Report calibration errors that the nodes' self-checks suspect, and disabled self-checks."""
     checks = [one for status in probe.nodes.values() for one in status.self_checks]
     suspected = [one for one in checks if one.suspected]
     for one in suspected:

@@ -61,12 +61,15 @@ Figures = Mapping[SystemMetric, float]
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """Parts of the metrics that the methods do not explain, learned from runs of the graph."""
+    """Excess of measured over predicted system metrics, learned from runs of the graph.
+
+    It is added to later predictions, because the errors of the single methods do not explain it.
+    """
 
     parts: Figures = field(default_factory=dict)
 
     def learn(self, predicted: Figures, measured: Figures) -> Unexplained:
-        """Return the parts updated from a run, whose metrics were predicted without such parts."""
+        """Return the excess updated with a run; `predicted` are its metrics without any excess."""
         parts = dict(self.parts)
         for metric, value in measured.items():
             known = predicted.get(metric, 0.0)
@@ -77,7 +80,7 @@ class Unexplained:
 
 
 def predict(combination: Combination, unexplained: Unexplained | None = None) -> Figures:
-    """Predict the metrics of a combination: spreads add as squares, biases linearly."""
+    """Predict the system metrics of a combination: spreads add as squares, biases linearly."""
     squares: dict[SystemMetric, float] = {}
     sums: dict[SystemMetric, float] = {}
     for option in combination.values():

@@ -190,7 +190,8 @@ def run_system_chart(
 ) -> dict[str, Any]:
     """Measure the configurations for all scenes; return the result of `chart system --json`.
 
-    blocks: per scene. seconds: duration of the stroke. apparatuses: number of random ones.
+    blocks: number of repetitions per scene. seconds: duration of each stroke. apparatuses: number
+    of random apparatuses.
     """
     points: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []

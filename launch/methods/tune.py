@@ -64,10 +64,9 @@ class UnknownTunableError(FlexsheetError, KeyError):
 class Tunable:
     """Method family whose method can be chosen in a scene.
 
-    families: its parts as `module:NAME`, in the order of
-    measurement. Later parts take minutes to prepare and are measured only if no earlier method is
-    sufficient. settings: value to write into the scene for each method, by the method's name in
-    the family's chart.
+    families: families of which it consists, as `module:NAME`, in the order of measurement. Later
+    ones take minutes to prepare and are measured only if no earlier method is sufficient. settings:
+    value to write into the scene for each method, by the method's name in the family's chart.
     """
 
     name: str

@@ -79,7 +79,7 @@ def list_writers(
 def resolve_further_inputs(
     entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
-    """Add the inputs that depend on a node's parameters, as of recorder and console."""
+    """Add the inputs that depend on parameters, such as those of recorder and console."""
     written = [topic for topic in TOPICS.values() if topic.name in writers]
     for entry in entries:
         if entry.type is None or entry.parameters is None:

@@ -87,7 +87,7 @@ class ArmGeometry:
         return _base_from_flange(tuple((joints_rad + self._joint_offsets_rad).tolist()))
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
-        """Return the world pose (4, 4) of the flange of a rigid arm.
+        """Return the world pose (4, 4) of the flange, without the compliance of the arm.
 
         joints_rad: angles (6,) that the encoders report.
         """
@@ -104,7 +104,7 @@ class ArmGeometry:
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
         """Return joints (6,) rad that place this arm's edge for a pose of the sheet.
 
-        They are near the present joints, and hold the edge against the tension of the sheet.
+        They are near the present joints, and compensate the displacement by the sheet's tension.
         Raises UnreachableError if there are none.
         """
         edge = motion.world_from_sheet.copy()
@@ -112,18 +112,18 @@ class ArmGeometry:
         return self.solve_joints(flange_pose(edge, self.flange_from_edge), present_rad)
 
     def edge_offset_m(self, stretch_ratio: float) -> float:
-        """Return where to command the edge along x of the sheet, from its centre.
+        """Return the commanded position of the edge along the sheet's x axis, from its centre.
 
-        The tension of the sheet moves the flange from there towards the other one.
+        The tension of the sheet moves the flange from this position towards the other flange.
         """
         length_m = stretch_ratio * self.sheet_limits.width_m
         moved_m = self._compliance_m_per_n * self.sheet_limits.force_n(length_m)
         return (-1.0 if self.left else 1.0) * (0.5 * length_m + moved_m)
 
     def solve_joints(self, world_from_flange: Floats, near_rad: Floats) -> Floats:
-        """Return the encoder angles (6,) rad, near given ones, for the flange of a rigid arm.
+        """Return encoder angles (6,) that place the flange of a rigid arm at a pose (4, 4).
 
-        Raises UnreachableError if there are none.
+        They are near `near_rad`. Raises UnreachableError if there are none.
         """
         offsets_rad = self._joint_offsets_rad
         base_from_flange = self.base_from_world @ world_from_flange
@@ -133,7 +133,7 @@ class ArmGeometry:
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
         """Return the sheet at rest between this arm's edge and the other one.
 
-        Both are world poses of the edges if the arms were rigid.
+        own_edge, other_edge: world poses (4, 4) that the edges would have if the arms were rigid.
         """
         limits = self.sheet_limits
         left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)

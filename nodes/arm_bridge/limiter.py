@@ -280,9 +280,9 @@ def _longest(shifts: Floats) -> float:
 
 
 def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
-    """Return the largest blend from slow to fast shifts (n, 3) none of which is too long.
+    """Return the largest blend of slow and fast shifts (n, 3) for which no shift is too long.
 
-    It is the least solution of |slow + blend (fast - slow)| = max_shift_m over all shifts.
+    It is the smallest solution of |slow + blend (fast - slow)| = max_shift_m for any shift.
     """
     change = fast - slow
     square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)

@@ -140,7 +140,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
     *joints, refused, crc = rest
     if magic != MAGIC:
         raise ArmAnswerError(
-            f"status magic 0x{magic:04x}, expected 0x{MAGIC:04x}: another register map"
+            f"status magic 0x{magic:04x}, expected 0x{MAGIC:04x}: unknown register map"
         )
     if version != VERSION:
         raise ArmAnswerError(f"register map version {version}, expected {VERSION}")

@@ -1,8 +1,9 @@
 """Estimate the pull of the sheet on an arm from the arm's motor currents.
 
-A current that differs from that of the same pose without the sheet is a torque of the joint. Static
-friction of the gears adds an unknown torque of about a tenth of the rated one, so that the estimate
-is good for detecting a wrong sheet tension of some newtons, not for calibrating the sheet.
+The difference of a current from that in the same pose without the sheet is proportional to a torque
+of the joint. Static friction of the gears adds an unknown torque of about a tenth of the rated one.
+The estimate therefore detects errors of the sheet's tension of several newtons, but is not precise
+enough to calibrate the sheet.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 STEP_RAD = 1e-5
 MAX_SPEED_RAD_PER_S = 0.02
-"""Joint speed above which currents contain sliding friction and acceleration."""
+"""Joint speed above which currents also depend on sliding friction and acceleration."""
 
 PERIOD_NS = 50_000_000
 
 
 class MotorForceCalibration(LimitedModel):
-    """Constants that convert motor currents to a force; measure them (docs/force.md)."""
+    """Constants that convert motor currents to a force; to measure them, see docs/force.md."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -36,11 +37,11 @@ class MotorForceCalibration(LimitedModel):
         description="torque of each joint per percent of its motor's rated current, N m"
     )
     unloaded_percent: Six = Field(
-        description="currents at the working pose without the sheet, percent of the rated ones"
+        description="currents at the working pose without the sheet, percent of the rated currents"
     )
     friction_percent: Positive = Field(
         default=10.0,
-        description="standard deviation of a current because of static friction, percent",
+        description="standard deviation of a motor current that static friction causes, percent",
     )
 
 
@@ -51,10 +52,11 @@ def estimate_pull_n(
     edge_flange_m: Floats,
     towards_base: Floats,
 ) -> tuple[float, float]:
-    """Return the pull on the edge in the direction `towards_base`, and its standard deviation, N.
+    """Return the pull on the edge towards the base, and its standard deviation, N.
 
-    joints_rad, currents_percent: (6,). edge_flange_m: centre of the edge, flange frame (3,).
-    towards_base: unit vector (3,). The fit is weighted least squares over the joints.
+    joints_rad, currents_percent: (6,). edge_flange_m: centre (3,) of the edge in the flange frame.
+    towards_base: direction of the pull, a unit vector (3,). The fit over the joints is by weighted
+    least squares.
     """
     at_edge = np.append(edge_flange_m, 1.0)
     edge_m = (forward(joints_rad) @ at_edge)[:3]
@@ -70,7 +72,7 @@ def estimate_pull_n(
 
 
 class MotorForceEstimator:
-    """Estimator of the pull of the sheet, at most 20 times per second."""
+    """Estimator of the sheet's pull on an arm, which gives up to 20 estimates per second."""
 
     def __init__(self, calibration: MotorForceCalibration, side: Side) -> None:
         self._calibration, self._side = calibration, side
@@ -85,7 +87,7 @@ class MotorForceEstimator:
         edge_flange_m: Floats,
         towards_base: Floats,
     ) -> Force | None:
-        """Return the force at a time; None if it is too early for another one."""
+        """Return the estimated force at a time; None if the last estimate is too recent."""
         before_ns, before_rad = self._last_ns, self._last_rad
         if before_ns is not None and at_ns - before_ns < PERIOD_NS:
             return None

@@ -13,9 +13,9 @@ LAG_THRESHOLD_S = 0.01
 deviations of a calibrated lag (2 ms)."""
 
 TRACKING_THRESHOLD_RAD = 0.005
-"""Excess of the tracking error over that of an ideal servo with the measured lag, above which the
-arm is suspected not to follow.  It is 2 mm at 0.4 m, four times the effect of the largest tabulated
-backlash (0.6 mrad per joint)."""
+"""Excess of the tracking error over the error of an ideal servo with the measured lag, above which
+the arm is suspected not to follow.  It is 2 mm at 0.4 m, four times the effect of the largest
+tabulated backlash (0.6 mrad per joint)."""
 
 
 class ServoCheck:

@@ -104,7 +104,7 @@ class VideoReader:
         self._pairing = Pairing(1.0 / rate_hz)
 
     def read(self) -> ImagePair | None:
-        """See `Reader`."""
+        """Return the next image pair; None at the end.  Raises DeviceError."""
         frames = self._next()
         if frames is None and self._source.loop:
             self.close()
@@ -161,8 +161,8 @@ class VideoReader:
 class _LoopClock:
     """Continuous time for a file that is read repeatedly.
 
-    The interval between two passes is that between the last two images of the file.  rate_hz: rate
-    that gives this interval for a file with one image only.
+    The interval between two passes equals the interval between the last two images of the file.
+    rate_hz: frame rate, which determines the interval for a file with a single image.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -254,7 +254,7 @@ class ImagesReader:
         self._clock = _LoopClock(rate_hz)
 
     def read(self) -> ImagePair | None:
-        """See `Reader`."""
+        """Return the next image pair; None at the end.  Raises DeviceError."""
         if self._next == len(self._pairs):
             if not self._loop:
                 return None

@@ -150,7 +150,7 @@ def describe_skew(skew_s: float, limit_s: float) -> str:
 def convert_to_gray(image: NDArray[Any]) -> Image:
     """Convert a decoded image to grey (h, w).
 
-    image: grey (h, w), brightness in the first of one or two channels (h, w, 1 or 2), or BGR.
+    image: grey (h, w) or (h, w, 1); brightness and another channel (h, w, 2); or BGR (h, w, 3).
     """
     if image.ndim == 3:
         image = image[:, :, 0] if image.shape[2] < 3 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)

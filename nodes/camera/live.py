@@ -34,7 +34,8 @@ RELEASE_S = 0.5
 class CapturedFrame:
     """Image of one camera with two estimates of its mid-exposure time, ns.
 
-    by_arrival_ns: from the arrival. by_stamp_ns: from the driver's timestamp; None: not available.
+    by_arrival_ns: computed from the arrival. by_stamp_ns: computed from the driver's timestamp;
+    None if there is none.
     """
 
     image: Image
@@ -196,7 +197,7 @@ class CameraReader:
             stream.start()
 
     def read(self) -> ImagePair | None:
-        """See `Reader`."""
+        """Wait for the next image pair and return it.  Raises DeviceError."""
         with self._changed:
             counts = [stream.count for stream in self._streams]
             limit_ns = self._now() + round(1e9 * self._wait_s)
@@ -275,7 +276,7 @@ class CameraReader:
         )
 
     def interrupt(self) -> None:
-        """See `Reader`."""
+        """Make `read` return None soon, now and later.  Thread-safe."""
         with self._changed:
             self._interrupted = True
             self._changed.notify_all()

@@ -91,7 +91,7 @@ class FingerController:
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
-        """Apply the request to another object; picker: None while the object's shape is unknown."""
+        """Replace the object; picker: finder of surface points, None if the shape is unknown."""
         self._picker = picker
         self._update_target()
 

@@ -85,7 +85,7 @@ def make_paragraph(html: str) -> str:
 def make_latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
     """Make the legend of the latency chart, with the values of each series.
 
-    latencies: by name of the series, the latest and the maximum value (ms); NaN if there is none.
+    latencies: latest and maximum value (ms) by the name of the series; NaN if there is none.
     """
     rows = []
     for line, (name, (newest, worst)) in zip(LINES, latencies.items(), strict=True):
@@ -103,7 +103,7 @@ def make_latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
 def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
     """Make the table of the nodes: state, processor load, last error or note.
 
-    statuses: by name of the node, its latest status and the status's age (s).
+    statuses: latest status of each node and its age (s), by the name of the node.
     """
     rows = []
     for name, (status, age_s) in sorted(statuses.items()):
@@ -132,7 +132,7 @@ def make_topics_table(
 ) -> str:
     """Make the table of the topics: rate, maximum age at the readers, and lost messages.
 
-    statuses: as in `make_nodes_table`. sampling_readers: nodes that skip messages by design and are
+    statuses: see `make_nodes_table`. sampling_readers: nodes that skip messages by design and are
     therefore not counted as readers.
     """
     written: dict[str, list[PortStatus]] = {}

@@ -28,10 +28,11 @@ from flexsheet.nodes.models.shapes import Shape, make_shape
 Floats = NDArray[np.float64]
 
 QUICK_TABLE = "quick_table"
-"""Name of the method that uses the first table, of few snapshots."""
+"""Name of the method that uses the coarse table, which is computed first from few snapshots."""
 LINEAR_ERROR_RATIO, QUICK_ERROR_RATIO, TABLE_ERROR_RATIO, UNCORRECTED_RATIO = 0.25, 0.1, 0.03, 0.15
-"""Stated relative errors of the force above a depth of 1 mm: of the linear method, of the quick
-table, and of the table with and without the correction by a fine push (docs/soft-body.md)."""
+"""Stated relative errors of the force at depths above 1 mm: of the linear method, of the coarse
+table, and of the complete table with and without correction by a push on a fine mesh
+(docs/soft-body.md)."""
 
 
 def make_soft_body_spec(
@@ -204,7 +205,7 @@ def attach_table(
 ) -> SceneBody:
     """Return a copy of the body that uses the nonlinear table as its method.
 
-    quick: whether the table is the first one, of few snapshots.
+    quick: whether it is the coarse table of few snapshots.
     """
     method = TableSoftBody(
         model.response,
@@ -222,9 +223,9 @@ def attach_table(
 
 
 def blend_responses(old: Response, new: Response, weight: float) -> Response:
-    """Return the weighted mean of two responses; weight: that of the new one, 0 to 1.
+    """Return the weighted mean of two responses; weight: weight of the new response, 0 to 1.
 
-    The other fields and the depths of the force curve are those of the new one.
+    The other fields, and the depths of the force curve, are those of the new response.
     """
     depths = new.force_curve[:, 0]
     before = np.interp(depths, old.force_curve[:, 0], old.force_curve[:, 1])

@@ -20,8 +20,8 @@ MAX_POISSON_RATIO = 0.4999
 """Maximum Poisson's ratio. Closer to 0.5, the bulk modulus is so large that rounding errors destroy
 the solution."""
 MIN_VOLUME_RATIO = 1e-6
-"""Minimum Jacobian of an element over the cube of its edge length. For flatter elements, rounding
-errors destroy the solution."""
+"""Minimum ratio of an element's Jacobian to the cube of its edge length. For flatter elements,
+rounding errors destroy the solution."""
 
 
 class SolidMeshError(FlexsheetError, ValueError):

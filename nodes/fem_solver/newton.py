@@ -354,7 +354,7 @@ class NeoHookeanBody:
     def _check_validity(self, displacement: Floats, centre: Floats) -> None:
         """Raise NewtonNotConvergedError for inverted elements or a sphere centre inside the body.
 
-        The latter is checked because no penalty acts on a finger that is completely inside the
+        The sphere is checked because no penalty acts on a finger that is completely inside the
         body.
         """
         ratio = self.solid.min_volume_ratio(displacement)

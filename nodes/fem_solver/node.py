@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 POLL_S = 0.05
 BLEND_S = 5.0
-"""Time in which the response changes from that of one method to that of a better one."""
+"""Duration of the gradual change from the responses of one method to those of a better one."""
 
 
 class FemSolver(Node):
@@ -92,7 +92,7 @@ class FemSolver(Node):
             self.note = f"soft body ready, {self._describe(bodies[0])}"
 
     def _describe(self, current: body.SceneBody) -> str:
-        """Return the method that answers, with its stated error, for the node's status."""
+        """Return a text for the node's status: method in use, its force error, and skin nodes."""
         nodes = len(current.skin.vertices_world_m)
         percent = 100.0 * current.force_error_ratio
         return f"{current.method.name}, force within {percent:.0f} %, {nodes} skin nodes"
@@ -139,7 +139,7 @@ class FemSolver(Node):
     async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
         """Compute the nonlinear table in the background and use it when it is finished.
 
-        In the meantime, the linear method computes the responses, and then a quick table.
+        Until then, the responses come from the linear method, and later from a coarse table.
         """
         loop = asyncio.get_running_loop()
         stop = self._stop
@@ -203,7 +203,7 @@ class FemSolver(Node):
     def _blend_in(
         self, response: Response, respond: Callable[[body.SceneBody], Response]
     ) -> Response:
-        """Return the response, blended with those of bodies that were replaced recently."""
+        """Return the response as a weighted mean with those of recently replaced bodies."""
         now_ns = self.clock.now_ns()
         fractions = [(now_ns - at_ns) / 1e9 / BLEND_S for _, at_ns in self._replaced]
         while fractions and fractions[0] >= 1.0:

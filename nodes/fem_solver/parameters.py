@@ -17,7 +17,7 @@ class FemSolverParameters(NodeParameters):
         default="auto",
         description="Method that computes the deformation. auto: the method that the scene "
         "specifies, or else nonlinear_table. nonlinear_table: if the table is not cached, it is "
-        "computed in the background: a quick one in about a minute, then the whole.",
+        "computed in the background: first a coarse one in about a minute, then the complete one.",
     )
     skin_spacing_m: Positive | Literal["auto"] = Field(
         default="auto",

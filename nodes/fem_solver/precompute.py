@@ -311,6 +311,6 @@ def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
 
 
 def load_or_compute(spec: SoftBodySpec, cache_dir: Path, progress: Progress) -> SoftBodyModel:
-    """Load the cached model, or compute and store it; raises as `compute` and `cached`."""
+    """Load the cached model, or compute and store it; raises the errors of both functions."""
     entry = response_cache(spec)
     return cached(entry, cache_dir, lambda: compute(spec, progress, entry.checkpoints(cache_dir)))

@@ -136,7 +136,7 @@ class LostWorkersError(WorkersError):
 
 
 def code_version() -> str:
-    """Return the version of the code that computes snapshots, combined from those of its parts."""
+    """Return the version of the code that computes snapshots, from the versions of its parts."""
     return f"{VERSION}.{precompute.VERSION}.{mesh_version}"
 
 
@@ -160,9 +160,9 @@ def compute_table(
     """Load the cached table, or compute and store it.
 
     model: linear response of the same body. workers: how many workers of the executor run on this
-    machine. on_quick: called with a first table of few snapshots (`snapshots.QUICK_COUNT`), which
-    is ready much earlier; None omits it. Raises MemoryError, before any snapshot is solved, if this
-    machine has too little memory for them, and the errors of `cached` and `solve_all`.
+    machine. on_quick: called with a coarse table of `snapshots.QUICK_COUNT` snapshots, which is
+    ready much earlier; None: it is not computed. Raises MemoryError, before any snapshot is solved,
+    if this machine has too little memory for them, and the errors of `cached` and `solve_all`.
     """
     entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)

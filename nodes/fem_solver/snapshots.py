@@ -47,15 +47,16 @@ TOLERANCE, MAX_STEP_RATIO, MIN_STEP_FRACTION = 1e-3, 1.0, 0.25
 """Tolerance, maximum and minimum load step, looser than for a reference solution. They change the
 force by at most 0.04 %, and halve the time."""
 MIN_VOLUME_RATIO = 0.2
-"""Volume ratio of the most compressed element below which a push ends. The next depth would not
-converge, and trying it takes a third of the time of a push."""
+"""Volume ratio of the most compressed element below which a push ends. The solution at the next
+depth would not converge, and would take a third of the time of the push."""
 QUICK_DEPTHS_M = (0.0025, 0.005, 0.010)
 QUICK_COUNT = 9
-"""Depths, and number of sample points, of the first, quick table."""
+"""Depths and number of sample points of the coarse table that is computed first."""
 FINE_DEPTHS_M = (0.0007, 0.0015, 0.003, 0.005, 0.010)
 FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
-"""Fine push for the force: its depths, its skin spacing over that of a snapshot, the distance from
-the push within which it has this spacing (finger radii), and the growth of the element size."""
+"""Push on a fine mesh, which corrects the forces: its depths; the ratio of its skin spacing to that
+of a snapshot; the distance from the push within which it has this spacing, in finger radii; and the
+growth of the element size per distance."""
 SAME_RATIO = 1e-6
 
 
@@ -209,7 +210,7 @@ def order_by_spread(
 ) -> list[SamplePoint]:
     """Return the sample points in an order in which the first ones cover the skin best.
 
-    The first is nearest to the middle of the side that faces the user. Each next one is farthest
+    The first is nearest to the centre of the side that faces the user. Each next one is farthest
     from all previous ones and their mirror images (farthest point sampling).
     """
     points = np.array([sample.point for sample in samples])
@@ -252,7 +253,7 @@ def make_snapshot_job(
     spacing_m: float | None = None,
     depths_m: tuple[float, ...] | None = None,
 ) -> SnapshotJob:
-    """Return the job for pushes at a sample point.
+    """Return the description of the pushes at a sample point, which a worker solves.
 
     If the shape supports it, the job has a new mesh that is fine near the push; otherwise it uses
     `mesh`. spacing_m: skin spacing of the new mesh; None for that of a table. depths_m: push
@@ -272,7 +273,7 @@ def make_snapshot_job(
 def make_fine_job(
     spec: MeshSpec, sample: SamplePoint, *, poisson_ratio: float, finger_radius_m: float
 ) -> SnapshotJob | None:
-    """Return the job for the fine push that corrects the forces of a table.
+    """Return the job for a push on a fine mesh, which corrects the forces of a table.
 
     Returns None for a shape without meshes that are fine only near the push.
     """

@@ -63,7 +63,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Responses to pushes at m contact nodes to L depths, for a Young's modulus of 1 Pa.
+    """Responses to pushes at m contact nodes, each to L depths, for a Young's modulus of 1 Pa.
 
     depths_m (L,): push depths; the first is 0. fields (m, L - 1, 3 s) float32: displacement of the
     s skin nodes at all depths except 0. force_n (m, L, 3): force on the finger. reach_m (m,):
@@ -98,7 +98,7 @@ def fill_table(
     triangles (t, 3): triangles of its skin. linear: linear method for the same response and a
     modulus of 1 Pa; its linear range must contain all blended depths. on_progress: called with the
     number of nodes done and their total; it may raise an exception to stop. fine: push on a fine
-    mesh, by which all forces are corrected, see `compute_force_factors`.
+    mesh with which all forces are corrected (`compute_force_factors`).
     """
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
     points, normals = response.rest[response.contact_nodes], response.normals
@@ -132,11 +132,11 @@ def compute_force_factors(
     """Return the factors (L,) that correct the table's forces at its depths (L,).
 
     The table's meshes are too coarse for small contacts, so that its forces are too large. The
-    excess depends mainly on the depth: contact and mesh are similar everywhere. Each factor is the
-    true force, divided by the table's own force at the same point. The true force is extrapolated
-    from the meshes of the table and of the fine push (Richardson, order 2); where the table blends
-    with the linear method, it is that of the fine push. Beyond the depths of the fine push, the
-    factor is constant.
+    excess depends mainly on the depth, since contact and mesh are similar at all points. Each
+    factor is the ratio of an estimate of the true force to the table's force at the same point. The
+    estimate is extrapolated from the meshes of the table and of the fine push (Richardson, order
+    2). Where the table blends with the linear method, it is the force of the fine push. Beyond the
+    depths of the fine push, the factor is constant.
     """
     sample, push = fine
     solved_m = push.depths_m[: push.reached]
@@ -146,7 +146,7 @@ def compute_force_factors(
     _, force, _ = _fill_levels(sample, response, linear, interpolator, depths)
     coarse_n, fine_n = force @ sample.normal, push.force_n[: push.reached] @ sample.normal
     within = (depths > 0.0) & (depths <= solved_m[-1] * (1.0 + 1e-9))
-    # Hertz: the force over depth^1.5 hardly changes, so that it is interpolated most precisely.
+    # As in Hertz' theory, force / depth^1.5 hardly changes, so its interpolation is precise.
     hertz = np.interp(depths[within], solved_m, fine_n / solved_m**1.5)
     true_n = hertz * depths[within] ** 1.5
     excess_n = np.where(depths[within] >= BLEND_M[1], coarse_n[within] - true_n, 0.0)

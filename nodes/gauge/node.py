@@ -1,4 +1,4 @@
-"""Publish the force that a gauge measures between finger and sheet."""
+"""Publish the force between finger and sheet that a force gauge measures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flexsheet.nodes.parameter_marks import DeviceFile
 
 
 class SerialSource(LimitedModel):
-    """Gauge at a serial port that sends one line of text per measurement."""
+    """Force gauge at a serial port that sends one line of text per measurement."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -36,23 +36,26 @@ class GaugeParameters(NodeParameters):
         default="sheet_normal", description="component that the gauge measures; see topic `force`"
     )
     newtons_per_unit: Finite = Field(
-        default=1.0, description="force per displayed unit; negative if the gauge shows a pull"
+        default=1.0,
+        description="force per displayed unit, N; negative if positive readings mean a pull",
     )
     zero_units: Finite = Field(
-        default=0.0, description="displayed value without contact, which is subtracted"
+        default=0.0, description="reading without contact, in displayed units; it is subtracted"
     )
     standard_deviation_n: NonNegative = Field(
         default=0.02, description="standard deviation of noise and calibration error, N"
     )
     max_force_n: Positive = Field(default=20.0, description="measuring range of the gauge, N")
     delay_s: NonNegative = Field(
-        default=0.0, description="time from the measurement to its arrival, filter included, s"
+        default=0.0,
+        description="time from a measurement to its arrival, including the gauge's filter, s",
     )
     silence_s: Positive = Field(
         default=1.0, description="time without a reading until the force is invalid, s"
     )
     watch_hz: Positive = Field(
-        default=2.0, description="rate at which silence is checked and a lost gauge reopened, Hz"
+        default=2.0,
+        description="rate at which missing readings and a lost connection are checked, Hz",
     )
 
 
@@ -131,7 +134,7 @@ class Gauge(Node):
 
     @periodic("watch_hz")
     def watch(self) -> None:
-        """Reopen a lost gauge, and publish an invalid force while it is silent."""
+        """Reopen a disconnected gauge; publish an invalid force while no readings arrive."""
         if self._reader is None:
             self._open()
         if self.clock.now_ns() - self._last_ns > 1e9 * self.parameters.silence_s:

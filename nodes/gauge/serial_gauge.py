@@ -26,7 +26,7 @@ class GaugeError(FlexsheetError, OSError):
 
 
 class GaugeReader(Protocol):
-    """Interface of a gauge driver: a file descriptor to wait for, and the numbers that arrived."""
+    """Interface of a gauge driver: a file descriptor to wait on, and the received numbers."""
 
     unreadable: int
 
@@ -40,13 +40,13 @@ class GaugeReader(Protocol):
 
 
 class SerialGauge:
-    """Gauge at a serial port, one measurement per line, such as "+0.123 N".
+    """Gauge at a serial port that sends one measurement per line, such as "+0.123 N".
 
     unreadable: number of lines without a finite number.
     """
 
     def __init__(self, port: str, baud: int) -> None:
-        """Open the port without echo and control characters; raises GaugeError."""
+        """Open the port with echo and control characters disabled; raises GaugeError."""
         self.port, self.unreadable, self._rest = port, 0, b""
         speed = getattr(termios, f"B{baud}", None)
         if speed is None:

@@ -218,7 +218,7 @@ def _are_joints(joints_rad: Floats) -> bool:
 
 
 def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
-    """Return weighted mean (6,) and total variance after a value (6,) with the weight `gain`."""
+    """Return weighted mean (6,) and total variance, updated with a value (6,) of weight `gain`."""
     deviation = value - mean
     return mean + gain * deviation, square + gain * (
         (1.0 - gain) * float(deviation @ deviation) - square

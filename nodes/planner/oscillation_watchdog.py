@@ -13,7 +13,7 @@ MIN_AMPLITUDE_M = 2e-4
 """Amplitude of the depth (root mean square) below which an oscillation cannot be felt."""
 
 GROWTH_RATIO = 1.15
-"""Growth of the amplitude over the window, second half to first, that triggers the watchdog."""
+"""Ratio of amplitudes in the second and first half of the window that triggers the watchdog."""
 
 STEADY_RATIO = 0.95
 SUSTAINED_S = 1.5

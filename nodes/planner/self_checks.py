@@ -48,15 +48,15 @@ MAX_FORCE_RATIO = 0.12
 
 MIN_INDENTATION_M = 0.005
 MIN_FORCE_N = 0.2
-"""Smallest push and force that are compared; smaller ones consist of errors of depth and gauge."""
+"""Minimum push depth and force that are compared; below, measurement errors dominate."""
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""Time before and after a measured force in which the indentation must change by less."""
+"""Time before and after a measured force, and maximum change of the indentation in this time."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedPush:
-    """State of the sheet for which a target is valid: stretch, indentation and contact point."""
+    """State of the sheet that the planner commands for a time: stretch, indentation, contact."""
 
     valid_at_ns: int
     stretch_ratio: float
@@ -65,9 +65,10 @@ class PlannedPush:
 
 
 class MeasuredForceCheck:
-    """Comparison of the measured force of the finger with the force model in use.
+    """Comparison of the measured force of the finger with the force that the sheet's model
+    predicts.
 
-    The ratio of both forces is the ratio of the true to the assumed modulus times thickness.
+    Their ratio is the true product of modulus and thickness, divided by the assumed one.
     """
 
     def __init__(self, scene: Scene, model: SheetForceModel) -> None:
@@ -78,14 +79,14 @@ class MeasuredForceCheck:
         self._monitor = ResidualMonitor(1, threshold=MAX_FORCE_RATIO)
 
     def add_push(self, push: PlannedPush) -> None:
-        """Add a planned push, and compare the forces whose time it completes."""
+        """Add a planned push, and check the forces measured at least QUIET_S before it."""
         self._pushes.append(push)
         limit_ns = push.valid_at_ns - round(1e9 * QUIET_S)
         while self._waiting and self._waiting[0][0] <= limit_ns:
             self._compare(*self._waiting.popleft())
 
     def add_force(self, force: Force, at_ns: int) -> None:
-        """Add a measured force with the time of its measurement; only contact forces count."""
+        """Add a force measured at a time; only valid forces along the sheet's normal are used."""
         if force.valid and force.axis == "sheet_normal":
             self._waiting.append((at_ns, force.force_n))
 
@@ -117,7 +118,7 @@ class MeasuredForceCheck:
 
     @property
     def result(self) -> tuple[SelfCheck, ...]:
-        """Return the check, or () before there are enough comparisons."""
+        """Return the self-check, or () if too few forces have been compared."""
         if not self._monitor.has_data:
             return ()
         return (

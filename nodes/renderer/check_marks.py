@@ -1,8 +1,9 @@
 """Place the projected marks with which the stereo camera checks the calibrations.
 
-A mark is a square of projector pixels with known rays. The camera must therefore see it on that ray
-if projector and camera are where the scene says, and on the sheet if the arms are, too. The sheet
-near a pushing finger follows it in a known ratio, which shows the true depth of the finger.
+A mark is a square of projector pixels with a known ray. If the poses of projector and camera in the
+scene are correct, the camera must see the mark on this ray; if those of the arms are correct, on
+the sheet. Near a pushing finger, the sheet follows the finger in a known ratio, which shows the
+true depth of the finger.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 Floats = NDArray[np.float64]
 
 SIDE_M = 0.0053
-"""Side of a mark, which then has the area of a marker of 3 mm radius: the triangulator finds it as
-another marker.  Its side in pixels is even, as are the corners, because a mark may be drawn at half
-the resolution (see `output.image_parts`)."""
+"""Side of a mark, whose area is that of a marker of 3 mm radius, so that the triangulator detects
+it.  Its side in pixels is even, as are the corners, because a mark may be drawn at half the
+resolution (see `output.image_parts`)."""
 
 FINGER_STEP_M = 0.001
-"""Displacement of the fingertip that determines the ratio of the marks' displacements to it."""
+"""Displacement of the fingertip for which the displacements of the marks are computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +56,7 @@ def place_marks(
 ) -> CheckMarks:
     """Place the marks of a projector on the sheet (4, 4) with its mesh.
 
-    deeper: mesh with the fingertip displaced by FINGER_STEP_M against the sheet's normal; None
-    without contact.
+    deeper: mesh of the sheet with the fingertip FINGER_STEP_M deeper; None without contact.
     """
     pose, lens = projector.world_from_projector, projector.lens
     world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)

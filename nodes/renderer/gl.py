@@ -69,7 +69,7 @@ class EyeView:
 class DrawStyle:
     """Style in which the object is drawn.
 
-    flat: whether to draw without shading. pattern: as in the message `Display`. fingertip_mark,
+    flat: whether to draw without shading. pattern: see the message `Display`. fingertip_mark,
     target_mark: points (3,), world, of the undeformed object at which marks are drawn, or None.
     """
 

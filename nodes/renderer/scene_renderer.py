@@ -110,10 +110,10 @@ class SceneRenderer:
     ) -> None:
         """Create the graphics objects of the scene.
 
-        spacing_m: distance between the vertices of the object. samples: per pixel; None: `SAMPLES`,
-        but no multisampling in the first pass of two_pass with a software driver. basis: deflection
-        shapes of the sheet; None: a pushed sheet is drawn as four triangles. Raises ValueError if
-        the projector's lens maps several rays to one pixel.
+        spacing_m: distance between the vertices of the object. samples: samples per pixel; None:
+        `SAMPLES`, but no multisampling in the first pass of two_pass with a software driver. basis:
+        deflection shapes of the sheet; None: a pushed sheet is drawn as four triangles. Raises
+        ValueError if the projector's lens maps several rays to one pixel.
         """
         projector, geometry = require_projector(scene), scene.object.geometry
         self.scene = scene
@@ -279,7 +279,7 @@ class SceneRenderer:
         )
 
     def place_check_marks(self, sheet: SheetPose) -> CheckMarks:
-        """Place the marks that check the calibrations; the next images contain them."""
+        """Store the projected marks that check the calibrations; the next images contain them."""
         note, pushed_point, deeper = self.note, sheet.pushed_point, None
         if pushed_point is not None and self.sheet_shape == "reduced_order" and self.basis:
             deeper_point = pushed_point - FINGER_STEP_M * sheet.world_from_sheet[:3, 2]

@@ -179,7 +179,7 @@ def _stationary_oscillators() -> Floats:
 def solve_riccati(transition: Floats, process_noise: Floats, variance: float) -> Floats:
     """Return the steady-state error covariance (models, 5, 5) just before each measurement.
 
-    variance: of the measurement noise, m^2.
+    variance: variance of the measurement noise, m^2.
     Solves the Riccati equation by the doubling algorithm (Chu et al. 2004): each iteration doubles
     the number of frames.
     """
@@ -219,7 +219,7 @@ def _solve_gains(interval: int, noise: int) -> Floats:
 def _compute_gain(covariance: Floats, variance: float) -> Floats:
     """Return the Kalman gain (models, 5) from the predicted covariance (models, 5, 5).
 
-    variance: of the measurement noise, m^2.
+    variance: variance of the measurement noise, m^2.
     """
     observed = covariance @ OBSERVED
     return np.asarray(observed / (observed @ OBSERVED + variance)[:, None])

@@ -3,7 +3,7 @@
 A mark lies on the ray of its projector pixel, wherever the sheet is.  Its distance from this ray
 thus concerns only the projector and the camera, and its distance from the surface of the sheet only
 the arms and the camera.  Near a finger that pushes the sheet, the surface follows the true finger
-pad in a known ratio, so that an error of the measured depth of the pad is visible, too.
+pad in a known ratio.  An error of the measured depth of the pad is therefore visible, too.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ LATENCY_THRESHOLD_S = 0.01
 of a measurement by photodiode (1 ms)."""
 
 LATENCY_MEMORY_S = 4.0
-"""Time constant of the mean latency: the few images taken while an old mark is still shown contain
-the deviation."""
+"""Time constant of the mean latency: the few images taken while an old mark is still shown
+contain the deviation."""
 
 MATCH_RADIUS_M = 0.012
 """Maximum distance of a detected point from the expected position of a mark."""
 
 MAX_SPREAD_M = 0.004
-"""Maximum deviation of a mark from the median of all, beyond which it is another bright point."""
+"""Maximum deviation of a mark from the median of all; a point beyond it is not the mark."""
 
 MAX_AGE_NS = 2_000_000_000
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
-"""Speed of the marks on the sheet up to which positions, and from which the latency is checked."""
+"""Speed of the marks up to which positions are checked, and from which latency is checked."""
 
 MIN_RATIO_RANGE = 0.1
-"""Minimum range of the marks' displacement ratios with which the finger's depth is estimated."""
+"""Minimum range of the marks' displacement ratios, from which the finger's depth is estimated."""
 
 
 class ProjectionCheck:
-    """Self-checks of projector, arms and marker by projected marks."""
+    """Self-checks of the poses of projector, arms and finger marker, by projected marks."""
 
     def __init__(self, projector: Projector | None) -> None:
         """Use the marks of the projector; without a projector or marks, do nothing."""
@@ -89,7 +89,7 @@ class ProjectionCheck:
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
         """Check the positions (3,) m of all bright points in an image pair.
 
-        camera_shift_m: shift (3,) of the fixed reference marks, which is that of the camera.
+        camera_shift_m: apparent shift (3,) of the fixed reference marks, caused by the camera.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]
         if not shown or len(points) < 2:
@@ -125,7 +125,10 @@ class ProjectionCheck:
             self._latency.add(np.array([late]), at_ns)
 
     def _velocity(self, number: int) -> Floats | None:
-        """Return the mean velocity (3,) of the marks across their rays; None if it is unknown."""
+        """Return the marks' mean velocity (3,) in frame `number`, perpendicular to their rays.
+
+        Returns None if it is unknown.
+        """
         if number == 0:
             return None
         (before_ns, before, *_), (now_ns, now, *_) = self._frames[number - 1], self._frames[number]

@@ -74,7 +74,7 @@ class CameraCheck:
         self._projection.on_frame(frame)
 
     def on_marks(self, points: Sequence[Floats], at_ns: int) -> None:
-        """Check the fixed and projected marks with the positions (3,) m of all bright points."""
+        """Check fixed and projected marks; points: positions (3,) m of all bright points."""
         self._check_reference_marks(points, at_ns)
         self._projection.on_points(points, self._camera_shift_m, at_ns)
 

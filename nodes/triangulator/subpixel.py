@@ -127,7 +127,7 @@ class DiscFit:
     elongation: (e, f) px of an ellipse; see the module `ellipse`.
     height: difference of the grey levels of marker and ground.
     misfit: root mean square residual in excess of the noise, as a fraction of the height.
-    odd_misfit: as misfit, but for the part of the residuals that is odd about the centre.
+    odd_misfit: like misfit, but for the part of the residuals that is odd about the centre.
     converged: whether the fit converged to a disc that is brighter than the ground.
     """
 

@@ -100,7 +100,7 @@ def is_valid_position(joints_rad: Floats) -> bool:
 
 
 def joint_torques_nm(joints_rad: Floats, flange_from_edge: Floats, force_n: Floats) -> Floats:
-    """Return the torques (6,) of a force (3,), base frame, on the edge: its work per rotation."""
+    """Return the joint torques (6,) that a force (3,) on the edge, in the base frame, causes."""
     step_rad = 1e-4
     torques = np.zeros(6)
     for joint, turn in enumerate(step_rad * np.eye(6)):
@@ -230,7 +230,7 @@ class TwinArmsNode(Node):
             self._stored_joints[side][:] = controller.servo.joints_rad
 
     def _load_motors(self, joints: dict[str, Floats], left: Floats, right: Floats) -> None:
-        """Set the torques of the sheet's pull between both edges, which only MXT reports."""
+        """Set the joint torques of the sheet's pull, which only the protocol MXT reports."""
         across = right[:3, 3] - left[:3, 3]
         distance_m = float(np.linalg.norm(across))
         if self._pull is None or distance_m <= 0.0:

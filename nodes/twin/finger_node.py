@@ -61,7 +61,7 @@ class TwinFingerParameters(SimulatorParameters):
     hand: Literal["prescribed", "coupled"] = Field(
         default="prescribed",
         description="prescribed: the finger follows its path regardless of forces. coupled: the "
-        "simulated sheet pushes the finger off its path; the apparatus has the hand's impedance",
+        "force of the simulated sheet deflects the finger; the apparatus has the hand's impedance",
     )
     cache_dir: Path | None = Field(
         default=None,
@@ -169,7 +169,7 @@ class TwinFingerNode(Node):
         self._follow_waiting()
 
     def _follow_waiting(self) -> None:
-        """Follow the path that arrived before the finger could."""
+        """Follow the path that arrived before the finger was ready."""
         path, self.waiting = self.waiting, None
         if path is not None:
             self._follow(path)

@@ -117,7 +117,7 @@ def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> 
 
 
 def compute_history_ratios(apparatus: Apparatus) -> Floats:
-    """Return the ratios (2,) of the rubber's force to that of an elastic sheet, for in and out.
+    """Return the force ratios (2,) of rubber to an elastic sheet, for loading and unloading.
 
     The elastic force rises linearly to `TURNING_RATIO` times the evaluated force and falls again.
     """

@@ -28,10 +28,10 @@ from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 Floats = NDArray[np.float64]
 
 CELLS = 12
-"""Number of node intervals per side; the force differs by 1 % from that with 32."""
+"""Number of cells per side of the mesh; the force differs by 1 % from that with 32 cells."""
 
 STATED_STANDARD_DEVIATION_N = 0.02
-"""Uncertainty that the data sheet states; the reading does not show its own error."""
+"""Uncertainty that the gauge's data sheet states, which the node publishes with each force."""
 
 GAUGE_STREAM = 3
 """Second element of the random seed, which makes the noise independent of other simulators."""
@@ -63,7 +63,7 @@ class TrueSheetForce:
         ]
 
     def compute_n(self, time_s: float, tip: Floats, left: Floats, right: Floats) -> float:
-        """Return the force at a time, which must not decrease, for true tip and flange poses."""
+        """Return the force for true tip and flange poses; times of calls must not decrease."""
         edges = left @ self._clamps[0], right @ self._clamps[1]
         across = edges[1][:3, 3] - edges[0][:3, 3]
         normal = np.cross(across, edges[0][:3, 1] + edges[1][:3, 1])
@@ -90,7 +90,7 @@ class GaugeErrors:
     random: np.random.Generator
 
     def read_n(self, force_n: float) -> float:
-        """Return a reading for a true force."""
+        """Return the reading of the gauge for a true force."""
         noise_n = self.truth.noise_n * float(self.random.standard_normal())
         return self.truth.gain_ratio * force_n + self.truth.offset_n + noise_n
 
@@ -136,7 +136,7 @@ class TwinGauge(Node):
             arms.message.world_from_flange_right,
         )
         self.note = ""
-        # The gauge stamps its reading, which lags, with the present time.
+        # The reading lags behind the force, but its timestamp is the present time.
         self.force.publish(
             Force(
                 source="gauge",

@@ -6,7 +6,7 @@ a deviation e from this path, for mass m, damping b and stiffness k of the hand 
     m e'' + b e' + k e = F(path + e)
 
 F acts along the sheet's normal. Friction forces along the sheet are neglected. In each step F is
-constant, evaluated at its middle; the linear equation is solved exactly.
+constant, evaluated at the centre of the step; the linear equation is solved exactly.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ STEP_S = 0.0005
 """Maximum time step of the normal motion: a tenth of a radian of the fastest oscillation."""
 
 INTERVAL_S = 0.004
-"""Maximum interval in which path and sheet are interpolated."""
+"""Maximum interval over which the voluntary path and the sheet are interpolated."""
 
 NEAR_M = 0.005
 """Distance from the sheet beyond which no force is computed."""
@@ -55,7 +55,7 @@ UP = np.array([0.0, 1.0, 0.0])
 class HandImpedance:
     """Mechanical impedance of a hand at the fingertip, equal in all directions.
 
-    The default is a finger whose wrist moves too. Its natural frequency is 5 Hz in the air (Lakie
+    The default is a finger whose wrist moves too. Its natural frequency in the air is 5 Hz (Lakie
     et al. 2015: 6 to 12 Hz with less mass).
     """
 
@@ -65,7 +65,7 @@ class HandImpedance:
 
     @classmethod
     def of(cls, apparatus: Apparatus | None) -> Self:
-        """Return the impedance that the apparatus states; if it states none, the default."""
+        """Return the impedance in the apparatus (true hardware parameters), or else the default."""
         finger = None if apparatus is None else apparatus.finger
         if finger is None or finger.hand_mass_kg is None:
             return cls()
@@ -74,7 +74,7 @@ class HandImpedance:
         return cls(finger.hand_mass_kg, finger.hand_stiffness_n_per_m, finger.hand_damping_ratio)
 
     def transition(self, step_s: float) -> tuple[float, float, float, float]:
-        """Return the exact matrix, row by row, of the free deviation and its rate over a step."""
+        """Return the 2x2 matrix, row by row, that advances deviation and rate without force."""
         pace = math.sqrt(self.stiffness_n_per_m / self.mass_kg)
         decay = self.damping_ratio * pace
         split = pace * cmath.sqrt(self.damping_ratio**2 - 1.0)
@@ -88,10 +88,10 @@ class HandImpedance:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """Sheet under the finger at one time.
+    """Local state of the sheet below the finger at one time.
 
     origin: point (3,) of the unloaded sheet's tangent plane. normal: (3,) towards the user.
-    curve_n: normal force over the depths of the reaction's table.
+    curve_n: normal forces at the depths in the force table `SheetReaction`.
     """
 
     origin: Floats
@@ -108,7 +108,10 @@ class TrueSheet:
         self._reaction, self._surface = reaction, SheetSurface.of(scene, apparatus)
 
     def find_touch(self, edges: tuple[Floats, Floats], tip: Floats) -> Touch:
-        """Return the sheet at the projection of the fingertip (3,) onto it."""
+        """Return point, normal and force curve of the sheet nearest to the fingertip (3,).
+
+        edges: poses (4, 4) of the left and right edges. tip: position in the world, m.
+        """
         left, right = edges
         across = right[:3, 3] - left[:3, 3]
         distance_m = float(np.linalg.norm(across))
@@ -130,13 +133,13 @@ class TrueSheet:
 
 
 class EdgeTrack:
-    """Poses of the sheet's edges between and shortly after two samples, linear in time."""
+    """Poses of the sheet's edges, linearly inter- and extrapolated in time from two samples."""
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, Floats]] = []
 
     def add(self, time_s: float, left: Floats, right: Floats) -> None:
-        """Add the poses (4, 4) of the edges at a time; a time that does not ascend is ignored."""
+        """Add the poses (4, 4) of the edges at a time; ignore a time that is not later."""
         if not self._samples or time_s > self._samples[-1][0]:
             self._samples = [*self._samples[-1:], (time_s, np.stack([left, right]))]
 
@@ -154,7 +157,7 @@ class EdgeTrack:
 class CoupledFinger:
     """Deviation of the finger from its voluntary path, integrated over time.
 
-    path: voluntary motion; may be replaced at any time. deviation_m, rate_m_per_s: (3,).
+    path: voluntary motion, which may be replaced at any time. deviation_m, rate_m_per_s: (3,).
     force_n: (3,) force of the sheet on the finger, mean over the last interval.
     log: rows (time s, indentation m, force N) of each step; None: not recorded.
     """
@@ -170,8 +173,8 @@ class CoupledFinger:
     def predict(self, time_s: float, edges: Edges) -> CoupledFinger:
         """Return a copy that is advanced to a time.
 
-        This finger is advanced only if it is more than MAX_PREDICTION_S behind, since the poses of
-        the edges do not arrive.
+        This finger itself is advanced only if it is more than MAX_PREDICTION_S behind. This happens
+        if no poses of the edges arrive.
         """
         self.advance(time_s - MAX_PREDICTION_S, edges)
         ahead = copy(self)
@@ -237,7 +240,7 @@ class CoupledFinger:
 
 
 def _hermite(t: float, span_s: float, before: float, after: float, rates: list[float]) -> float:
-    """Interpolate a value at a fraction t of a span, from values and rates at both ends."""
+    """Interpolate a value at a fraction t of a time span, from values and rates at both ends."""
     s = 1.0 - t
     return (
         s * s * (1.0 + 2.0 * t) * before
@@ -247,7 +250,7 @@ def _hermite(t: float, span_s: float, before: float, after: float, rates: list[f
 
 
 def _interpolate(curve: list[float], at: float) -> float:
-    """Interpolate a curve at a fractional index: zero below 0, the last slope beyond its end."""
+    """Interpolate a curve at a fractional index: 0 below 0; extrapolate linearly beyond the end."""
     if at <= 0.0:
         return 0.0
     index = min(int(at), len(curve) - 2)

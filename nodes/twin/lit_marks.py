@@ -1,4 +1,7 @@
-"""Compute where the true projector's check marks light the true sheet, for the stereo camera."""
+"""Compute the points of the simulated sheet that the projected check marks light.
+
+The stereo camera sees these points. True parameters are those of the simulated hardware.
+"""
 
 from __future__ import annotations
 
@@ -22,19 +25,20 @@ from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 Floats = NDArray[np.float64]
 
 CELLS = 8
-"""Number of node intervals per side of the sheet's mesh, which is solved in 0.15 s."""
+"""Number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
 
 SOLVE_PERIOD_NS = 500_000_000
 MAX_FINGER_MOTION_M = 5e-4
-"""Period of solutions, and motion of a pushing finger since the last solution beyond which the
-marks are not drawn, because the shape of the sheet is not known."""
+"""Period in which the sheet's shape is solved, and motion of a pushing finger since the last
+solution beyond which the marks are not drawn, because the shape is not known."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Heights:
-    """Heights (n,) of the sheet at the marks above the plane of its edges, for a finger (3,).
+    """Heights (n,) of the sheet at the marks, above the plane of its edges.
 
-    pushed: whether the finger deforms the sheet.
+    finger_sheet_m: position (3,) of the fingertip in the frame of this plane. pushed: whether the
+    finger deforms the sheet.
     """
 
     heights_m: Floats
@@ -43,10 +47,10 @@ class _Heights:
 
 
 class LitMarks:
-    """Points of the true sheet that the projected marks light.
+    """Points of the simulated sheet that the projected marks light.
 
-    The sheet moves with the true arms. Its deflection by the finger and its weight is solved in the
-    background.
+    The sheet moves with the true arms. Its deflection by the finger and by its weight is solved in
+    the background.
     """
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
@@ -68,17 +72,17 @@ class LitMarks:
         self._worker.shutdown(cancel_futures=True)
 
     def settle(self) -> None:
-        """Wait for the solution that is being computed."""
+        """Wait until a running solution of the sheet's shape is finished."""
         if self._solving is not None:
             self._solving.exception()
 
     def on_frame(self, frame: Frame) -> None:
-        """Add a frame that the projector shows until the next one."""
+        """Add a frame, which the projector shows from `light_ns` until the next frame."""
         if frame.light_ns and len(frame.marks_px):
             self._frames.append((frame.light_ns + self._late_ns, frame.marks_px))
 
     def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
-        """Return the lit points (n, 3), world, at the time `at_ns`; empty if they are unknown."""
+        """Return the lit points (n, 3) in the world at a time; empty if they are unknown."""
         shown = [pixels for light_ns, pixels in self._frames if light_ns <= at_ns]
         if not shown:
             return np.zeros((0, 3))
@@ -151,7 +155,7 @@ class LitMarks:
 
 
 def _plane_of(left: Floats, right: Floats) -> Floats:
-    """Return the pose (4, 4) of the plane between two edges (4, 4); z points to the user."""
+    """Return the pose (4, 4) of the plane through two edges (4, 4); z points towards the user."""
     across = right[:3, 3] - left[:3, 3]
     across = across / np.linalg.norm(across)
     normal = np.cross(across, left[:3, 1] + right[:3, 1])

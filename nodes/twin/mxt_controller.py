@@ -53,7 +53,7 @@ FRICTION_STREAM = 11
 """Second element of the random seed of the static friction."""
 
 FIRST_STEP_RAD = 0.01
-"""Maximum difference of each joint between the first set-point and the arm."""
+"""Maximum difference of each joint between the first set-point and the measured joints."""
 
 STEP_CYCLES = 2.0
 """Maximum step between set-points, as the number of cycles that it would take at full speed."""
@@ -71,8 +71,8 @@ class MxtController:
 
     An error ends the robot program: the arm brakes, and no packet is answered until `restart`.
     Errors are: a move before a packet that only requests the state; an unknown command or data
-    type; joints out of range; a first set-point away from the arm; a jump; and no
-    packet for `timeout_s`.
+    type; joints out of range; a first set-point away from the measured joint angles; a jump of the
+    set-point; and no packet for `timeout_s`.
 
     servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joints.
     filter_s: time constant of the low-pass filter on set-points.
@@ -220,7 +220,7 @@ class MxtController:
     def _stay(self, sender: Address) -> None:
         """Process a packet that only requests the state.
 
-        The arm stops, and the next set-point counts as the first one.
+        The arm stops. The next set-point is compared with the measured joints, like the first one.
         """
         self._master = sender
         if self._moved:
@@ -230,14 +230,14 @@ class MxtController:
     def _move(self, send_type: int, data: Floats) -> None:
         """Check and store a set-point; raise MxtError if it is invalid, which ends the program."""
         if self._master is None:
-            raise MxtError("a move ahead of the first packet")
+            raise MxtError("move command ahead of the first packet that only requests the state")
         before = self.wanted_rad if self._moved else self.servo.joints_rad
         joints = _set_point(send_type, data)
         step = np.abs(joints - before)
         if not self._moved and step.max() > FIRST_STEP_RAD:
-            raise MxtError("a first set-point away from the arm")
+            raise MxtError("first set-point away from the measured joint angles")
         if (step > self._max_step_rad).any():
-            raise MxtError("a set-point too far")
+            raise MxtError("set-point too far from the previous one")
         self._moved, self.wanted_rad = True, joints
 
     def _fail(self, why: str) -> None:
@@ -282,12 +282,12 @@ class MxtController:
 def _set_point(send_type: int, data: Floats) -> Floats:
     """Decode the joints (6,) of a packet; raise MxtError if it contains no valid set-point."""
     if send_type != _JOINTS[0]:
-        raise MxtError(f"a set-point of type {send_type}")
+        raise MxtError(f"set-point of unknown type {send_type}")
     if not np.isfinite(data).all():
-        raise MxtError("a set-point that is not finite")
+        raise MxtError("set-point not finite")
     joints = data[:6]
     if (joints < RANGE_RAD[:, 0]).any() or (joints > RANGE_RAD[:, 1]).any():
-        raise MxtError("joints out of range")
+        raise MxtError("set-point with joints out of range")
     return joints
 
 

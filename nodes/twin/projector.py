@@ -47,10 +47,10 @@ point, position, rotation and distortion."""
 
 
 def make_true_projector(projector: Projector, *, seed: int) -> Projector:
-    """Return a projector that differs at random from the scene's, as a real one from a data sheet.
+    """Return a projector with random deviations from the scene's, as real devices have.
 
-    Its pose deviates as after measuring with a tape. Deviations are normal, limited to two standard
-    deviations.
+    Its pose deviates as if it had been measured with a tape. Deviations are normal, limited to two
+    standard deviations.
     """
     random = np.random.default_rng(seed)
 
@@ -116,7 +116,7 @@ class LitSheet:
     """Stereo camera in front of a flat sheet that the projector lights from behind."""
 
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
-        """camera, projector: the simulated devices, with their true parameters."""
+        """Store the simulated devices; camera, projector: true parameters."""
         self._scene, self._camera, self._projector = scene, camera, projector
         self._random = np.random.default_rng(seed)
         self._sensor = Sensor()

@@ -46,10 +46,10 @@ NEWTON_STEPS = 12
 
 
 def make_true_camera(camera: StereoCamera) -> StereoCamera:
-    """Return the true parameters of a camera, whose deviations the device name determines.
+    """Return true camera parameters, which deviate at random from the scene's.
 
-    The deviations from the scene's parameters are normal, limited to two standard deviations. The
-    pose of the left camera, image size, rate and exposure remain those of the scene.
+    The random seed is the device name. The deviations are normal, limited to two standard
+    deviations. The pose of the left camera, image size, rate and exposure remain unchanged.
     """
     name = hashlib.sha256(camera.device.encode()).digest()
     random = np.random.default_rng(np.frombuffer(name, dtype=np.uint32))

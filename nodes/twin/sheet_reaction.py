@@ -1,8 +1,8 @@
-"""Tabulate the force of the simulated sheet on a finger, so that it is known every millisecond.
+"""Tabulate the force of the simulated sheet on a finger, to look it up every millisecond.
 
 The membrane model takes a tenth of a second per push. The table contains the normal force of pushes
-along the sheet's normal. It is the force at the sheet's centre for several stretch ratios, times
-the ratio of the force at other positions to that at the centre, at the mean stretch.
+along the sheet's normal. It is the product of two parts: the force at the sheet's centre for
+several stretch ratios, and the ratio of the force at other positions to it, at the mean stretch.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ VERSION = 1
 """Version of the computation; tables of another version are computed again."""
 
 CELLS = 16
-"""Number of node intervals per side of the membrane; the force differs by 1 to 4 % from 32."""
+"""Number of cells per side of the mesh; the force differs by 1 to 4 % from that with 32 cells."""
 
 DEPTH_FRACTIONS = np.array([0.04, 0.12, 0.25, 0.45, 0.7, 1.0])
 """Depths of the solved pushes, as fractions of the scene's maximum push depth."""
@@ -45,9 +45,10 @@ DEPTH_STEPS = 256
 class SheetReaction:
     """Normal force (N) of the sheet on a finger over stretch, position and indentation.
 
-    width_m, height_m: dimensions of the sheet at rest, (1,). stretches (s,). depths_m (d,): equal
-    steps from 0. centre_n (s, d): force at the centre. ratios (p, p, d): force over that at the
-    centre, at POSITION_FRACTIONS of width and height; the sheet is assumed to be symmetric.
+    width_m, height_m: dimensions of the sheet at rest, (1,). stretches (s,): stretch ratios.
+    depths_m (d,): depths in equal steps from 0. centre_n (s, d): force at the centre. ratios
+    (p, p, d): ratio of the force at POSITION_FRACTIONS of width and height to the force at the
+    centre. The sheet is assumed to be symmetric.
     """
 
     width_m: Floats
@@ -60,7 +61,7 @@ class SheetReaction:
     def curve_n(self, distance_m: float, x_m: float, y_m: float) -> Floats:
         """Return the forces (d,) at `depths_m`; zero for a position that is not on the sheet.
 
-        distance_m: between the edges. x_m, y_m: position relative to the sheet's centre.
+        distance_m: distance between the edges. x_m, y_m: position relative to the sheet's centre.
         """
         if abs(x_m) >= 0.5 * distance_m or abs(y_m) >= 0.5 * self.height_m[0]:
             return np.zeros(len(self.depths_m))
@@ -88,7 +89,7 @@ def _lagrange(nodes: Floats, at: float) -> Floats:
 def load_or_compute_reaction(
     scene: Scene, apparatus: Apparatus | None, cache_dir: Path | None = None
 ) -> SheetReaction:
-    """Return the cached table for the true sheet of a scene, or compute and store it (10 s)."""
+    """Return the cached table for the true sheet of a scene; compute it if missing (10 s)."""
     true_scene = apply_apparatus(scene, apparatus)
     sheet = true_scene.sheet
     rubber = replace(
@@ -118,10 +119,10 @@ def load_or_compute_reaction(
 def compute_reaction(
     rubber: TrueRubber, stretches: Floats, depths_m: Floats, *, finger_radius_m: float
 ) -> SheetReaction:
-    """Solve the pushes of the table. The sheet's weight is neglected in the forces."""
+    """Solve the pushes of the table. The sheet's weight is neglected."""
 
     def push_n(stretch: float, across: float, along: float) -> Floats:
-        """Return the forces (n,) at the depths for a position, in fractions of the dimensions."""
+        """Return the forces (n,) at the depths; across, along: fractions of width and height."""
         half_m = 0.5 * stretch * rubber.width_m
         edges = [transform(np.eye(3), [side * half_m, 0.0, 0.0]) for side in (-1.0, 1.0)]
         at = 2.0 * across * half_m, along * rubber.height_m
@@ -133,7 +134,7 @@ def compute_reaction(
                     rubber, *edges, finger_tip=tip, finger_radius_m=finger_radius_m, cells=CELLS
                 )
             except NotConvergedError:
-                # Deep pushes near a clamp have no solution; the last slope continues the curve.
+                # Deep pushes near a clamp have no solution; extrapolate with the last slope.
                 if len(forces) < 2:
                     raise
                 slope = (forces[-1] - forces[-2]) / np.diff(depths_m)[len(forces) - 2]

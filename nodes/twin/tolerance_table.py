@@ -378,8 +378,9 @@ def deviate_apparatus(
 ) -> Apparatus:
     """Make an apparatus in which only the parameter of one row deviates, to test its effect.
 
-    The deviation is that of a normal deviate of `sigmas`. All components of a vector, and both arms
-    or lenses, deviate equally. Raises KeyError for a key that is not in the table.
+    sigmas: size of the deviation, in standard deviations of a normal distribution. All components
+    of a vector, and both arms or lenses, deviate equally. Raises KeyError for a key that is not in
+    the table.
     """
     row = TOLERANCES[key]
     given = row.of(profile, calibrated=calibrated)

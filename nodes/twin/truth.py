@@ -166,9 +166,9 @@ def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[fl
 def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
     """Return the same hardware, described in the world frame that the stereo camera defines.
 
-    Calibrations define the world by the left camera: its pose in the scene is exact. So the pose
-    errors of the camera become opposite pose errors of arms, projector and eyes. The finger's path,
-    the direction of gravity and the finger's tilt are kept in the new world frame.
+    Calibrations define the world by the left camera, so that its pose in the scene is exact. The
+    pose errors of the camera therefore become opposite pose errors of arms, projector and eyes. The
+    finger's path, the direction of gravity and the finger's tilt are kept in the new world frame.
     """
     nominal = apparatus.nominal or devices_of(scene)
     true_scene = apply_apparatus(scene, apparatus)

@@ -50,7 +50,7 @@ VERSION = 1
 TOUCH_MARGIN_RAD = 0.45
 """Angle by which the touchable skin extends beyond the maximum tilt of the working range."""
 SLAB_DEPTHS = 2.0
-"""Depth of the slab that represents a half-space, over the push depth of the working range."""
+"""Ratio of the depth of the slab that represents a half-space to the scene's push depth."""
 MIN_THICKNESS_SPACINGS = 4.0
 """Minimum thickness of the object in skin spacings; four spacings are two elements."""
 MAX_NODES = 250_000

@@ -46,7 +46,7 @@ ANCHORS = (30.0, 3.0, 0.3, 0.0)
 first value is used for which the radius ratios of all elements exceed `GOOD_RATIO`."""
 GOOD_RATIO = 0.2
 MAX_SURPLUS_RATIO = 2.0
-"""Number of elements above which a lattice is not tried, over that of the smallest lattice."""
+"""Maximum ratio of a lattice's number of elements to that of the smallest lattice."""
 
 
 def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:

@@ -13,7 +13,7 @@ Ints = NDArray[np.int64]
 MIN_RADIUS_RATIO = 0.1
 """Minimum radius ratio of an accepted mesh."""
 MIN_JACOBIAN_RATIO = 0.1
-"""Minimum Jacobian determinant of a curved element over that of the element with straight edges."""
+"""Minimum ratio of the Jacobian determinants of a curved element and one with straight edges."""
 
 _EDGE_OF = np.array([[-1, 4, 6, 7], [4, -1, 5, 8], [6, 5, -1, 9], [7, 8, 9, -1]])
 """Index of the node at the midpoint of the edge between two corners of an element."""
@@ -58,11 +58,11 @@ def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
 def min_jacobian_ratios(nodes: Floats, elements: Ints) -> Floats:
     """Return how much curved edges reduce the Jacobian determinant of each 10-node tetrahedron.
 
-    The result (e,) is a lower bound of the determinant over that of the element with straight
-    edges. The determinant is a cubic polynomial, which is bounded by its Bernstein coefficients
-    (Johnen, Remacle, Geuzaine, "Geometrical validity of curvilinear finite elements", 2013). The
-    three derivatives of position are linear, so each coefficient belongs to three corners. It is
-    the mean, over all permutations of these corners, of the determinant of the derivatives at them.
+    The result (e,) is a lower bound of the ratio of the determinant to that with straight edges.
+    The determinant is a cubic polynomial, which is bounded by its Bernstein coefficients (Johnen,
+    Remacle, Geuzaine, "Geometrical validity of curvilinear finite elements", 2013). The three
+    derivatives of position are linear, so each coefficient belongs to three corners. It is the
+    mean, over all permutations of these corners, of the determinant of the derivatives at them.
     """
     points = nodes[elements]
     slopes = np.empty((len(elements), 4, 4, 3))

@@ -505,7 +505,7 @@ def _put(
 
 
 def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Floats, Floats]:
-    """Fit the jets; return their centres (j, 3), normals (j, 3) and shape operators (j, 3, 3)."""
+    """Fit local quadratics; return centres (j, 3), normals (j, 3), shape operators (j, 3, 3)."""
     rough = vertex_normals(vertices, triangles)
     from scipy.spatial import cKDTree
 

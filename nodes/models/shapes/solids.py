@@ -181,7 +181,7 @@ class EllipsoidShape(Convex):
         return self.closest(points).height_m
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate the function that is zero on the ellipsoid, as a `LevelSet` with support 1."""
+        """Evaluate a quadratic that is zero on the ellipsoid: value, gradient, Hessian and ones."""
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)

@@ -137,7 +137,7 @@ def push_path(
 
 
 def grade_coordinates(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floats:
-    """Return node coordinates (cells + 1,) from 0 to length_m; one is at the focus, densest there.
+    """Return node coordinates (cells + 1,) from 0 to length_m, densest at the focus.
 
     On each side, distances from the focus are proportional to sinh(k u) with uniform u from 0 to 1.
     The finest cell has the size `finest_m`, which determines k.
