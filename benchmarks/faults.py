@@ -225,6 +225,33 @@ def worst_gaps(lost: list[Gap], results: list[Result]) -> list[Gap | None]:
     return worst
 
 
+KILLED_KINDS = {
+    "launcher": ("launcher",),
+    "bridge": ("bridge",),
+    "arm": ("twin_left", "twin_right"),
+    "node": ("",),
+}
+"""Words in the names of faults that tell what was killed; the first kind that fits counts."""
+
+
+def summarize(results: list[Result]) -> dict[str, float]:
+    """Return the times after kills that stopped the arms, s, by what was killed.
+
+    follow_again: both arms follow again after the kill of a node's process.
+    """
+    killed = [one for one in results if one.stopped_s is not None and "killed" in one.trouble]
+    found: dict[str, float] = {}
+    for kind, words in KILLED_KINDS.items():
+        chosen = [one for one in killed if any(word in one.trouble for word in words)]
+        killed = [one for one in killed if one not in chosen]
+        stopped = [one.stopped_s for one in chosen if one.stopped_s is not None]
+        back = [one.back_s for one in chosen if one.back_s is not None]
+        for name, values in ((f"stop_{kind}", stopped), (f"{kind}_follow_again", back)):
+            if values:
+                found |= {f"{name}_min_s": min(values), f"{name}_max_s": max(values)}
+    return found
+
+
 def rows(
     results: list[Result],
     arms: tuple[Arm, Arm],
@@ -321,6 +348,7 @@ async def main() -> int:
         "light": given.light,
         "patience": patience,
         "cases": cases,
+        "summary": summarize(results),
         "largest_joint_speed_ratio": speed,
         "violations": violations,
     }

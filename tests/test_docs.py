@@ -66,7 +66,9 @@ def test_links_anchors_and_images_are_there(page: Path) -> None:
         is_chart = target.parent == CHARTS and target.with_suffix(".json").is_file()
         assert target.is_file() or is_chart, f"{link.place}: there is no file {link.target}"
         if link.is_picture:
-            assert target.suffix in (".png", ".svg"), f"{link.place}: {link.target} is no picture"
+            assert target.suffix in (".png", ".svg", ".webp"), (
+                f"{link.place}: {link.target} is no picture"
+            )
         if anchor:
             assert anchor in anchors(as_built(target)), (
                 f"{link.place}: {link.target} meets no heading; words without signs make anchors "
