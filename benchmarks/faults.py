@@ -229,6 +229,7 @@ KILLED_KINDS = {
     "launcher": ("launcher",),
     "bridge": ("bridge",),
     "arm": ("twin_left", "twin_right"),
+    "clock": ("clock",),
     "node": ("",),
 }
 """Words in the names of faults that tell what was killed; the first kind that fits counts."""
