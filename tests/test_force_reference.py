@@ -96,7 +96,7 @@ def test_contact_forces_and_tangent_are_derivatives_of_the_energy() -> None:
 def test_curves_are_extrapolated_and_transferred_to_positions_with_one_mesh() -> None:
     exact = np.array(DEPTHS) ** 1.5
 
-    def run(along: float, scale: float, stiffness: float) -> dict[str, object]:
+    def run(along: float, scale: float, stiffness: float) -> dict[str, Any]:
         place = {**dict.fromkeys(CURVE_KEYS, 1.0), "along": along}
         forces = stiffness * exact * (1.0 + 0.01 * scale**2)
         inputs = {**place, "scale": scale, "penalty": PENALTY}
@@ -108,7 +108,7 @@ def test_curves_are_extrapolated_and_transferred_to_positions_with_one_mesh() ->
     assert both["forces"] == pytest.approx(exact, abs=1e-5)
     assert one["forces"] == pytest.approx(2.0 * exact, abs=2e-5)
     assert max(both["uncertainty_ratio"]) < min(one["uncertainty_ratio"])
-    runs[2]["forces"] = runs[2]["forces"][:3]  # type: ignore[index]
+    runs[2]["forces"] = runs[2]["forces"][:3]
     deeper = combine_runs(runs)[0]
     assert deeper["forces"] == pytest.approx(exact, abs=1e-5)
     assert min(deeper["uncertainty_ratio"][3:]) > max(deeper["uncertainty_ratio"][:3])

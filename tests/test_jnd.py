@@ -9,6 +9,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -209,7 +210,7 @@ def make_presenter(lines: Iterator[str]) -> tuple[PairPresenter, FakeDriver]:
             driver.push()
         return next(lines)
 
-    return PairPresenter(driver, SCENE, ask), driver  # type: ignore[arg-type]
+    return PairPresenter(cast(Driver, driver), SCENE, ask), driver
 
 
 def test_a_pair_is_presented_by_the_modulus_of_the_object() -> None:

@@ -48,7 +48,10 @@ from flexsheet.launch.commands.output import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from flexsheet.launch.calibration.arm_poses import PoseRecorder
+    from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.launch.calibration.hand_eye import BaseFit, BoardDetection
     from flexsheet.messages.apparatus import Apparatus
     from flexsheet.messages.arms_calibration import ArmBase, ArmsCalibration
@@ -247,16 +250,33 @@ def capture(
         output, described, make_lens_rig(scene, load_optics(calibration, scene))
     )
     size = (scene.camera.width_px, scene.camera.height_px)
-    run_interruptible(_record_poses(f"arm_{side}", recorder, size, places, run))
+
+    def on_arm(state: Any, time_s: float) -> None:
+        recorder.update_joints(state.joints_rad, time_s)
+
+    run_interruptible(
+        record_poses(recorder, on_arm, [f"arm_{side}"], size=size, places=places, run=run)
+    )
     if as_json:
         print_json({"folder": str(output), "poses": recorder.count})
     else:
         words.print(f"{recorder.count} poses in {output}", markup=False)
 
 
-async def _record_poses(
-    arm: str, recorder: PoseRecorder, size: tuple[int, int], places: int, run: Path | None
+async def record_poses(
+    recorder: PoseRecorder | EdgeMarkRecorder,
+    on_arm: Callable[[Any, float], None],
+    arms: Sequence[str],
+    *,
+    size: tuple[int, int],
+    places: int,
+    run: Path | None,
 ) -> int:
+    """Pass images and arm states of the running graph to a recorder, until it has enough poses.
+
+    on_arm: called with each state of the topics `arms` and the time of its arrival, s. size: of the
+    images, px.
+    """
     import asyncio
     import time
 
@@ -270,13 +290,11 @@ async def _record_poses(
         if images.empty():
             images.put_nowait((pair, time.monotonic()))
 
-    def on_arm(state: Any, _: Any) -> None:
-        recorder.update_joints(state.joints_rad, time.monotonic())
+    def on_state(state: Any, _: Any) -> None:
+        on_arm(state, time.monotonic())
 
-    subscribers = [
-        make_listener(TOPICS[name], run, handler)
-        for name, handler in ((arm, on_arm), ("stereo", on_stereo))
-    ]
+    subscribers = [make_listener(TOPICS["stereo"], run, on_stereo)]
+    subscribers += [make_listener(TOPICS[name], run, on_state) for name in arms]
     printed = ""
     try:
         for subscriber in subscribers:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +14,7 @@ from flexsheet.launch.commands.calibrate import (
     require_twin,
     round_digits,
 )
-from flexsheet.launch.commands.calibrate_arms import CalibrationOption
+from flexsheet.launch.commands.calibrate_arms import CalibrationOption, record_poses
 from flexsheet.launch.commands.graph import run_interruptible
 from flexsheet.launch.commands.options import (
     CYLINDER,
@@ -39,7 +37,6 @@ from flexsheet.launch.commands.output import (
 
 if TYPE_CHECKING:
     from flexsheet.launch.calibration.edge_fit import EdgeFit
-    from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.messages.types import Side
 
 
@@ -179,47 +176,14 @@ def edges_capture(
             f"-o {output}: cannot be created: {error.strerror}; name a new file", BAD_INPUT
         ) from error
     size = (scene.camera.width_px, scene.camera.height_px)
-    run_interruptible(_record(recorder, size, poses, run))
+
+    def on_arm(state: Any, time_s: float) -> None:
+        recorder.update_joints(state.side, state.joints_rad, time_s)
+
+    run_interruptible(
+        record_poses(recorder, on_arm, ["arm_left", "arm_right"], size=size, places=poses, run=run)
+    )
     if as_json:
         print_json({"rows": str(output), "poses": recorder.count})
     else:
         words.print(f"{recorder.count} poses in {output}", markup=False)
-
-
-async def _record(
-    recorder: EdgeMarkRecorder, size: tuple[int, int], poses: int, run: Path | None
-) -> int:
-    from flexsheet.launch.commands.topic import make_listener
-    from flexsheet.messages.topics import TOPICS
-
-    images: asyncio.Queue[tuple[Any, float]] = asyncio.Queue(maxsize=1)
-
-    def on_stereo(pair: Any, _: Any) -> None:
-        # Image pairs that arrive while another one is processed are dropped and not needed.
-        if images.empty():
-            images.put_nowait((pair, time.monotonic()))
-
-    def on_arm(state: Any, _: Any) -> None:
-        recorder.update_joints(state.side, state.joints_rad, time.monotonic())
-
-    handlers = {"arm_left": on_arm, "arm_right": on_arm, "stereo": on_stereo}
-    subscribers = [make_listener(TOPICS[name], run, handler) for name, handler in handlers.items()]
-    printed = ""
-    try:
-        for subscriber in subscribers:
-            subscriber.start()
-        while recorder.count < poses:
-            pair, time_s = await images.get()
-            if (pair.left.shape[1], pair.left.shape[0]) != size or any(pair.left_origin_px):
-                hint = "the camera publishes image regions; configure it to publish whole images"
-            else:
-                hint = await asyncio.to_thread(
-                    recorder.update_images, pair.left, pair.right, time_s
-                )
-            if hint != printed:
-                words.print(hint, markup=False)
-            printed = hint
-    finally:
-        for subscriber in subscribers:
-            subscriber.close()
-    return 0

@@ -58,7 +58,8 @@ TRANSIENT_S = 0.1
 """Time after the start of a touch in which force errors are transients of the contact."""
 
 MIN_CONTACT_N = 2e-3
-"""Force above which the finger touches the sheet: a tenth of what a fingertip can feel."""
+"""Force above which the finger touches the sheet: a tenth of the smallest
+force that a fingertip can perceive."""
 
 
 def _press(depth_m: float, hold_s: float, lift_s: float) -> tuple[Floats, Floats]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration
-from flexsheet.nodes import cache
+from flexsheet.nodes import cache, node_class
 from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.soft_body_factory import (
@@ -166,8 +166,10 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     the planner reports the risk when they have been computed.
     """
     scene = plan.scene_message()
-    planners = [node for node in plan.nodes.values() if node.type == "planner"]
-    solvers = [node for node in plan.nodes.values() if node.type == "fem_solver"]
+    planners, solvers = (
+        [node for node in plan.nodes.values() if issubclass(node_class(node.type), kind)]
+        for kind in (node_class("planner"), node_class("fem_solver"))
+    )
     if scene is None or not planners or not solvers:
         return None
     given = PlannerParameters.model_validate(planners[0].parameters)

@@ -123,7 +123,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
 """Check, finding and remedy if the host is on, but its launcher does not report."""
 
 SELF_CHECK = "self-check"
-"""Name of the check of what the host's nodes report about their own assumptions."""
+"""Name of the check that lists the causes of error which the nodes of a host suspect."""
 
 
 def evaluate_probes(
