@@ -245,6 +245,7 @@ def test_only_the_jackknife_detects_bent_boards() -> None:
     assert np.divide(stated, alone) == pytest.approx(uncertainty.jackknife_ratio, rel=1e-6)
 
 
+@pytest.mark.long
 def test_fingertip_errors_agree_with_the_stated_uncertainty() -> None:
     """Six calibrations from images with different poses and noise are compared with the true
     rig."""
@@ -277,6 +278,7 @@ def test_shipped_calibration_is_within_its_stated_uncertainty() -> None:
     assert np.linalg.norm(errors, axis=1).max() < 2.5e-4
 
 
+@pytest.mark.long
 def test_the_twin_calibrated_again_agrees_with_the_shipped_file() -> None:
     """This calibration has fewer pairs, other poses and other noise."""
     shipped = load_calibration(SHIPPED)

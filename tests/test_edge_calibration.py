@@ -68,7 +68,7 @@ def held_poses(seed: int) -> tuple[Any, list[HeldPose]]:
     return apparatus, simulate_edge_marks(SCENE, apparatus, calibration=OPTICS, seed=seed)
 
 
-@pytest.mark.parametrize("seed", [3, 11])
+@pytest.mark.parametrize("seed", [3, pytest.param(11, marks=pytest.mark.long)])
 def test_fitted_arms_hold_the_edges_where_they_are_commanded(seed: int) -> None:
     apparatus, poses = held_poses(seed)
     fits = fit_edges(poses, SCENE)

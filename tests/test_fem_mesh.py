@@ -367,6 +367,7 @@ def test_any_measures_and_any_side_to_the_user_give_a_sound_mesh(
     assert angles.max() < one.working_range.tilt_rad + 0.45 + 1e-6
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not LIVER.exists(), reason=f"{LIVER} is not there")
 def test_a_liver_is_meshed() -> None:
     geometry = dict(read_mesh(LIVER, 0.01, None))

@@ -144,7 +144,10 @@ def sunk_at(r: float, patch: float, force: float) -> float:
     return float((1 - NU**2) / E * pressure / (2 * patch) * bend)
 
 
-@pytest.mark.parametrize(("penalty", "name", "off"), [(HARD, "hard", 0.04), (SHIPPED, "own", 0.1)])
+@pytest.mark.parametrize(
+    ("penalty", "name", "off"),
+    [pytest.param(HARD, "hard", 0.04, marks=pytest.mark.long), (SHIPPED, "own", 0.1)],
+)
 def test_light_pushes_follow_hertz(
     record_property: Record, penalty: tuple[float, float], name: str, off: float
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from flexsheet.nodes.fem_solver.elasticity import element_stiffness
@@ -61,6 +62,7 @@ def body_force(size: float, law: object, points: Floats) -> Floats:
     return force
 
 
+@pytest.mark.long
 def test_linear_rates(record_property: Record) -> None:
     """Plane waves are prescribed on the hull of a box of distorted elements, with a body force.
 

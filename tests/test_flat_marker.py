@@ -226,7 +226,7 @@ def test_shapes_that_contradict_each_other_have_a_mismatch() -> None:
     assert estimate_flat_pose([left, wrong], 0.003).mismatch_px > 0.3
 
 
-SEEDS = [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (3, 4, 5))]
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 6))]
 
 
 @pytest.mark.parametrize("seed", SEEDS)

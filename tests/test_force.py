@@ -393,7 +393,9 @@ def test_a_wrong_modulus_or_thickness_is_named_by_the_measured_force(
     assert found.value == pytest.approx(ratio * EXPECTED, rel=0.06)
 
 
-@pytest.mark.parametrize("seed", [120, 121, 122, 123])
+@pytest.mark.parametrize(
+    "seed", [120, *(pytest.param(seed, marks=pytest.mark.long) for seed in (121, 122, 123))]
+)
 def test_a_calibrated_sheet_is_not_suspected(seed: int) -> None:
     drawn = sample_apparatus(SCENE, seed, calibrated=True)
     only_sheet = Apparatus(scene=SCENE.name, sheet=drawn.sheet)

@@ -87,6 +87,7 @@ def test_ctrl_c_at_any_moment_leaves_nothing(runs_folder: Path, words: str) -> N
 )
 def test_an_interrupted_demo_leaves_nothing(runs_folder: Path, number: int) -> None:
     settings = [part for setting in on_ports(free_ports()) for part in ("--set", setting)]
+    settings += ["--set", "fem_solver.compute_table=false"]
     demo = start(runs_folder, "demo", "--output", str(runs_folder / "demo"), *settings)
     read_until(demo, "waiting for the soft body")
     code, rest = end(demo, number)

@@ -154,8 +154,11 @@ def test_without_noise_the_base_is_found_exactly(side: Side) -> None:
 
 @pytest.mark.parametrize(
     ("noise_px", "joint_noise_rad"),
-    [(0.1, 0.0), (0.1, 2e-4), (0.02, 1e-3)],
-    ids=["camera's noise", "both", "arm's noise"],
+    [
+        pytest.param(0.1, 0.0, marks=pytest.mark.long, id="camera's noise"),
+        pytest.param(0.1, 2e-4, id="both"),
+        pytest.param(0.02, 1e-3, marks=pytest.mark.long, id="arm's noise"),
+    ],
 )
 def test_the_errors_are_within_the_stated_uncertainty(
     noise_px: float, joint_noise_rad: float

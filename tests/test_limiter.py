@@ -299,7 +299,7 @@ def test_the_turn_between_edges_is_the_angle_of_their_rotation(
         assert f"rotated by {np.degrees(angle):.1f}" in found or "force" in found
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_no_random_or_adversarial_command_moves_an_arm_out_of_its_limits(seed: int) -> None:
     """Run a short `python -m benchmarks.limiter`."""
     result = run(5000, seed, searching=False)

@@ -185,7 +185,9 @@ def test_a_late_display_is_named_while_the_sheet_moves() -> None:
     assert not set().union(*observe(110, Change(), moving=True))
 
 
-@pytest.mark.parametrize(("seed", "pushed"), [(100, False), (101, True)])
+@pytest.mark.parametrize(
+    ("seed", "pushed"), [pytest.param(100, False, marks=pytest.mark.long), (101, True)]
+)
 def test_calibrated_devices_raise_no_suspicion_in_ten_minutes(seed: int, pushed: bool) -> None:
     assert not set().union(*observe(seed, Change(), seconds=600.0, image_s=0.2, pushed=pushed))
 

@@ -132,7 +132,7 @@ def fitted_corner(image: NDArray[np.float32], near: Floats, along: Floats, down:
 
 
 def test_corners_lie_where_the_optics_put_them(chessboard: TwinBoard) -> None:
-    for pose in chessboard.poses(3)[::2]:
+    for pose in chessboard.poses(1):
         for image, corners in zip(chessboard.levels(pose), chessboard.corners(pose), strict=True):
             grid = corners.reshape(6, 9, 2)
             along = np.gradient(grid, axis=1).reshape(-1, 2)
@@ -161,7 +161,7 @@ def test_a_charuco_board_has_the_markers_that_opencv_expects(rig: StereoCamera) 
             (10, 7), 0.025, 0.018, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
         )
     )
-    for pose in board.poses(4):
+    for pose in board.poses(1):
         for image, corners in zip(board.pair(pose), board.corners(pose), strict=True):
             seen, numbers, _, _ = detector.detectBoard(image)
             assert numbers is not None
