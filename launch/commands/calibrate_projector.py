@@ -286,7 +286,6 @@ def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
 
 
 def _make_flow_list(values: Iterable[float]) -> Any:
-    """Return a YAML list of rounded values that is written on one line."""
     from ruamel.yaml.comments import CommentedSeq
 
     row = CommentedSeq([round_digits(value) for value in values])

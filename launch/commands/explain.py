@@ -80,7 +80,6 @@ def entries() -> tuple[Entry, ...]:
 
 
 def _subclasses(kind: type[FlexsheetError]) -> Iterator[type[FlexsheetError]]:
-    """Yield all subclasses of an error class that are defined in this package."""
     for derived in kind.__subclasses__():
         if derived.__module__.startswith("flexsheet."):
             yield derived

@@ -229,7 +229,6 @@ async def _run_until(
 
 
 def _print_log_line(node: str, line: str) -> None:
-    """Print one line of a node's log with the node's name."""
     style, text = format_log_line(line)
     words.print(f"{node:>16} | {text}", style=style, markup=False)
 

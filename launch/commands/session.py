@@ -319,7 +319,6 @@ def run_node(
 
 
 async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | None) -> int:
-    """Run a node of the plan in this process, connected to the running graph."""
     from flexsheet.launch.running.supervisor import node_config
     from flexsheet.nodes.runner import run_node as run_config
 

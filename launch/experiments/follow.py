@@ -301,7 +301,6 @@ class FollowedContact:
         )
 
     def _deviated(self, sheet: RolledSheet) -> list[Floats]:
-        """Return the nominal pose, and poses with a small deviation along x, y and the normal."""
         poses = [sheet.pose()]
         for axis in range(2):
             found = self._shape.closest(

@@ -91,8 +91,6 @@ def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = 
 
 
 def make_gestures_procedure(names: Sequence[str], progress: Progress) -> Procedure:
-    """Make a procedure that performs the gestures in sequence."""
-
     async def procedure(driver: Driver, scene: Scene) -> None:
         for i, name in enumerate(names):
             path = gesture_path(name, scene)

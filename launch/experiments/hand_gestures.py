@@ -326,7 +326,6 @@ SUMMARY = ("peak_error_n", "mean_error_n", "median_error_percent", "transient_n"
 
 
 def _make_result(scene: Scene, seed: int | None, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the result and a summary, which has the worst value of all hands for each gesture."""
     names = dict.fromkeys(row["gesture"] for row in rows)
     summary = {
         name: {key: max(row[key] for row in rows if row["gesture"] == name) for key in SUMMARY}

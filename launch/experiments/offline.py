@@ -32,6 +32,7 @@ from flexsheet.nodes import node_class
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.models.sheet.force_models import SheetPush
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 from flexsheet.nodes.renderer import deflection_cache
@@ -392,10 +393,8 @@ class OfflineEvaluator:
             felt.extend((history_ratios * (pushed.finger_force_n @ contact.normal)).tolist())
             believed_m = true_m - float(tip_error @ contact.normal)
             model = self._force_model.evaluate(
-                self._stretch_ratio,
+                SheetPush(self._stretch_ratio, self._scene.finger.radius_m),
                 np.array([max(believed_m, 1e-4)]),
-                position_m=(0.0, 0.0),
-                finger_radius_m=self._scene.finger.radius_m,
             )
             expected.extend([float(model.force_n[0])] * len(history_ratios))
         return np.array(felt), np.array(expected)
@@ -403,7 +402,6 @@ class OfflineEvaluator:
     def _compare_images(
         self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
     ) -> tuple[Floats, ...]:
-        """Return the image error maps of a tilted sheet and of a pushed sheet."""
         tilted, upright = self._touch(self._places_m[-1]), self._touch(0.0)
         depth_m = min(MAX_IMAGE_DEPTH_M, self._scene.working_range.push_depth_m)
         tip = upright.point - depth_m * upright.normal

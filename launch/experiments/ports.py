@@ -32,7 +32,6 @@ def choose_ports(launch_file: Path) -> list[str]:
 
 
 def _find_free_ports(count: int) -> list[int]:
-    """Return different TCP ports that are free now on the loopback interface."""
     sockets = [socket.socket() for _ in range(count)]
     try:
         for one in sockets:

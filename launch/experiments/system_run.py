@@ -128,7 +128,6 @@ def scene_speed(scene: Scene) -> float:
 
 
 def _make_rest(scene: Scene, label: str, place: Sequence[float]) -> FingerPath:
-    """Make a path that approaches a surface position from above and rests there."""
     above = [place[0], place[1], HOVER_M]
     return FingerPath(
         label=label,
@@ -317,7 +316,6 @@ def _read_force_errors(bag: Path) -> Floats:
 
 
 def _iterate_force_errors(bag: Path) -> Iterator[float]:
-    """Yield the absolute relative force error at each depth of the push, percent."""
     recorded = compliance.read_bag(bag)
     reference = compliance.ForceReference(recorded)
     press = compliance.make_presses(recorded.scene)[0]

@@ -74,13 +74,7 @@ class ArmPair:
         across = edges[1][:3, 3] - edges[0][:3, 3]
         length_m = float(np.linalg.norm(across))
         sheet = self._sheet
-        tension_n = edge_force_n(
-            length_m / sheet.width_m,
-            young_modulus_pa=sheet.young_modulus_pa,
-            width_m=sheet.width_m,
-            height_m=sheet.height_m,
-            thickness_m=sheet.thickness_m,
-        )
+        tension_n = edge_force_n(length_m / sheet.width_m, sheet)
         commanded = []
         for side, (spec, wanted) in enumerate(zip(self._specs, edges, strict=True)):
             edge, outwards = wanted.copy(), (-1.0, 1.0)[side]

@@ -82,15 +82,8 @@ def compute_compliance(
     max_depth_m: maximum push depth; None for the scene's. bounds: limits that keep the loop of
     sheet and hand stable.
     """
-    return fit_compliance(
-        curve,
-        law,
-        make_stretch_limits(scene.sheet, law, bounds),
-        max_depth_m=scene.working_range.push_depth_m if max_depth_m is None else max_depth_m,
-        finger_radius_m=scene.finger.radius_m,
-        usable_half_height_m=scene.sheet.usable_half_height_m,
-        position_error_m=scene.tolerances.sheet_position_m,
-    )
+    limits = make_stretch_limits(scene.sheet, law, bounds)
+    return fit_compliance(curve, law, limits, scene, max_depth_m=max_depth_m)
 
 
 class LoopRisk(StrEnum):

@@ -284,7 +284,6 @@ def _is_finite(value: float | None) -> bool:
 
 
 def _has_reference(point: dict[str, Any]) -> bool:
-    """Return whether the error of a point is known, that is, a reference was available."""
     return _is_finite(point["error"])
 
 
@@ -318,7 +317,6 @@ def read_charts(folder: Path) -> list[dict[str, Any]]:
 
 
 def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
-    """Add the keys that results of earlier versions do not contain."""
     points = [
         {
             "extra_metrics": {},

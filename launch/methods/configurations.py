@@ -21,7 +21,7 @@ from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
 from flexsheet.nodes.fem_solver.benchmarks import LINEAR_DEPTH_M
-from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel
+from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetPush
 from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.renderer.benchmarks import MAX_TRIANGLES_DEPTH_MM, is_in_range
 
@@ -119,7 +119,7 @@ def choose_cheapest(scene: Scene) -> Methods:
     stretch = 0.5 * (scene.sheet.min_stretch_ratio + scene.sheet.max_stretch_ratio)
     rubber = make_rubber(scene.sheet)
     is_scaled = not ScaledSheetModel(rubber).invalid_reason(
-        stretch, depth_m, position_m=(0.0, 0.0), finger_radius_m=scene.finger.radius_m
+        SheetPush(stretch, scene.finger.radius_m), depth_m
     )
     corrections = ("one_plane", "four_triangles", "two_pass")
     limits = {"tilt_deg": min(float(tilt_deg), 50.0), "push_mm": 1e3 * depth_m}

@@ -151,7 +151,6 @@ class ResolvedNode(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _add_missing_fields(cls, values: Any) -> Any:
-        """Derive the fields that plans in older bags do not contain."""
         if not isinstance(values, dict):
             return values
         derived: dict[str, Any] = {"role": ROLES_OF_TYPES.get(str(values.get("type")))}

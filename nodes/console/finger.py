@@ -128,7 +128,6 @@ class FingerController:
         self._request(lifted=True)
 
     def lift_or_lower(self) -> None:
-        """Lift the finger, or lower it if it is lifted."""
         self._request(lifted=not self.intent.lifted)
 
     def _request(self, **changes: object) -> None:
@@ -137,7 +136,6 @@ class FingerController:
         self._update_target()
 
     def _update_target(self) -> None:
-        """Compute the target position, if there are a request and an object."""
         self._target, self._arrived = None, False
         position = self.intent.position
         if position.is_from_front:

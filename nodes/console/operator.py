@@ -307,7 +307,6 @@ class Operator:
         self._page.touch.show_lifted(finger)
 
     def _on_new_scene(self) -> None:
-        """Store the time at which the scene changed, and prepare picking points on its object."""
         self._sent_ns = round(1e9 * self._now_s)
         self.controller.scenes.make_picker(self.controller.finger, self._page.show_problem)
 

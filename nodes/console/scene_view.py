@@ -281,7 +281,6 @@ class SceneView:
         self._finger_color = FINGER
 
     def _add_devices(self, scene: Scene) -> None:
-        """Add the stereo camera, the projector and the user's eyes, with their lenses."""
         camera = scene.camera
         left = pose_matrix(camera.world_from_left)
         baseline_m = -float(camera.right_from_left[0, 3])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,14 +9,13 @@ from flexsheet.messages.methods import ComplianceMode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import SoftBody
 from flexsheet.nodes.models.hand_loop import OffsetBoundsTable
-from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel, SheetPosition
+from flexsheet.nodes.models.sheet.force_models import SheetForceModel, SheetPosition, SheetPush
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
     Compliance,
     ObjectCurve,
     StretchLimits,
     choose_stretch,
-    fit_at_stretch,
     fit_compliance,
     make_stretch_limits,
 )
@@ -123,18 +120,13 @@ class ComplianceController:
 
     def _fit(self, curve: ObjectCurve, *, in_contact: bool) -> None:
         self._curve = curve
-        scene = self._scene
-        fit = fit_compliance
-        if in_contact and self._compliance is not None:
-            fit = partial(fit_at_stretch, stretch_ratio=self._compliance.stretch_ratio)
-        fitted = fit(
+        kept = in_contact and self._compliance is not None
+        fitted = fit_compliance(
             curve,
             self._model,
             self._limits,
-            max_depth_m=scene.working_range.push_depth_m,
-            finger_radius_m=scene.finger.radius_m,
-            usable_half_height_m=scene.sheet.usable_half_height_m,
-            position_error_m=scene.tolerances.sheet_position_m,
+            self._scene,
+            stretch_ratio=self.stretch_ratio if kept else None,
         )
         self._compliance = fitted
         self.stretch_ratio = fitted.stretch_ratio
@@ -151,12 +143,8 @@ class ComplianceController:
     def _range_note(self, fitted: Compliance) -> str:
         """Return why the force model is invalid for the deepest push at the centre; "" if valid."""
         max_depth_m = self._scene.working_range.push_depth_m
-        reason = self._model.invalid_reason(
-            fitted.stretch_ratio,
-            float(fitted.indentation_m(max_depth_m)),
-            position_m=CENTRE,
-            finger_radius_m=self._scene.finger.radius_m,
-        )
+        push = SheetPush(fitted.stretch_ratio, fitted.finger_radius_m)
+        reason = self._model.invalid_reason(push, float(fitted.indentation_m(max_depth_m)))
         if not reason:
             return ""
         return f"outside the range of sheet force model {self._model.name}: {reason}"
@@ -181,15 +169,11 @@ class ComplianceController:
         return depth_m - scale * indented_m, 1.0 - scale * (1.0 - per_depth)
 
     def _force_exponent(self, indentation_m: float, position_m: SheetPosition) -> float:
-        """Return the local exponent of the sheet's force as a power of its indentation."""
         if indentation_m <= 0.0:
             return 1.0
-        below, above = self._model.evaluate(
-            self.stretch_ratio,
-            np.array([0.95, 1.05]) * indentation_m,
-            position_m=position_m,
-            finger_radius_m=self._scene.finger.radius_m,
-        ).force_n
+        push = SheetPush(self.stretch_ratio, self._scene.finger.radius_m, position_m)
+        depths = np.array([0.95, 1.05]) * indentation_m
+        below, above = self._model.evaluate(push, depths).force_n
         if below <= 0.0:
             return 1.0
         return max(float(np.log(above / below) / np.log(1.05 / 0.95)), 0.5)

@@ -170,7 +170,6 @@ class ContactStateMachine:
         return replace(contact, axes=axes, position_sheet_m=np.clip(point_sheet[:2], -limit, limit))
 
     def _roll(self, finger: Floats, velocity: Floats) -> ContactCommand:
-        """Roll the sheet to the finger, or hold it and return the reason in the command."""
         contact, limits = self.contact, self._limits
         depth = max(0.0, -contact.height_m(finger))
         moved, self._finger = finger - self._finger, finger
@@ -241,7 +240,6 @@ class ContactStateMachine:
         return rolled, "past_sheet_width" if axis == 0 else "past_sheet_height"
 
     def _lift(self, contact: SheetContact) -> SheetContact:
-        """Return the contact with the sheet lifted above the object's surface around it."""
         return replace(contact, lift_m=compute_rim_lift_m(self._shape, contact))
 
     def _concavity_reason(self) -> SheetReason:
@@ -252,7 +250,6 @@ class ContactStateMachine:
 
 
 def _is_too_deep(found: Nearest) -> bool:
-    """Return whether a new finger is so deep that its side of the object is not clear."""
     curvature = tightest_curvature(found.shape_operator)
     return bool(1.0 + found.height_m * curvature < MIN_RADIUS_FRACTION)
 

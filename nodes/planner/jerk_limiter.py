@@ -53,7 +53,6 @@ class JerkLimitedState:
 
     @staticmethod
     def at_rest(sheet: SheetMotion) -> JerkLimitedState:
-        """Return the state of the sheet at rest in this pose."""
         still = replace(sheet, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
         return JerkLimitedState(still, np.zeros(7), np.zeros(7))
 

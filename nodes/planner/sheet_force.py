@@ -18,6 +18,7 @@ from flexsheet.nodes.models.sheet.force_models import (
     SheetForce,
     SheetForceModel,
     SheetPosition,
+    SheetPush,
     make_model,
 )
 from flexsheet.nodes.models.sheet.membrane import push_path
@@ -143,6 +144,7 @@ def _trials(
             continue
         position = (x * rubber.width_m, y * rubber.height_m)
         reference_n = reference(sheet, stretch, depth, position, radius)
+        push = SheetPush(stretch, radius, position)
         for model in models:
             slow = model.name == "membrane"
             if slow and not (stretch == middle and label == "centre" and depth in SLOW_DEPTHS_M):
@@ -150,17 +152,9 @@ def _trials(
             yield Trial(
                 method=model.name,
                 case={"stretch": stretch, "depth_mm": 1e3 * depth, "position": label},
-                run=partial(
-                    model.evaluate,
-                    stretch,
-                    np.array([depth]),
-                    position_m=position,
-                    finger_radius_m=radius,
-                ),
+                run=partial(model.evaluate, push, np.array([depth])),
                 error=partial(_error_percent, reference_n=reference_n),
-                in_range=not model.invalid_reason(
-                    stretch, depth, position_m=position, finger_radius_m=radius
-                ),
+                in_range=not model.invalid_reason(push, depth),
                 in_scene=stretch >= sheet.min_stretch_ratio,
             )
 

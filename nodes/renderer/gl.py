@@ -266,7 +266,6 @@ class Canvas:
         mesh.array(program).render(moderngl.TRIANGLES)
 
     def _program(self, view: EyeView, look: DrawStyle) -> tuple[moderngl.Program, Uniforms]:
-        """Return the variant of the shader program for a view and a style, and its uniforms."""
         number = LOOKS.get(look.pattern, FLAT_LOOK if look.flat else SOFT_LOOK)
         return self._programs.get(
             LOOK=number,

@@ -156,7 +156,6 @@ class SceneRenderer:
         self.mesh_id: str | None = None
 
     def _material(self) -> SurfaceMaterial:
-        """Return the object's material, with a texture image scaled to the object's front view."""
         appearance, object_from_world = (
             self.scene.object.appearance,
             inverse(self._world_from_object),

@@ -267,7 +267,6 @@ class DataAssociation:
                 track.status = "clutter"
 
     def _update_finger(self, at_ns: int, marker: Candidate, tracker: Tracker) -> None:
-        """Update the finger's track with the marker that the tracker has accepted."""
         assert tracker.estimate is not None
         if self._finger is None:
             self._finger = ClutterTrack.of(marker, at_ns)
@@ -281,7 +280,6 @@ class DataAssociation:
     def _continue_track(
         self, at_ns: int, detection: StereoDetection
     ) -> Candidate | FingertipReason:
-        """Return the marker that continues the finger's track, or the reason if there is none."""
         tracks = self._associate(at_ns, [*detection.markers, *detection.clutter], self._finger)
         near = tracks[: len(detection.markers)]
         finger_markers = [
@@ -302,7 +300,6 @@ class DataAssociation:
     def _initiate_track(
         self, at_ns: int, detection: StereoDetection
     ) -> Candidate | FingertipReason:
-        """Return the marker that may start a track, or the reason if there is none."""
         markers = [*detection.markers, *detection.clutter]
         has_successor = any(track is self._successor for track in self.clutter_tracks)
         tracks = self._associate(at_ns, markers, None if has_successor else self._finger)

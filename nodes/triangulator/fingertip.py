@@ -243,7 +243,6 @@ def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | Non
 
 
 def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window | None]) -> bool:
-    """Return whether an image or its search window is overexposed."""
     return any(
         is_overexposed(image) or is_overexposed(image, window)
         for image, window in zip(inputs.images, windows, strict=True)
@@ -521,7 +520,6 @@ def _rejection_reason(
 
 
 def _size_cost(inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]) -> float:
-    """Return the mismatch of refined and expected radii, in squared standard deviations."""
     sizes = (
         _size_deviation(inputs, marker.radius, pair.depth_m)
         / math.hypot(MARKER_SIZE_SIGMA, marker.radius_deviation)
@@ -531,7 +529,6 @@ def _size_cost(inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Ma
 
 
 def _size_deviation(inputs: DetectionInput, radius_px: float, depth_m: float) -> float:
-    """Return the absolute log ratio of a radius to the marker's expected radius at that depth."""
     expected_px = _focal_px(inputs.geometry) * inputs.config.marker_radius_m / depth_m
     return abs(math.log(radius_px / expected_px))
 

@@ -228,7 +228,6 @@ def _add_border(box: Sequence[int]) -> Window:
 
 
 def _surround_level(cut: Image) -> float:
-    """Return the grey level of the surroundings, a quantile over the cut-out's outermost pixels."""
     border = np.concatenate((cut[0], cut[-1], cut[:, 0], cut[:, -1]))
     border.sort()
     return float(border[int(SURROUND_RANK * border.size)])

@@ -125,7 +125,6 @@ class Tracker:
         return self._gate_after(*self._history[-1], at_ns)
 
     def _gate_after(self, measurement: PositionMeasurement, estimate: Estimate, at_ns: int) -> Gate:
-        """Return the gate at a time after one of the track's points."""
         dt = (at_ns - estimate.at_ns) * 1e-9
         point = self.filter.predict(estimate, np.array([dt]))[0]
         spread = self.filter.moments(estimate)[2]

@@ -170,7 +170,6 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
-    """Clip values like numpy.clip, which takes five times as long for six numbers."""
     return np.minimum(np.maximum(values, lowest), highest)
 
 
@@ -333,7 +332,6 @@ class Controller:
             self._pending.append((self._due_s(), joints))
 
     def _due_s(self) -> float:
-        """Return the time at which a set-point that arrives now takes effect."""
         due_s = self._time_s + self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
         if not self._cycle_s:
             return due_s

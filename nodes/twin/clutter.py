@@ -197,7 +197,6 @@ def together(*parts: Clutter) -> Clutter:
 
 
 def _from_knuckle(x: float, y: float, z: float) -> FixedPoint:
-    """Return a point given relative to the knuckle of the pointing finger, from the fingertip."""
     knuckle = [FINGER_LENGTH_M * part for part in FINGER_DIRECTION]
     return FixedPoint((knuckle[0] + x, knuckle[1] + y, knuckle[2] + z))
 

@@ -157,7 +157,6 @@ class TwinFingerNode(Node):
             self._follow_waiting()
 
     async def _couple(self, scene: Scene) -> None:
-        """Tabulate the sheet's force in a thread, couple the finger to it, and start the path."""
         given = self.parameters
         reaction = await asyncio.to_thread(
             load_or_compute_reaction, scene, given.apparatus, given.cache_dir
@@ -169,7 +168,6 @@ class TwinFingerNode(Node):
         self._follow_waiting()
 
     def _follow_waiting(self) -> None:
-        """Follow the path that arrived before the finger was ready."""
         path, self.waiting = self.waiting, None
         if path is not None:
             self._follow(path)
@@ -305,7 +303,6 @@ class TwinFingerNode(Node):
         return self.lit_marks.light(arms, finger, at_ns)
 
     def _stamp_error_ns(self) -> int:
-        """Return a random sample of the true time of an exposure minus its timestamp."""
         if self.parameters.apparatus is None:
             return 0
         camera = self.parameters.apparatus.camera

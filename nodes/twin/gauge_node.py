@@ -90,7 +90,6 @@ class GaugeErrors:
     random: np.random.Generator
 
     def read_n(self, force_n: float) -> float:
-        """Return the reading of the gauge for a true force."""
         noise_n = self.truth.noise_n * float(self.random.standard_normal())
         return self.truth.gain_ratio * force_n + self.truth.offset_n + noise_n
 

@@ -125,7 +125,6 @@ def touched(motion: Sampled) -> Sampled:
 
 
 def _on_surface(scene: Scene, label: str, motion: Sampled) -> FingerPath:
-    """Make the path of a gesture in contact, with the tremor of a hand that is held out."""
     times, places = touched(motion)
     return place_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
 
@@ -144,7 +143,6 @@ def hover(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed: int) -> FingerPath:
-    """Make ten reaches, alternating between the surface and the air above it."""
     generator = np.random.default_rng(seed)
     along_m, arc_m = touchable(scene)
     half = 0.5 * np.array([along_m, arc_m])

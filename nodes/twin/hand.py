@@ -240,7 +240,6 @@ class CoupledFinger:
 
 
 def _hermite(t: float, span_s: float, before: float, after: float, rates: list[float]) -> float:
-    """Interpolate a value at a fraction t of a time span, from values and rates at both ends."""
     s = 1.0 - t
     return (
         s * s * (1.0 + 2.0 * t) * before

@@ -331,7 +331,6 @@ class MxtServer:
         self._wait_for_cycle()
 
     def _wait_for_cycle(self) -> None:
-        """Schedule the answer for the end of the present cycle."""
         if self._due is None:
             loop = asyncio.get_running_loop()
             self._due = loop.call_later(self.controller.until_cycle_s(), self._flush)

@@ -487,7 +487,6 @@ class TwinCamera:
     def _eye(
         self, side: Side, lens: Lens, camera_from_world: Floats, sheet: Singles | None
     ) -> CameraView:
-        """Make the view of one camera, with all static objects drawn into its background."""
         height, width = self.camera.height_px, self.camera.width_px
         slopes = _slopes(lens, width, height)
         canvas = self._room(height, width)
@@ -613,7 +612,6 @@ def quantize(levels: Singles) -> Image:
 
 
 def _spots(clutter: Clutter, side: Side) -> list[SecondMarker | Highlight]:
-    """Return the additional markers and the highlights that one camera sees."""
     spots: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
     return [spot for spot in spots if spot.views in ("both", side)]
 

@@ -124,7 +124,6 @@ class SheetSurface:
 
     @classmethod
     def of(cls, scene: Scene, apparatus: Apparatus | None = None) -> Self:
-        """Return the surface of the true sheet in an apparatus, or of the sheet in the scene."""
         rubber = true_rubber(apply_apparatus(scene, apparatus).sheet, apparatus)
         if rubber.density_kg_per_m3 == 0.0:
             return cls(None)
