@@ -35,6 +35,7 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, Phase, SheetTarget, TwinFinger
+from flexsheet.nodes.models.hand_loop import Hand
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
@@ -245,10 +246,8 @@ def hand_gestures_result(
     rows: list[dict[str, Any]] = []
     forces: dict[tuple[str, str], FeltForce] = {}
     for number, hand in enumerate(draw_hands(hands, seed)):
-        critical = 2.0 * (hand.mass_kg * hand.stiffness_n_per_m) ** 0.5
-        impedance = HandImpedance(
-            hand.mass_kg, hand.stiffness_n_per_m, hand.damping_ns_per_m / critical
-        )
+        ratio = hand.damping_ns_per_m / _critical_damping(hand)
+        impedance = HandImpedance(hand.mass_kg, hand.stiffness_n_per_m, ratio)
         kind = f"{1e3 * hand.mass_kg:.0f} g"
         progress(f"hand {number + 1} of {3 * hands}: {kind}, {hand.stiffness_n_per_m:.0f} N/m")
         for name in names:
@@ -262,15 +261,7 @@ def hand_gestures_result(
             )
             force = compute_felt_force(scene, recorded, curve)
             forces[kind, name] = force
-            rows.append(
-                {
-                    "gesture": name,
-                    "mass_kg": hand.mass_kg,
-                    "damping_ns_per_m": hand.damping_ns_per_m,
-                    "stiffness_n_per_m": hand.stiffness_n_per_m,
-                    **evaluate_touch(recorded, force, touches),
-                }
-            )
+            rows.append(_make_row(name, impedance, evaluate_touch(recorded, force, touches)))
     return _make_result(scene, seed, rows), forces
 
 
@@ -309,17 +300,23 @@ def run_gestures(
     for name, recorded in read_touches(bag).items():
         force = compute_felt_force(scene, recorded, curve)
         forces[kind, name] = force
-        critical = 2.0 * (hand.mass_kg * hand.stiffness_n_per_m) ** 0.5
-        rows.append(
-            {
-                "gesture": name,
-                "mass_kg": hand.mass_kg,
-                "damping_ns_per_m": hand.damping_ratio * critical,
-                "stiffness_n_per_m": hand.stiffness_n_per_m,
-                **evaluate_touch(recorded, force, HAND_GESTURES[name][1]),
-            }
-        )
+        touches = HAND_GESTURES[name][1]
+        rows.append(_make_row(name, hand, evaluate_touch(recorded, force, touches)))
     return {**_make_result(scene, None, rows), "bag": str(bag)}, forces
+
+
+def _critical_damping(hand: Hand | HandImpedance) -> float:
+    return 2.0 * float(hand.mass_kg * hand.stiffness_n_per_m) ** 0.5
+
+
+def _make_row(gesture: str, hand: HandImpedance, figures: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "gesture": gesture,
+        "mass_kg": hand.mass_kg,
+        "damping_ns_per_m": hand.damping_ratio * _critical_damping(hand),
+        "stiffness_n_per_m": hand.stiffness_n_per_m,
+        **figures,
+    }
 
 
 SUMMARY = ("peak_error_n", "mean_error_n", "median_error_percent", "transient_n", "chatter")

@@ -123,6 +123,8 @@ def run_experiment(
         if bag is None or not bag.exists():
             raise
         raise type(error)(f"{error}\nrecording until the error: {bag}") from error
+    if bag is not None:
+        progress("reading the bag")
 
 
 async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
