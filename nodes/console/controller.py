@@ -1,7 +1,7 @@
 """Carry out the requests of the console page's viewers, in the console node's asyncio loop.
 
-The "eye view" is an image of what the user sees: a camera in the digital twin traces the projected
-frame from the viewpoint of the user's eye.
+The "eye view" is the image that a user sees: a camera in the simulator traces the projected frame
+from the position of the user's eye.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Show the page's tab with images of what the user's eye sees."""
+"""Show the page's tab with the images that the simulated eye sees."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMAGES = (
 
 
 class EyeTab:
-    """Tab with the images of what the user's eye sees; an image is visible once it exists."""
+    """Tab with the images that the simulated eye sees; each is hidden until it exists."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._enabled = gui.add_checkbox(

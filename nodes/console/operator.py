@@ -114,7 +114,7 @@ class Operator:
             "bookmark": self._bookmark,
             "open_bag": self._open_bag,
             "leave": self._leave,
-            "play": self._play,
+            "play": controller.replay.play_or_pause,
             "seek": controller.replay.seek,
             "replay_rate": self._set_rate,
         }
@@ -369,9 +369,6 @@ class Operator:
     def _leave(self) -> None:
         self.controller.replay.leave()
         self._page.record.show_replay(self.controller.replay, opened=True)
-
-    def _play(self) -> None:
-        self.controller.replay.play_or_pause()
 
     def _set_rate(self, rate: float) -> None:
         self.controller.replay.rate = rate

@@ -164,7 +164,6 @@ class Renderer(Node):
         self._draw(self._frame_renderer, now_ns)
         # If drawing takes longer than a period, leave time to read messages between frames.
         rest_until_ns = self.clock.now_ns() + self._period_ns // 2
-        self._max_age = MaxAge(self.parameters.max_age_s)
         self._due_ns = max(self._due_ns + self._period_ns, rest_until_ns)
 
     def _draw(self, frame_renderer: FrameRenderer, begun_ns: int) -> None:

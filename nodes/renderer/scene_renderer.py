@@ -85,14 +85,8 @@ def projector_homography(scene: Scene) -> Floats:
     Points of the plane (the imaginary screen of Furukawa et al. 2007) are (x, y) in m. The pixels
     are those without lens distortion.
     """
-    lens = require_projector(scene).lens
-    return pixel_from_screen(
-        fx_px=lens.fx_px,
-        fy_px=lens.fy_px,
-        cx_px=lens.cx_px,
-        cy_px=lens.cy_px,
-        world_from_projector=pose_matrix(require_projector(scene).world_from_projector),
-    )
+    projector = require_projector(scene)
+    return pixel_from_screen(projector.lens, pose_matrix(projector.world_from_projector))
 
 
 class SceneRenderer:

@@ -1,4 +1,4 @@
-"""Simulate the user's eye: render what it sees of projected frames, to evaluate experiments.
+"""Simulate the user's eye: render its images of projected frames, to evaluate experiments.
 
 Experiments label the frames that they evaluate. The apparatus holds the true parameters of the
 simulated hardware; the scene holds those that the other nodes assume.
@@ -65,7 +65,7 @@ class TwinEyeParameters(SimulatorParameters):
 
 
 class TwinEyeNode(Node):
-    """Render what the eye sees of labelled frames, once per label, correction and eye.
+    """Render the eye's image of labelled frames, once per label, correction and eye.
 
     Only frames with pixels and of a single view are rendered. A mono frame is seen from the
     viewpoint of the parameters, a frame for one eye from that eye.

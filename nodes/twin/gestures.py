@@ -15,7 +15,7 @@ The gestures follow published measurements of human motion:
   95:319). Hurried taps follow in 170-200 ms, 50-60 in ten seconds (finger tapping test of the
   Halstead Reitan battery). Contact is assumed to last 100-200 ms of an unhurried tap and about half
   of a hurried one; there is no source for soft objects.
-- People who are told to stop a reach need 206 ms on average to react (Mirabella, Pani, Pare and
+- After a signal to stop a reach, people need 206 ms on average to react (Mirabella, Pani, Pare and
   Ferraina 2006, Exp. Brain Res. 174:240). A stop is therefore sudden for an observer only.
 - Ellipses and similar figures are drawn more slowly where they are more curved, as in harmonic
   motion (Richardson and Flash 2002, J. Neurosci. 22:8201).

@@ -2,8 +2,9 @@
 
 This module was written from `docs/mxt.md` only. It shares no code with the bridge (the node that
 sends commands to an arm), because it serves to test the bridge. The robot program
-`Mxt 1,1,<filter>` is assumed to run. Only part of what a real controller refuses is known; this one
-refuses more, and does not answer after its program has ended.
+`Mxt 1,1,<filter>` is assumed to run. The set of packets that a real controller rejects is only
+partly known. The simulated controller rejects more packets, and sends no answer after its program
+has ended.
 """
 
 from __future__ import annotations
