@@ -11,7 +11,6 @@ import typer
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
 from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     examples,
@@ -287,8 +286,7 @@ def _check_may_reset(plan: ResolvedGraph, host: str, command: tuple[str, Message
         raise CommandError(
             f'host "{host}" is not allowed to reset an e-stop; reset it on '
             f"{', '.join(plan.estop_resetters)}, "
-            f"or set hosts.{host}.may_reset_estop in {plan.launch_file}",
-            BAD_INPUT,
+            f"or set hosts.{host}.may_reset_estop in {plan.launch_file}"
         )
 
 

@@ -23,7 +23,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     OTHER_THAN_LIVE,
     CommandError,
@@ -106,9 +105,7 @@ def record(
     running = running_graph(run)
     target = output or bag or Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}.mcap"
     if target.exists():
-        raise CommandError(
-            f"{target}: the file exists and is not overwritten; name a new file", BAD_INPUT
-        )
+        raise CommandError(f"{target}: the file exists and is not overwritten; name a new file")
     logs_on_stderr()
     limits = {
         "max_bag_bytes": None if max_size_mb is None else round(1e6 * max_size_mb),
@@ -390,7 +387,7 @@ def plot(
 
 def _require_output(output: Path | None) -> Path:
     if output is None:
-        raise CommandError("the output file is missing; add --output FILE", BAD_INPUT)
+        raise CommandError("the output file is missing; add --output FILE")
     return output
 
 
@@ -491,9 +488,7 @@ async def _record(
     for name in names:
         if name not in plan.writers:
             option = "--include" if name in include else "--topic"
-            raise CommandError(
-                f"{option} {name}: the topic has no writer in the running graph", BAD_INPUT
-            )
+            raise CommandError(f"{option} {name}: the topic has no writer in the running graph")
     config = NodeConfig(
         name="bag_record",
         type="recorder",
@@ -574,7 +569,8 @@ async def _play_into(request: PlayRequest, plan: ResolvedGraph, run: Run) -> int
     if not selection.topics:
         raise CommandError(
             f"{request.bag}: contains no topic that can be played into {plan.launch_file}; "
-            "list the topics to play under external_topics there"
+            "list the topics to play under external_topics there",
+            FAILED,
         )
     sent = 0
     while True:

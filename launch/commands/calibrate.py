@@ -22,7 +22,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -152,7 +151,7 @@ def stereo(
         else:
             camera_scene = twin or scene_file
             if camera_scene is None:
-                raise CommandError("--device-source requires --scene FILE; add it", BAD_INPUT)
+                raise CommandError("--device-source requires --scene FILE; add it")
             scene = load_scene(camera_scene)
             pose_capture = Capture(
                 described,
@@ -187,7 +186,7 @@ def stereo(
                 progress=progress,
             )
     except CalibrationError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     save_calibration(calibrated.calibration, output, comment=shlex.join(command))
     page: Path | None = None
     if report is not None:
@@ -277,7 +276,7 @@ def check(
                 progress=progress,
             )
     except (CalibrationError, CalibrationFileError) as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     reused = result["used_to_calibrate"]
     if isinstance(reused, list) and reused:
         words.print(
@@ -328,7 +327,7 @@ def cross_check(
                 progress=progress,
             )
     except CalibrationError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     if as_json:
         print_json(result)
         return
@@ -375,7 +374,7 @@ def print_board(
     try:
         write_board(described, output)
     except CalibrationError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     if as_json:
         print_json({"file": str(output), "board": described.model_dump(mode="json")})
     else:
@@ -395,8 +394,7 @@ def _check_single_source(
     if sum(chosen) != 1 or (files and not (left and right)):
         raise CommandError(
             "give exactly one source of images: --left with --right, --device-source with --scene, "
-            "or --twin",
-            BAD_INPUT,
+            "or --twin"
         )
 
 
@@ -404,8 +402,7 @@ def _find_images(option: str, pattern: str) -> list[Path]:
     paths = [Path(name) for name in sorted(glob.glob(pattern))]
     if not paths:
         raise CommandError(
-            f"{option} {pattern}: no file matches; check the path, and put the pattern in quotes",
-            BAD_INPUT,
+            f"{option} {pattern}: no file matches; check the path, and put the pattern in quotes"
         )
     return paths
 
@@ -416,8 +413,7 @@ def _parse_board(text: str, square_mm: float, marker_mm: float | None, dictionar
     columns, _, rows = text.lower().partition("x")
     if not (columns.isdigit() and rows.isdigit() and min(int(columns), int(rows)) >= 3):
         raise CommandError(
-            f"--board {text}: expected COLUMNSxROWS of inner corners, at least 3x3, such as 9x6",
-            BAD_INPUT,
+            f"--board {text}: expected COLUMNSxROWS of inner corners, at least 3x3, such as 9x6"
         )
     charuco = marker_mm is not None
     return Board(
@@ -467,18 +463,16 @@ def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
         calibration = load_calibration(path)
         refuse_other_camera(calibration, scene.camera)
     except CalibrationFileError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     except CalibrationMismatchError as error:
-        raise CommandError(f"{path}: {error}", BAD_INPUT) from error
+        raise CommandError(f"{path}: {error}") from error
     return calibration
 
 
 def require_twin(apparatus: str | None, *, simulated: bool) -> None:
     """Raise CommandError if --apparatus is given without --twin."""
     if apparatus is not None and not simulated:
-        raise CommandError(
-            f"--apparatus {apparatus}: the option is for --twin only; remove it", BAD_INPUT
-        )
+        raise CommandError(f"--apparatus {apparatus}: the option is for --twin only; remove it")
 
 
 def load_true_devices(text: str | None, scene: Scene) -> Apparatus | None:

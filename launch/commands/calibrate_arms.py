@@ -38,7 +38,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -141,7 +140,7 @@ def arms(
 
     check_folder("-o", output)
     if twin == (left_arm is not None or right_arm is not None):
-        raise CommandError("give either --twin, or --left-arm, --right-arm or both", BAD_INPUT)
+        raise CommandError("give either --twin, or --left-arm, --right-arm or both")
     require_twin(apparatus, simulated=twin)
     if copy is not None:
         _check_new_file(copy, "--write-scene")
@@ -195,7 +194,7 @@ def write_scene(
     try:
         _write_copy(scene_file, load_arms_calibration(calibration), output)
     except CalibrationFileError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     if as_json:
         print_json({"scene": str(output)})
     else:
@@ -237,14 +236,14 @@ def capture(
     from flexsheet.launch.plans.plan import load_scene
 
     if side not in SIDES:
-        raise CommandError(f"--arm {side}: expected left or right", BAD_INPUT)
+        raise CommandError(f"--arm {side}: expected left or right")
     scene = load_scene(scene_file)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
     try:
         output.mkdir(parents=True)
     except OSError as error:
         raise CommandError(
-            f"-o {output}: cannot be created: {error.strerror}; name a new folder", BAD_INPUT
+            f"-o {output}: cannot be created: {error.strerror}; name a new folder"
         ) from error
     recorder = PoseRecorder(
         output, described, make_lens_rig(scene, load_optics(calibration, scene))
@@ -318,7 +317,7 @@ async def record_poses(
 
 def _check_new_file(path: Path, option: str) -> None:
     if path.exists():
-        raise CommandError(f"{option} {path}: the file exists; name a new file", BAD_INPUT)
+        raise CommandError(f"{option} {path}: the file exists; name a new file")
     check_folder(option, path)
 
 
@@ -345,7 +344,7 @@ def simulate_folder(
             ):
                 progress(done, places, f"simulating the {side} arm")
     except BoardError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     return poses
 
 
@@ -365,9 +364,9 @@ def fit_folder(
         with words.status(f"{side} arm: fitting"):
             return calibrate_base(detections, rig), blind
     except (ArmPosesError, CalibrationError) as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     except HandEyeError as error:
-        raise CommandError(f"{side} arm, {folder}: {error}", BAD_INPUT) from error
+        raise CommandError(f"{side} arm, {folder}: {error}") from error
 
 
 def make_calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> ArmsCalibration:

@@ -23,7 +23,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -136,8 +135,7 @@ def projector(
     if (pictures is not None) + (corners is not None) + twin != 1:
         raise CommandError(
             "give exactly one of --pictures, --corners and --twin; to capture images, first write "
-            "the patterns with --write-patterns FOLDER",
-            BAD_INPUT,
+            "the patterns with --write-patterns FOLDER"
         )
     require_twin(apparatus, simulated=twin)
     if output is not None:
@@ -165,7 +163,7 @@ def projector(
                 measure_points(views, camera, require_projector(scene)), require_projector(scene)
             )
     except ProjectorError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     if output is not None:
         write_scene(scene_file, fit.projector, output)
     _print_result(scene, fit, true, output, as_json=as_json)
@@ -190,8 +188,7 @@ def read_views(folder: Path, count: int) -> Iterator[Views]:
     poses = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not poses:
         raise CommandError(
-            f"--pictures {folder}: the folder contains no subfolders; make one for each sheet pose",
-            BAD_INPUT,
+            f"--pictures {folder}: the folder contains no subfolders; make one for each sheet pose"
         )
     for pose in poses:
         sides = []
@@ -200,13 +197,12 @@ def read_views(folder: Path, count: int) -> Iterator[Views]:
             if len(paths) != count:
                 raise CommandError(
                     f"--pictures {pose}: expected {count} files {side}*.png, one per pattern, "
-                    f"found {len(paths)}",
-                    BAD_INPUT,
+                    f"found {len(paths)}"
                 )
             try:
                 sides.append([read_gray(path) for path in paths])
             except CalibrationError as error:
-                raise CommandError(str(error), BAD_INPUT) from error
+                raise CommandError(str(error)) from error
         yield sides[0], sides[1]
 
 
@@ -267,8 +263,7 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
     except ValueError as error:
         raise CommandError(
             f"--corners '{corners}' --rectangle-mm {rectangle_mm}: {error}; for example "
-            "--corners '599,499 199,499 199,99 599,99' --rectangle-mm 200x200",
-            BAD_INPUT,
+            "--corners '599,499 199,499 199,99 599,99' --rectangle-mm 200x200"
         ) from error
     return fit_keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, require_projector(scene))
 

@@ -8,7 +8,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexsheet.launch.commands.output import BAD_INPUT, CommandError, words
+from flexsheet.launch.commands.output import FAILED, CommandError, words
 from flexsheet.messages.files import write_file
 from flexsheet.nodes.camera.image_pair import encode_png
 
@@ -49,13 +49,11 @@ def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
             problem = "; ".join(f"{where}: {what}" for where, what in mistakes)
         raise CommandError(
             f"--device-source {source}: {problem}; use the format of a camera node's parameter "
-            "source, such as '{kind: opencv, left: 0, right: 1}'",
-            BAD_INPUT,
+            "source, such as '{kind: opencv, left: 0, right: 1}'"
         ) from error
     if described.kind == "twin":
         raise CommandError(
-            "--device-source twin: the simulator of a graph shows no board; use --twin SCENE",
-            BAD_INPUT,
+            "--device-source twin: the simulator of a graph shows no board; use --twin SCENE"
         )
     return _read_views(described, source, scene)
 
@@ -72,7 +70,7 @@ def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Vie
                 check_size(images, scene.camera, source)
                 yield images.left, images.right
     except DeviceError as error:
-        raise CommandError(str(error)) from error
+        raise CommandError(str(error), FAILED) from error
 
 
 def simulate_views(
@@ -92,7 +90,7 @@ def simulate_views(
         for left_from_board in shown.poses(POSES_PER_PAIR * pairs):
             yield shown.pair(left_from_board)
     except BoardError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
 
 
 def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
@@ -102,7 +100,7 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
     the missing cases. Returns the number of pairs, which is at least one.
     """
     if folder.exists():
-        raise CommandError(f"--pictures {folder}: the folder exists; name a new folder", BAD_INPUT)
+        raise CommandError(f"--pictures {folder}: the folder exists; name a new folder")
     accepted = 0
     try:
         with _show_coverage(capture) as show:
@@ -125,7 +123,8 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
     if not accepted:
         raise CommandError(
             "no image pair was accepted, because the board was never at rest and fully visible in "
-            "both images; hold it still in view of both cameras"
+            "both images; hold it still in view of both cameras",
+            FAILED,
         )
     words.print(f"{accepted} pairs in {folder}", markup=False)
     return accepted

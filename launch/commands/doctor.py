@@ -11,7 +11,6 @@ import typer
 
 from flexsheet.launch.commands.options import JsonOption, SceneArgument, output_file
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     check_folder,
@@ -108,7 +107,7 @@ def check_scene(
             draw_layout(layout, output)
         except (OSError, ValueError) as error:
             raise CommandError(
-                f"--output {output}: cannot be written: {error}; use .png or .svg", BAD_INPUT
+                f"--output {output}: cannot be written: {error}; use .png or .svg"
             ) from error
         words.print(f"image: {output}", markup=False)
     if as_json:

@@ -9,7 +9,6 @@ import typer
 
 from flexsheet.launch.commands.options import JsonOption, SceneArgument
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     examples,
@@ -70,7 +69,7 @@ def compliance(
         with words.status("computing the soft body's force curve"):
             curve = ObjectCurve.from_rows(compute_front_curve(scene))
     except (CalibrationFileError, CalibrationMismatchError, UnfitGeometryError) as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms)
     if as_json:
         print_json(result)

@@ -23,7 +23,6 @@ from flexsheet.launch.commands.options import (
     with_scene,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     examples,
     print_json,
@@ -130,9 +129,7 @@ def stroke(
     """
     given = with_scene(settings, scene)
     if radii and scene is not None:
-        raise CommandError(
-            "--radii measures the shipped cylinder scenes only; remove --scene", BAD_INPUT
-        )
+        raise CommandError("--radii measures the shipped cylinder scenes only; remove --scene")
     if repeats > 1 or ablations or radii:
         from flexsheet.launch.experiments import stroke_table
 
@@ -552,7 +549,7 @@ def stability(
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
     if (graph or apparatus is not None) and not (gestures and graph):
-        raise CommandError("--graph requires --gestures, and --apparatus requires both", BAD_INPUT)
+        raise CommandError("--graph requires --gestures, and --apparatus requires both")
     given = with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")

@@ -30,7 +30,7 @@ class CommandError(FlexsheetError):
     code = "command"
     remedy = "Correct the option or file that the error names."
 
-    def __init__(self, text: str, exit_code: int = FAILED) -> None:
+    def __init__(self, text: str, exit_code: int = BAD_INPUT) -> None:
         super().__init__(text)
         self.exit_code = exit_code
 
@@ -38,9 +38,7 @@ class CommandError(FlexsheetError):
 def check_folder(option: str, file: Path) -> None:
     """Raise CommandError, which names the option, if the folder of an output file is missing."""
     if not file.resolve().parent.is_dir():
-        raise CommandError(
-            f"{option} {file}: the folder {file.parent} does not exist; create it", BAD_INPUT
-        )
+        raise CommandError(f"{option} {file}: the folder {file.parent} does not exist; create it")
 
 
 class Words:

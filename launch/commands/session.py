@@ -32,7 +32,6 @@ from flexsheet.launch.commands.options import (
     with_scene,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     examples,
@@ -182,8 +181,7 @@ def logs(
     if not file.is_file():
         known = sorted(one.stem for one in found.logs.glob("*.log"))
         raise CommandError(
-            f'"{node}": {found.logs} contains no log of this node; {did_you_mean(node, known)}',
-            BAD_INPUT,
+            f'"{node}": {found.logs} contains no log of this node; {did_you_mean(node, known)}'
         )
 
     def show(line: str) -> None:
@@ -300,13 +298,11 @@ def run_node(
         if given:
             raise CommandError(
                 "--set and --scene require --launch LAUNCH_FILE, because the running graph has "
-                "fixed settings",
-                BAD_INPUT,
+                "fixed settings"
             )
     if node not in plan.nodes:
         raise CommandError(
-            f'"{node}": unknown node of {plan.launch_file}; {did_you_mean(node, list(plan.nodes))}',
-            BAD_INPUT,
+            f'"{node}": unknown node of {plan.launch_file}; {did_you_mean(node, list(plan.nodes))}'
         )
     if launch_file is not None:
         without = [name for name in plan.nodes if name != node]
@@ -325,7 +321,8 @@ async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | No
     if (run.directory / f"{name}.status").exists():
         raise CommandError(
             f'node "{name}" is already running in {run.directory}; '
-            f"start the graph without it: flexsheet launch LAUNCH_FILE --without {name}"
+            f"start the graph without it: flexsheet launch LAUNCH_FILE --without {name}",
+            FAILED,
         )
     words.print(f"running {name} in {run.directory}; press Ctrl-C to stop", markup=False)
     stop_event = asyncio.Event()

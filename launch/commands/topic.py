@@ -13,7 +13,7 @@ import typer
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
 from flexsheet.launch.commands.options import JsonOption, RunOption, TopicArgument, make_app
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
+    FAILED,
     CommandError,
     examples,
     print_fields,
@@ -188,7 +188,7 @@ def delay(
     arrivals = [one for one in _measure(topic, run, duration) if one.header.clock_id == own]
     if not arrivals:
         raise CommandError(
-            f'topic "{topic}" has timestamps of another computer; run the command there'
+            f'topic "{topic}" has timestamps of another computer; run the command there', FAILED
         )
     print_rows(measure_delays(arrivals), as_json=as_json)
 
@@ -249,7 +249,8 @@ def pub(
 def make_silence_error(topic: str, duration_s: float) -> CommandError:
     return CommandError(
         f'no message on "{topic}" within {duration_s:g} s; check that its writer is running: '
-        "flexsheet topic echo status"
+        "flexsheet topic echo status",
+        FAILED,
     )
 
 
@@ -389,7 +390,7 @@ def _find_topic(name: str) -> Topic:
     try:
         return find_topic(name)
     except UnknownTopicError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
 
 
 def _describe(topic: Topic) -> dict[str, Any]:
@@ -414,8 +415,7 @@ def _get_field(message: Message, path: str | None, topic: str) -> Any:
 
             raise CommandError(
                 f'--field {path}: topic "{topic}" does not contain the field "{name}"; '
-                f"{did_you_mean(name, list(fields))}",
-                BAD_INPUT,
+                f"{did_you_mean(name, list(fields))}"
             )
         value = getattr(value, name)
     return value
@@ -498,7 +498,8 @@ def make_listener(
     if not plan.endpoints_to_read(topic.name):
         raise CommandError(
             f'topic "{topic.name}" has no writer in the running graph {run.directory}; '
-            "add a node that publishes it to the launch file"
+            "add a node that publishes it to the launch file",
+            FAILED,
         )
     return make_subscriber(
         topic.name,
@@ -521,17 +522,17 @@ def _parse_message(topic: Topic, text: str) -> Message:
         try:
             text = Path(source).read_text()
         except OSError as error:
-            raise CommandError(f"{source}: cannot be read: {error.strerror}", BAD_INPUT) from error
+            raise CommandError(f"{source}: cannot be read: {error.strerror}") from error
     try:
         try:
             value = parse_json(text)
         except ValueError:  # JSON is valid YAML, so the YAML error describes faults in both
             value = parse_value(text)
     except YAMLError as error:
-        raise CommandError(f"{source}: not valid YAML or JSON: {error}", BAD_INPUT) from error
+        raise CommandError(f"{source}: not valid YAML or JSON: {error}") from error
     if not isinstance(value, dict):
         raise CommandError(
-            f"{source}: expected a mapping with the fields of {topic.message.__name__}", BAD_INPUT
+            f"{source}: expected a mapping with the fields of {topic.message.__name__}"
         )
     return validate(
         topic.message, Document(Path(f"{source} ({topic.message.__name__})"), value, text, {})
