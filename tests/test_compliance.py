@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from flexsheet.launch.calibration.simulated_sheet import simulate_push
-from flexsheet.launch.cli import app
-from flexsheet.launch.commands.output import CommandError
+from flexsheet.launch.cli import app, exit_code
+from flexsheet.launch.commands.output import BAD_INPUT
 from flexsheet.launch.health import compliance as compliance_check
 from flexsheet.launch.health.compliance import (
     FINGERTIP_AGE_S,
@@ -26,6 +26,7 @@ from flexsheet.launch.health.compliance import (
     find_loop_risk,
 )
 from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.types import SoftBody
 from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel, SheetPush
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
@@ -322,15 +323,12 @@ def test_a_graph_is_checked_with_the_delay_of_its_planner(monkeypatch: pytest.Mo
 
 
 def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:
-    command = [
-        "doctor",
-        "compliance",
-        str(SCENE_FILE),
-        "--calibration",
-        str(tmp_path / "none.yaml"),
-    ]
-    result = CliRunner().invoke(app, command)
-    assert isinstance(result.exception, CommandError)
+    missing = str(tmp_path / "none.yaml")
+    result = CliRunner().invoke(
+        app, ["doctor", "compliance", str(SCENE_FILE), "--calibration", missing]
+    )
+    assert isinstance(result.exception, CalibrationFileError)
+    assert exit_code(result.exception) == BAD_INPUT
     assert "cannot be read" in str(result.exception)
 
 

@@ -131,7 +131,6 @@ def stereo(
     simulated (--twin).
     """
     from flexsheet.launch.calibration.capture import Capture
-    from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.launch.calibration.stereo import calibrate_stereo
     from flexsheet.launch.commands import capture
     from flexsheet.launch.plans.plan import load_scene
@@ -143,50 +142,47 @@ def stereo(
     described = _parse_board(board, square_mm, marker_mm, dictionary)
     scene: Scene | None = None
     command = ["flexsheet", "calibrate", "stereo"]
-    try:
-        if left and right:
-            left_paths, right_paths = _find_images("--left", left), _find_images("--right", right)
-            command += ["--left", left, "--right", right]
-            scene = None if scene_file is None else load_scene(scene_file)
+    if left and right:
+        left_paths, right_paths = _find_images("--left", left), _find_images("--right", right)
+        command += ["--left", left, "--right", right]
+        scene = None if scene_file is None else load_scene(scene_file)
+    else:
+        camera_scene = twin or scene_file
+        if camera_scene is None:
+            raise CommandError("--device-source requires --scene FILE; add it")
+        scene = load_scene(camera_scene)
+        pose_capture = Capture(
+            described,
+            lens=scene.camera.left,
+            size=(scene.camera.width_px, scene.camera.height_px),
+            pairs=pairs,
+            still_images=1 if device_source is None else 4,
+        )
+        if device_source is None:
+            true = load_true_devices(apparatus, scene)
+            views = capture.simulate_views(scene, described, true, pairs=pairs, seed=seed)
+            command += ["--twin", str(camera_scene), "--pairs", str(pairs), "--seed", str(seed)]
+            command += [] if apparatus is None else ["--apparatus", apparatus]
         else:
-            camera_scene = twin or scene_file
-            if camera_scene is None:
-                raise CommandError("--device-source requires --scene FILE; add it")
-            scene = load_scene(camera_scene)
-            pose_capture = Capture(
-                described,
-                lens=scene.camera.left,
-                size=(scene.camera.width_px, scene.camera.height_px),
-                pairs=pairs,
-                still_images=1 if device_source is None else 4,
-            )
-            if device_source is None:
-                true = load_true_devices(apparatus, scene)
-                views = capture.simulate_views(scene, described, true, pairs=pairs, seed=seed)
-                command += ["--twin", str(camera_scene), "--pairs", str(pairs), "--seed", str(seed)]
-                command += [] if apparatus is None else ["--apparatus", apparatus]
-            else:
-                views = capture.read_device_views(device_source, scene)
-                command += ["--device-source", device_source, "--scene", str(camera_scene)]
-            folder = pictures or Path(f"runs/calibration-{datetime.now():%Y%m%d-%H%M%S}")
-            capture.write_pairs(views, pose_capture, folder)
-            left_paths = sorted(folder.glob("left*.png"))
-            right_paths = sorted(folder.glob("right*.png"))
-        command += ["--board", board, "--square-mm", f"{square_mm:g}"]
-        if marker_mm is not None:
-            command += ["--marker-mm", f"{marker_mm:g}", "--dictionary", dictionary]
-        command += ["-o", str(output)]
-        with _progress("detecting the board") as progress:
-            calibrated = calibrate_stereo(
-                left_paths,
-                right_paths,
-                board=described,
-                device=device or ("stereo" if scene is None else scene.camera.device),
-                working_distance_m=_working_distance_m(distance_mm, scene),
-                progress=progress,
-            )
-    except CalibrationError as error:
-        raise CommandError(str(error)) from error
+            views = capture.read_device_views(device_source, scene)
+            command += ["--device-source", device_source, "--scene", str(camera_scene)]
+        folder = pictures or Path(f"runs/calibration-{datetime.now():%Y%m%d-%H%M%S}")
+        capture.write_pairs(views, pose_capture, folder)
+        left_paths = sorted(folder.glob("left*.png"))
+        right_paths = sorted(folder.glob("right*.png"))
+    command += ["--board", board, "--square-mm", f"{square_mm:g}"]
+    if marker_mm is not None:
+        command += ["--marker-mm", f"{marker_mm:g}", "--dictionary", dictionary]
+    command += ["-o", str(output)]
+    with _progress("detecting the board") as progress:
+        calibrated = calibrate_stereo(
+            left_paths,
+            right_paths,
+            board=described,
+            device=device or ("stereo" if scene is None else scene.camera.device),
+            working_distance_m=_working_distance_m(distance_mm, scene),
+            progress=progress,
+        )
     save_calibration(calibrated.calibration, output, comment=shlex.join(command))
     page: Path | None = None
     if report is not None:
@@ -262,21 +258,16 @@ def check(
 ) -> None:
     """Check a calibration: measure a board of known size in images not used to calibrate."""
     from flexsheet.launch.calibration.check import check_stereo
-    from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.messages.calibration import load_calibration
-    from flexsheet.messages.calibration_file import CalibrationFileError
 
-    try:
-        with _progress("measuring the board") as progress:
-            result = check_stereo(
-                load_calibration(calibration),
-                _find_images("--left", left),
-                _find_images("--right", right),
-                board=_parse_board(board, square_mm, marker_mm, dictionary),
-                progress=progress,
-            )
-    except (CalibrationError, CalibrationFileError) as error:
-        raise CommandError(str(error)) from error
+    with _progress("measuring the board") as progress:
+        result = check_stereo(
+            load_calibration(calibration),
+            _find_images("--left", left),
+            _find_images("--right", right),
+            board=_parse_board(board, square_mm, marker_mm, dictionary),
+            progress=progress,
+        )
     reused = result["used_to_calibrate"]
     if isinstance(reused, list) and reused:
         words.print(
@@ -315,19 +306,15 @@ def cross_check(
     Prints the errors next to those of a calibration by OpenCV's functions alone.
     """
     from flexsheet.launch.calibration import check
-    from flexsheet.launch.calibration.corners import CalibrationError
 
-    try:
-        with _progress("cross-validating") as progress:
-            result = check.cross_check(
-                _find_images("--left", left),
-                _find_images("--right", right),
-                board=_parse_board(board, square_mm, marker_mm, dictionary),
-                leave_out=leave_out,
-                progress=progress,
-            )
-    except CalibrationError as error:
-        raise CommandError(str(error)) from error
+    with _progress("cross-validating") as progress:
+        result = check.cross_check(
+            _find_images("--left", left),
+            _find_images("--right", right),
+            board=_parse_board(board, square_mm, marker_mm, dictionary),
+            leave_out=leave_out,
+            progress=progress,
+        )
     if as_json:
         print_json(result)
         return
@@ -366,15 +353,11 @@ def print_board(
 
     It is a chessboard; with --marker-mm, it is a ChArUco board.
     """
-    from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.launch.calibration.printing import make_caption, write_board
 
     check_folder("-o", output)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
-    try:
-        write_board(described, output)
-    except CalibrationError as error:
-        raise CommandError(str(error)) from error
+    write_board(described, output)
     if as_json:
         print_json({"file": str(output), "board": described.model_dump(mode="json")})
     else:
@@ -455,15 +438,13 @@ def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
 def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
     """Load a stereo calibration and check that it fits the scene's camera; None without a path."""
     from flexsheet.messages.calibration import load_calibration, refuse_other_camera
-    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+    from flexsheet.messages.calibration_file import CalibrationMismatchError
 
     if path is None:
         return None
     try:
         calibration = load_calibration(path)
         refuse_other_camera(calibration, scene.camera)
-    except CalibrationFileError as error:
-        raise CommandError(str(error)) from error
     except CalibrationMismatchError as error:
         raise CommandError(f"{path}: {error}") from error
     return calibration

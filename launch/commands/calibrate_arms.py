@@ -187,14 +187,10 @@ def write_scene(
     """Write a copy of a scene file with the base poses of an arm calibration."""
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.arms_calibration import load_arms_calibration
-    from flexsheet.messages.calibration_file import CalibrationFileError
 
     _check_new_file(output, "-o")
     load_scene(scene_file)
-    try:
-        _write_copy(scene_file, load_arms_calibration(calibration), output)
-    except CalibrationFileError as error:
-        raise CommandError(str(error)) from error
+    _write_copy(scene_file, load_arms_calibration(calibration), output)
     if as_json:
         print_json({"scene": str(output)})
     else:
@@ -333,26 +329,21 @@ def simulate_folder(
 ) -> Path:
     """Write the simulated poses of one arm to a new folder, and return its path."""
     from flexsheet.launch.calibration.arm_poses import simulate_poses
-    from flexsheet.nodes.twin.board import BoardError
 
     poses = folder / side
     poses.mkdir()
-    try:
-        with _progress(f"simulating the {side} arm") as progress:
-            for done in simulate_poses(
-                scene, board, side, poses, places=places, seed=seed, apparatus=apparatus
-            ):
-                progress(done, places, f"simulating the {side} arm")
-    except BoardError as error:
-        raise CommandError(str(error)) from error
+    with _progress(f"simulating the {side} arm") as progress:
+        for done in simulate_poses(
+            scene, board, side, poses, places=places, seed=seed, apparatus=apparatus
+        ):
+            progress(done, places, f"simulating the {side} arm")
     return poses
 
 
 def fit_folder(
     folder: Path, board: Board, scene: Scene, optics: StereoCalibration | None, side: Side
 ) -> tuple[BaseFit, list[tuple[str, str]]]:
-    from flexsheet.launch.calibration.arm_poses import ArmPosesError, make_lens_rig, read_detections
-    from flexsheet.launch.calibration.corners import CalibrationError
+    from flexsheet.launch.calibration.arm_poses import make_lens_rig, read_detections
     from flexsheet.launch.calibration.hand_eye import HandEyeError, calibrate_base
 
     rig = make_lens_rig(scene, optics)
@@ -363,8 +354,6 @@ def fit_folder(
             detections, blind = read_detections(folder, board, rig, size, progress)
         with words.status(f"{side} arm: fitting"):
             return calibrate_base(detections, rig), blind
-    except (ArmPosesError, CalibrationError) as error:
-        raise CommandError(str(error)) from error
     except HandEyeError as error:
         raise CommandError(f"{side} arm, {folder}: {error}") from error
 

@@ -118,7 +118,6 @@ def projector(
     """
     from flexsheet.launch.calibration import gray_code
     from flexsheet.launch.calibration.projector import (
-        ProjectorError,
         calibrate_projector,
         measure_points,
     )
@@ -141,29 +140,26 @@ def projector(
     if output is not None:
         check_folder("-o", output)
     true: Projector | None = None
-    try:
-        if corners is not None:
-            fit = _fit_corners(scene, corners, rectangle_mm)
-        else:
-            if twin:
-                from flexsheet.nodes.twin.projector import make_true_projector
-                from flexsheet.nodes.twin.truth import apply_apparatus
+    if corners is not None:
+        fit = _fit_corners(scene, corners, rectangle_mm)
+    else:
+        if twin:
+            from flexsheet.nodes.twin.projector import make_true_projector
+            from flexsheet.nodes.twin.truth import apply_apparatus
 
-                devices = load_true_devices(apparatus, scene)
-                if devices is None:
-                    true = make_true_projector(require_projector(scene), seed=seed)
-                else:
-                    true = require_projector(apply_apparatus(scene, devices))
-                views = list(simulate_views(scene, true, devices, poses, seed))
+            devices = load_true_devices(apparatus, scene)
+            if devices is None:
+                true = make_true_projector(require_projector(scene), seed=seed)
             else:
-                assert pictures is not None
-                views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
-            camera = load_camera(scene, calibration)
-            fit = calibrate_projector(
-                measure_points(views, camera, require_projector(scene)), require_projector(scene)
-            )
-    except ProjectorError as error:
-        raise CommandError(str(error)) from error
+                true = require_projector(apply_apparatus(scene, devices))
+            views = list(simulate_views(scene, true, devices, poses, seed))
+        else:
+            assert pictures is not None
+            views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
+        camera = load_camera(scene, calibration)
+        fit = calibrate_projector(
+            measure_points(views, camera, require_projector(scene)), require_projector(scene)
+        )
     if output is not None:
         write_scene(scene_file, fit.projector, output)
     _print_result(scene, fit, true, output, as_json=as_json)
@@ -183,7 +179,7 @@ def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
 
 
 def read_views(folder: Path, count: int) -> Iterator[Views]:
-    from flexsheet.launch.calibration.corners import CalibrationError, read_gray
+    from flexsheet.launch.calibration.corners import read_gray
 
     poses = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not poses:
@@ -199,10 +195,7 @@ def read_views(folder: Path, count: int) -> Iterator[Views]:
                     f"--pictures {pose}: expected {count} files {side}*.png, one per pattern, "
                     f"found {len(paths)}"
                 )
-            try:
-                sides.append([read_gray(path) for path in paths])
-            except CalibrationError as error:
-                raise CommandError(str(error)) from error
+            sides.append([read_gray(path) for path in paths])
         yield sides[0], sides[1]
 
 

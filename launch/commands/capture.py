@@ -80,17 +80,14 @@ def simulate_views(
 
     Raises CommandError for a board that cannot be rendered.
     """
-    from flexsheet.nodes.twin.board import BoardError, TwinBoard
+    from flexsheet.nodes.twin.board import TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera
     from flexsheet.nodes.twin.truth import apply_apparatus
 
-    try:
-        camera = make_true_camera(apply_apparatus(scene, apparatus).camera)
-        shown = TwinBoard(camera, board, seed=seed)
-        for left_from_board in shown.poses(POSES_PER_PAIR * pairs):
-            yield shown.pair(left_from_board)
-    except BoardError as error:
-        raise CommandError(str(error)) from error
+    camera = make_true_camera(apply_apparatus(scene, apparatus).camera)
+    shown = TwinBoard(camera, board, seed=seed)
+    for left_from_board in shown.poses(POSES_PER_PAIR * pairs):
+        yield shown.pair(left_from_board)
 
 
 def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:

@@ -148,10 +148,7 @@ def chart(
     if len(chosen) > 1:
         raise CommandError("--scene: only `chart system` accepts several scenes")
     scene = load_scene(chosen[0] if chosen else find_file(CYLINDER, SCENES))
-    try:
-        families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]
-    except charts.UnknownFamilyError as error:
-        raise CommandError(str(error)) from None
+    families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]
     if busy := describe_load():
         words.print(busy, style="yellow")
     results = []

@@ -385,12 +385,9 @@ def _format_value(value: Any) -> str:
 
 
 def _find_topic(name: str) -> Topic:
-    from flexsheet.messages.topics import UnknownTopicError, find_topic
+    from flexsheet.messages.topics import find_topic
 
-    try:
-        return find_topic(name)
-    except UnknownTopicError as error:
-        raise CommandError(str(error)) from error
+    return find_topic(name)
 
 
 def _describe(topic: Topic) -> dict[str, Any]:

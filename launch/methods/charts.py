@@ -51,6 +51,7 @@ class UnknownFamilyError(FlexsheetError, KeyError):
     """Raised if the user names a method family that does not exist."""
 
     code = "unknown-family"
+    exit_code = 2
     remedy = "Use one of the names that the error lists (`flexsheet chart --help`)."
 
 

@@ -48,6 +48,7 @@ class BoardError(FlexsheetError, ValueError):
     """Raised for a board that cannot be rendered; the text states the cause."""
 
     code = "board"
+    exit_code = 2
     remedy = "Choose a board that fits into the images: fewer or smaller squares."
 
 
