@@ -23,12 +23,12 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene, UnfitGeometryError
 from flexsheet.messages.types import FingerPath, Fingertip, TwinFinger
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.twin import gestures as twin_gestures
 from flexsheet.nodes.twin.finger import FingerPathError
 from flexsheet.nodes.twin.paths import recorded_path
 
-Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 PREDICTION_HORIZONS_S = (0.0, 0.02, 0.05)

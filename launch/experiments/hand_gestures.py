@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from flexsheet.launch.experiments.driver import Driver
@@ -35,6 +34,7 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, Phase, SheetTarget, TwinFinger
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import Hand
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import make_shape
@@ -44,8 +44,6 @@ from flexsheet.nodes.twin.gestures import HOVER_M, SAMPLE_S, minimum_jerk
 from flexsheet.nodes.twin.hand import CoupledFinger, HandImpedance, TrueSheet, VoluntaryPath
 from flexsheet.nodes.twin.paths import inside, limit_path_speed, map_to_surface, touchable
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
-
-Floats = NDArray[np.float64]
 
 DEPTH_FRACTION = 0.3
 """Voluntary depth of the gestures, as a fraction of the scene's push depth."""

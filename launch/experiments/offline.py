@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.stroke import project_presented_point
@@ -29,6 +28,7 @@ from flexsheet.messages.marker_calibration import MarkerCalibration, load_marker
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.nodes import node_class
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
@@ -52,8 +52,6 @@ from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.nodes.twin.true_object import TrueBody
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
 
 METRES_PER_PX = 0.0007
 """Resolution of the images in Furukawa et al. 2007."""

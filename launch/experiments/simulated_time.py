@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
 from flexsheet.launch.experiments.stroke import (
@@ -35,6 +34,7 @@ from flexsheet.messages.types import FingerPath, Phase, Side, SoftBody
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import FOLLOW_BOUNDS, extrapolate_goal
 from flexsheet.nodes.arm_bridge.limiter import limit_velocity
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import OffsetBoundsTable
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.motion import SheetMotion, follow_sheet
@@ -57,8 +57,6 @@ from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, VoluntaryPath
 from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
 
 CYCLE_S = 0.0071
 """Period of the commands to the arms."""

@@ -28,6 +28,7 @@ from flexsheet.launch.experiments.hand_simulation import Cases, simulate_release
 from flexsheet.launch.experiments.run import Progress
 from flexsheet.launch.health.compliance import compute_compliance
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import (
     Hand,
     SampledLoop,
@@ -39,8 +40,6 @@ from flexsheet.nodes.planner.compliance import (
     ObjectCurve,
 )
 from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
-
-Floats = NDArray[np.float64]
 
 HAND_RANGES = {
     "finger": ((0.004, 0.01), (50.0, 800.0), (0.3, 1.2)),

@@ -30,12 +30,12 @@ from flexsheet.messages.methods import Correction, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, SheetTarget
 from flexsheet.nodes import NodeRole, node_class
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
 from flexsheet.nodes.twin.sheet_surface import SheetSurface
 
-Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 STROKE = "system stroke"

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration
 from flexsheet.nodes import cache, node_class
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.soft_body_factory import (
@@ -39,8 +39,6 @@ from flexsheet.nodes.planner.compliance import (
 from flexsheet.nodes.planner.hand_bounds import bounds_cache, load_or_compute_bounds
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
-
-Floats = NDArray[np.float64]
 
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010

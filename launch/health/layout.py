@@ -31,6 +31,7 @@ from flexsheet.nodes.arm_bridge.reach import (
     find_best_reach,
     plan_path,
 )
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, make_shape
@@ -42,7 +43,6 @@ from flexsheet.nodes.planner.rolling import (
     roll_contact,
 )
 
-Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 TILTS, SIDE_TILTS, DEPTHS = 17, 5, 6

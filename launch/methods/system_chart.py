@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.offline import metric_tolerances
@@ -40,10 +39,10 @@ from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.methods import Interval
 from flexsheet.nodes.twin.tolerance_table import Profile
 
-Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 FIRST_SEED = 100

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
@@ -30,7 +29,6 @@ from flexsheet.nodes.console.picking import SurfacePicker
 from flexsheet.nodes.console.replay import Timeline, list_bags
 from flexsheet.nodes.console.state_file import ConsoleState, load_state, save_state
 
-Floats = NDArray[np.float64]
 Publish = Callable[[Message], None]
 
 SETTLE_S = 0.4

@@ -10,6 +10,7 @@ import viser
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import ArmSpec, Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.arms import (
     CLAMP_SIZE_M,
     PIECES,
@@ -32,7 +33,6 @@ from flexsheet.nodes.models.rigid import (
     transform,
 )
 
-Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
 
 ARM: Color = (222, 226, 232)

@@ -7,17 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Geometry, Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rotation_from_rpy
 from flexsheet.nodes.models.shapes import GEOMETRIES
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
-
-Floats = NDArray[np.float64]
-
 
 MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 """Minimum and step of the slider for the sheet's tension (stretch ratio)."""

@@ -23,11 +23,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, PchipInterpolator
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Scene, SheetSpec
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import OffsetBounds
 from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.sheet import (
@@ -44,8 +44,6 @@ from flexsheet.nodes.models.sheet.force_models import (
     depth_for_force,
     interpolate_inverse,
 )
-
-Floats = NDArray[np.float64]
 
 USABLE_FRACTION = 0.85
 """Fraction of the maximum edge force and strain that the planner uses.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.methods import ComplianceMode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import SoftBody
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import OffsetBoundsTable
 from flexsheet.nodes.models.sheet.force_models import SheetForceModel, SheetPosition, SheetPush
 from flexsheet.nodes.planner.compliance import (
@@ -20,8 +20,6 @@ from flexsheet.nodes.planner.compliance import (
     make_stretch_limits,
 )
 from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
-
-Floats = NDArray[np.float64]
 
 EQUAL_RATIO = 0.02
 """Relative difference below which two force curves count as equal; users notice seven times it."""
@@ -63,7 +61,7 @@ class ComplianceController:
         self._scene, self._model, self._mode = scene, model, mode
         ratio = scene.sheet.hysteresis_ratio if hysteresis_ratio is None else hysteresis_ratio
         self._hysteresis = HysteresisCorrection(ratio) if ratio else None
-        self._bounds, self._delay_s, self._bounded_delay_s = bounds, delay_s, delay_s
+        self._bounds, self.delay_s, self._bounded_delay_s = bounds, delay_s, delay_s
         self._limits = self._make_limits()
         self.filter_s: float | None = None if bounds is None else float(bounds.filters_s[-1])
         self._curve: ObjectCurve | None = None
@@ -94,14 +92,9 @@ class ComplianceController:
         self._fit(ObjectCurve.from_rows(rows), in_contact=in_contact)
         self._fitted_n = forces_n
 
-    @property
-    def delay_s(self) -> float:
-        """Return the delay from a measured depth until the sheet has moved accordingly, s."""
-        return self._delay_s
-
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
         """Update the measured delay.  Outside contact, fit again if this changes the bounds."""
-        self._delay_s = delay_s
+        self.delay_s = delay_s
         if self._bounds is None or in_contact:
             return
         if self._bounded_delay_s - DELAY_HYSTERESIS_S <= delay_s <= self._bounded_delay_s:
@@ -136,7 +129,7 @@ class ComplianceController:
             if not suffices:
                 hand_note = (
                     f"a hand of low damping can oscillate with this object: the sheet follows "
-                    f"after {1e3 * self._delay_s:.0f} ms; reduce the delay or use a stiffer object"
+                    f"after {1e3 * self.delay_s:.0f} ms; reduce the delay or use a stiffer object"
                 )
         self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted), hand_note)))
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from math import hypot
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import Phase, SheetReason
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import inverse
 from flexsheet.nodes.models.shapes import Nearest, Shape, projection_jacobian, tightest_curvature
 from flexsheet.nodes.planner.rolling import (
@@ -27,8 +27,6 @@ from flexsheet.nodes.planner.rolling import (
     roll_contact,
     transport_axes,
 )
-
-Floats = NDArray[np.float64]
 
 SHALLOW_RATIO, DEEP_RATIO = 0.15, 0.5
 """Ratios of the finger's depth to the radius of curvature.  Up to the first, the contact is the

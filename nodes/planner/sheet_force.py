@@ -7,10 +7,10 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.messages.sheet_calibration import SheetCalibration, refuse_other_sheet
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.methods import Family, Trial, clip_range
 from flexsheet.nodes.models.sheet.force_models import (
     MembraneSheetModel,
@@ -24,8 +24,6 @@ from flexsheet.nodes.models.sheet.force_models import (
 from flexsheet.nodes.models.sheet.membrane import push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
-
-Floats = NDArray[np.float64]
 
 ReferenceForce = Callable[[SheetSpec, float, float, SheetPosition, float], float]
 """Reference force (N) at a stretch ratio, a depth, a position and a fingertip radius (m)."""

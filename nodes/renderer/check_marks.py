@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Projector
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import camera
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
-
-Floats = NDArray[np.float64]
 
 SIDE_M = 0.0053
 """Side of a mark, whose area is that of a marker of 3 mm radius, so that the triangulator detects

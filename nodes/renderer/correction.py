@@ -20,14 +20,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Lens
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.camera import camera_matrix
 from flexsheet.nodes.models.rigid import inverse
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 GRAZING_SINE = 0.05
 """Sine of the minimum angle (2.9 degrees) between a ray and the sheet. At this angle a pixel is

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.models.shapes.triangles import triangulate_grid
 from flexsheet.nodes.renderer.correction import (
     GRAZING_SINE,
@@ -23,9 +24,6 @@ from flexsheet.nodes.renderer.correction import (
     sector_normals,
 )
 from flexsheet.nodes.renderer.lens import ClipLens
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 FAR_M = 5.0
 SAMPLES = 4

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from flexsheet.messages.methods import SheetShapeMethod
 from flexsheet.messages.scene import Mesh, Scene, require_projector
 from flexsheet.messages.types import Display, SheetTarget, Skin, SoftBody
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import corners
@@ -38,7 +39,6 @@ from flexsheet.nodes.renderer.gl import (
     Canvas,
     DrawStyle,
     EyeView,
-    Image,
     ImagePart,
     SurfaceMaterial,
     is_software,
@@ -56,8 +56,6 @@ from flexsheet.nodes.renderer.sheet_mesh import (
     pyramid_mesh,
     refine_mesh,
 )
-
-Floats = NDArray[np.float64]
 
 OVERSAMPLING, UNSAMPLED_OVERSAMPLING = 1.5, 2.5
 """Ratio of the resolution of the eye's image (first pass of two_pass) to that of the projector,

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.methods import Case, Family, Interval, Trial, estimate_rms
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter, Marker, detect_blobs
@@ -20,9 +20,6 @@ from flexsheet.nodes.triangulator.triangulation import (
     dlt,
     measure,
 )
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 CASE_POINTS = 2000
 NOISES_PX = (0.01, 0.025, 0.1, 2.0)

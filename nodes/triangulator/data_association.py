@@ -16,15 +16,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from flexsheet.messages.types import FingertipReason
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.fingertip import Candidate, StereoDetection
 from flexsheet.nodes.triangulator.tracking import Tracker
 from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 
-Floats = NDArray[np.float64]
 TrackStatus = Literal["tentative", "ambiguous", "clutter"]
 """Status of a track other than the finger's.
 

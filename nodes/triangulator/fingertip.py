@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.types import FingertipReason
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.triangulator.flat_marker import DiscView, FlatPose, estimate_flat_pose
 from flexsheet.nodes.triangulator.marker import (
     FLAT_METHODS,
@@ -39,8 +39,6 @@ from flexsheet.nodes.triangulator.triangulation import (
     undistort_pixel,
 )
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Origin = tuple[int, int]
 
 SIZE_SIGMA = 0.2

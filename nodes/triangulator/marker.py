@@ -14,12 +14,10 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs, fit_ellipses
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Window = tuple[slice, slice]
 """Rows and columns of a part of an image."""
 

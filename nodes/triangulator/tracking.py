@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.types import FingertipState
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
 
-Floats = NDArray[np.float64]
 GateResult = Literal["ok", "too_fast", "unconfirmed"]
 """Result for a measured point.
 

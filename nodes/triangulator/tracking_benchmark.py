@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.methods import Case, Family, Trial
 from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
 
-Floats = NDArray[np.float64]
 TruePath = Callable[[float], Floats]
 """Function that returns the true fingertip (3,) m in the world at a given time, s."""
 

@@ -13,15 +13,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.calibration import StereoCalibration, refuse_other_camera
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.messages.types import StereoPair
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import camera, rigid
 
-Floats = NDArray[np.float64]
 Triangulate = Callable[[Floats, Floats, Floats], Floats]
 
 NEWTON_STEPS = 12

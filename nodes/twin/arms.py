@@ -21,13 +21,13 @@ from itertools import accumulate
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pymodbus.constants import ExcCodes
 from pymodbus.exceptions import NoSuchIdException
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
+
 Fault = Literal[
     "none",
     "silent",

@@ -17,6 +17,7 @@ from flexsheet.messages.apparatus import ArmTruth, nominal_apparatus
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
@@ -26,7 +27,6 @@ from flexsheet.nodes.twin.arms import (
     ArmServer,
     Controller,
     Fault,
-    Floats,
     check_loopback,
     forward,
     solve_inverse_kinematics,

@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, StereoCamera
+from flexsheet.nodes.arrays import Floats, Image, Singles
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
 from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Image = NDArray[np.uint8]
 
 RAYS = 3
 """Number of rays per pixel in each direction."""

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
+
 Point = tuple[float, float, float]
 Views = Literal["both", "left", "right"]
 

@@ -28,8 +28,9 @@ from flexsheet.messages.types import (
     Viewpoint,
 )
 from flexsheet.nodes import OmissionReason
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.node import Input, Node, Output
-from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation, Floats
+from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation
 from flexsheet.nodes.twin.head import HeadSway
 from flexsheet.nodes.twin.render_queue import RenderQueue
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus

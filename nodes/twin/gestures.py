@@ -34,14 +34,14 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.finger import minimum_jerk_profile
 from flexsheet.nodes.twin.paths import map_to_surface, place_path, touchable
 
-Floats = NDArray[np.float64]
 Sampled = tuple[Floats, Floats]
 """Times (n,) in s, from zero, and surface positions (n, 3) or distances (n,) in m at these times.
 """

@@ -10,19 +10,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.messages.types import Frame, TwinArms
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, transform, transform_from_rpy
 from flexsheet.nodes.twin.eye import TrueProjector
 from flexsheet.nodes.twin.membrane import DeformedSheet, NotConvergedError, solve
 from flexsheet.nodes.twin.projector import on_plane
 from flexsheet.nodes.twin.rig import slopes_of
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
-
-Floats = NDArray[np.float64]
 
 CELLS = 8
 """Number of cells per side of the sheet's mesh, which is solved in 0.15 s."""

@@ -17,6 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
     JITTER_STREAM,
@@ -24,7 +25,6 @@ from flexsheet.nodes.twin.arms import (
     RANGE_RAD,
     SPEED_RAD_PER_S,
     Fault,
-    Floats,
     Servo,
 )
 

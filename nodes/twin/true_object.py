@@ -14,11 +14,11 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from flexsheet.messages.scene import Cylinder, Ellipsoid, Geometry, Mesh, Plane, Scene, Sphere
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, pose_matrix
 from flexsheet.nodes.models.shapes import GEOMETRIES, Shape, make_shape
 from flexsheet.nodes.models.shapes.triangles import find_degenerate, nearest_in_triangles
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 AROUND, ALONG = 160, 40

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flexsheet.messages.apparatus import (
@@ -20,6 +19,7 @@ from flexsheet.messages.apparatus import (
     devices_of,
 )
 from flexsheet.messages.scene import ArmSpec, Lens, Pose, Scene, StereoCamera
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
@@ -31,8 +31,6 @@ from flexsheet.nodes.models.rigid import (
     vector_from_rotation,
 )
 from flexsheet.nodes.node import NodeParameters
-
-Floats = NDArray[np.float64]
 
 
 class SimulatorParameters(NodeParameters):

@@ -14,13 +14,12 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.sheet.membrane import CELLS, push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tension import edge_force_n, strain_measure
 
-Floats = NDArray[np.float64]
 SheetPosition = tuple[float, float]
 
 CENTRE: SheetPosition = (0.0, 0.0)

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.sheet.force_models import (
     ScaledSheetModel,
     SheetForce,
@@ -20,7 +20,6 @@ from flexsheet.nodes.models.sheet.force_models import (
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
-Floats = NDArray[np.float64]
 Measure = Callable[[float, Floats, SheetPosition], Floats]
 """Function that returns forces (n,), N, at a stretch ratio, depths (n,), m, and a position."""
 
