@@ -391,9 +391,10 @@ def gestures(
 ) -> None:
     """Measure the accuracy of fingertip tracking in strokes, taps, reaches, stops and turns."""
     from flexsheet.launch.experiments import gestures as experiment
+    from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments.run import run_experiment
 
-    selected = experiment.select_gestures(split_names(names))
+    selected = select_names(split_names(names), experiment.GESTURES, "gesture")
     bag = make_result_folder(output, "gestures") / "gestures.mcap"
     with progress_words() as progress:
         procedure = experiment.make_gestures_procedure(selected, progress)

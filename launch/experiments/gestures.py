@@ -59,15 +59,6 @@ def gesture_path(name: str, scene: Scene) -> FingerPath:
         raise ExperimentError(f'scene "{scene.name}": {error}') from None
 
 
-def select_gestures(names: Sequence[str]) -> list[str]:
-    """Check the names of gestures and remove duplicates; without names, return all names."""
-    selected = list(dict.fromkeys(names)) or list(GESTURES)
-    for name in selected:
-        if name not in GESTURES:
-            raise ExperimentError(f'unknown gesture "{name}"; {did_you_mean(name, list(GESTURES))}')
-    return selected
-
-
 def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = ()) -> FingerPath:
     """Make a finger path in the scene of a launch file, from a gesture's name or a recorded path.
 

@@ -29,7 +29,7 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.methods import Correction, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, SheetTarget
-from flexsheet.nodes import NodeRole, node_class
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import Nearest, make_shape
@@ -148,12 +148,6 @@ def list_image_paths(scene: Scene) -> list[FingerPath]:
     ]
 
 
-def has_node(plan: ResolvedGraph, node_type: str) -> bool:
-    """Return whether the graph contains a node of that type or of a type derived from it."""
-    base = node_class(node_type)
-    return any(issubclass(node_class(node.type), base) for node in plan.nodes.values())
-
-
 def find_correction(plan: ResolvedGraph, scene: Scene) -> Correction:
     """Return the image correction that the graph's renderer uses."""
     for node in plan.nodes.values():
@@ -177,8 +171,8 @@ def run_system(
     seconds: duration of the stroke. apparatus: file with true parameters of the simulated hardware.
     """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
-    has_images = has_node(plan, "renderer") and has_node(plan, "twin_eye")
-    has_forces = has_node(plan, "fem_solver")
+    has_images = bool(plan.nodes_of_type("renderer") and plan.nodes_of_type("twin_eye"))
+    has_forces = bool(plan.nodes_of_type("fem_solver"))
     correction = find_correction(plan, require_scene(plan))
     used = CpuUse()
 

@@ -15,7 +15,7 @@ import numpy as np
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration
-from flexsheet.nodes import cache, node_class
+from flexsheet.nodes import cache
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
@@ -157,10 +157,7 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     the planner reports the risk when they have been computed.
     """
     scene = plan.scene_message()
-    planners, solvers = (
-        [node for node in plan.nodes.values() if issubclass(node_class(node.type), kind)]
-        for kind in (node_class("planner"), node_class("fem_solver"))
-    )
+    planners, solvers = plan.nodes_of_type("planner"), plan.nodes_of_type("fem_solver")
     if scene is None or not planners or not solvers:
         return None
     given = PlannerParameters.model_validate(planners[0].parameters)

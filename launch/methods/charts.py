@@ -11,7 +11,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from textwrap import wrap
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.results import machine_name, replace_non_finite
 from flexsheet.launch.methods.svg import COLOURS, INK, page_style, save_svg
+from flexsheet.launch.plans.documents import did_you_mean
 from flexsheet.launch.running.code_state import read_git_state
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
@@ -58,11 +58,8 @@ class UnknownFamilyError(FlexsheetError, KeyError):
 def find_family(name: str) -> Family:
     """Return the method family with a name. Raises UnknownFamilyError."""
     if name not in FAMILIES:
-        near = get_close_matches(name, FAMILIES, n=1)
-        hint = (
-            f'; did you mean "{near[0]}"?' if near else f"; known families: {', '.join(FAMILIES)}"
-        )
-        raise UnknownFamilyError(f'unknown family "{name}"{hint}')
+        hint = did_you_mean(name, list(FAMILIES))
+        raise UnknownFamilyError(f'unknown family "{name}"; {hint}')
     return load_family(FAMILIES[name])
 
 

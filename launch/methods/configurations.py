@@ -19,7 +19,6 @@ from flexsheet.launch.running.precompute import (
 )
 from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes import node_class
 from flexsheet.nodes.fem_solver.benchmarks import LINEAR_DEPTH_M
 from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetPush
 from flexsheet.nodes.planner.sheet_force import make_rubber
@@ -94,8 +93,7 @@ class Configuration:
         return [
             f"{node.name}.{text}"
             for node_type, text in chosen
-            for node in graph.nodes.values()
-            if issubclass(node_class(node.type), node_class(node_type))
+            for node in graph.nodes_of_type(node_type)
         ]
 
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
