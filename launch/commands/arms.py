@@ -120,11 +120,11 @@ async def _confirm_stop(
     confirmed = shown or any(one.worked for one in attempts)
     _show_stop(arms.states, attempts, confirmed, as_json)
     for text in arms.problems:
-        words.print(text, markup=False)
+        words.print(text)
     if not shown:
         silent = [side for side, state in arms.states.items() if state.mode != "estop"]
         silent += [side for side in SIDES if side not in arms.states]
-        words.print(f"[red]not confirmed by the arms[/]: {', '.join(silent)}")
+        words.print(f"[red]not confirmed by the arms[/]: {', '.join(silent)}", markup=True)
     if any(one.outcome is StopOutcome.REFUSED for one in attempts):
         words.print(
             "the stop was not published on the topic estop, because another tool is writing it"
@@ -270,9 +270,11 @@ async def _command(
         confirmed = await arms.wait_for(done)
     _show(arms.states, as_json)
     for text in arms.problems:
-        words.print(text, markup=False)
+        words.print(text)
     if not confirmed:
-        words.print("[red]not confirmed[/]: see the reasons above and the bridges' logs")
+        words.print(
+            "[red]not confirmed[/]: see the reasons above and the bridges' logs", markup=True
+        )
     return 0 if confirmed else FAILED
 
 

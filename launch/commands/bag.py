@@ -126,7 +126,7 @@ def record(
     if as_json:
         print_json({"bag": str(target), "bags": [str(one) for one in bags]})
     else:
-        words.print(f"recorded {', '.join(map(str, bags))}", markup=False)
+        words.print(f"recorded {', '.join(map(str, bags))}")
 
 
 @app.command(
@@ -259,9 +259,7 @@ def export(
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED
         also = f" and {more} more" if more > 0 else ""
-        words.print(
-            f"not exported: {listed}{also} (recorded with incompatible message types)", markup=False
-        )
+        words.print(f"not exported: {listed}{also} (recorded with incompatible message types)")
     if as_json:
         print_json({**asdict(result), "output": str(output)})
         return
@@ -308,7 +306,7 @@ def verify(
         print_json({**asdict(result), "ok": result.ok})
     else:
         _print_verification(result)
-        words.print(_describe_result(result), markup=False)
+        words.print(_describe_result(result))
     if not result.repeatable:
         raise typer.Exit(FAILED)
     if not result.as_live:
@@ -344,7 +342,7 @@ def report(
         print_json(result)
         return
     for finding in result["findings"]:
-        words.print(f"{finding['gravity']}: {finding['text']}", markup=False)
+        words.print(f"{finding['gravity']}: {finding['text']}")
     print(page)
 
 
@@ -506,7 +504,7 @@ async def _record(
         keys_file=ring_file(run, tools_host(run)) if plan.keys else None,
         run_dir=str(run.directory),
     )
-    words.print(f"recording {len(names)} topics; press Ctrl-C to stop", markup=False)
+    words.print(f"recording {len(names)} topics; press Ctrl-C to stop")
     stop = asyncio.Event()
     work = asyncio.create_task(run_node(config, stop))
     countdown = asyncio.create_task(_show_remaining(bag.name, seconds))
@@ -565,7 +563,7 @@ async def _play_into(request: PlayRequest, plan: ResolvedGraph, run: Run) -> int
 
     selection = select_topics(BagReader(request.bag).topics, plan, request.topics)
     for name, why in selection.left_out.items():
-        words.print(f"not played: {name}: {why}", markup=False)
+        words.print(f"not played: {name}: {why}")
     if not selection.topics:
         raise CommandError(
             f"{request.bag}: contains no topic that can be played into {plan.launch_file}; "
@@ -589,5 +587,5 @@ async def _play_into(request: PlayRequest, plan: ResolvedGraph, run: Run) -> int
     if request.as_json:
         print_json({"bag": str(request.bag), "messages": sent, "topics": list(selection.topics)})
     else:
-        words.print(f"played {sent} messages on {', '.join(selection.topics)}", markup=False)
+        words.print(f"played {sent} messages on {', '.join(selection.topics)}")
     return 0

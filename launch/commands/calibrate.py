@@ -236,7 +236,7 @@ def _print_result(
     )
     for pair in calibration.pairs:
         if not pair.used:
-            words.print(f"excluded: {pair.left}: {pair.reason}", markup=False)
+            words.print(f"excluded: {pair.left}: {pair.reason}")
 
 
 @app.command(
@@ -272,8 +272,7 @@ def check(
     if isinstance(reused, list) and reused:
         words.print(
             f"{', '.join(reused)}: these images were used to calibrate, so the errors are "
-            "underestimated; use other images",
-            markup=False,
+            "underestimated; use other images"
         )
     if as_json:
         print_json(result)

@@ -194,7 +194,7 @@ def write_scene(
     if as_json:
         print_json({"scene": str(output)})
     else:
-        words.print(f"scene: {output}", markup=False)
+        words.print(f"scene: {output}")
 
 
 def capture(
@@ -255,7 +255,7 @@ def capture(
     if as_json:
         print_json({"folder": str(output), "poses": recorder.count})
     else:
-        words.print(f"{recorder.count} poses in {output}", markup=False)
+        words.print(f"{recorder.count} poses in {output}")
 
 
 async def record_poses(
@@ -303,7 +303,7 @@ async def record_poses(
                     recorder.update_images, pair.left, pair.right, time_s
                 )
             if hint != printed:
-                words.print(hint, markup=False)
+                words.print(hint)
             printed = hint
     finally:
         for subscriber in subscribers:
@@ -466,7 +466,7 @@ def _print_result(
         lines += [f"  {side}:", f"    world_from_base: {_format_pose(base)}"]
         outliers = [(one.name, one.reason) for one in base.poses if not one.used]
         for name, reason in [*blind[side], *outliers]:
-            words.print(f"{side} arm, excluded {name}: {reason}", markup=False)
+            words.print(f"{side} arm, excluded {name}: {reason}")
         moved_m, turned_rad = _compute_shift(base, scene, side)
         result["arms"][side] = {
             "world_from_base": base.world_from_base.model_dump(mode="json"),

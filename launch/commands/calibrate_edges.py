@@ -185,4 +185,4 @@ def edges_capture(
     if as_json:
         print_json({"rows": str(output), "poses": recorder.count})
     else:
-        words.print(f"{recorder.count} poses in {output}", markup=False)
+        words.print(f"{recorder.count} poses in {output}")

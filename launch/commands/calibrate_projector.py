@@ -173,8 +173,7 @@ def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
         write_file(folder / f"pattern{number:02}.png", encode_png(pattern))
     words.print(
         f"{len(patterns)} patterns written to {folder}; project each without scaling, and capture "
-        "it with both cameras",
-        markup=False,
+        "it with both cameras"
     )
 
 

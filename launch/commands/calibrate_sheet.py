@@ -325,7 +325,4 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
         ]
     )
     for one in calibration.left_out:
-        words.print(
-            f"line {one.line} excluded: its residual is {100 * one.residual_ratio:+.0f} %",
-            markup=False,
-        )
+        words.print(f"line {one.line} excluded: its residual is {100 * one.residual_ratio:+.0f} %")

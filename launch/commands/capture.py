@@ -65,7 +65,7 @@ def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Vie
     try:
         with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
             for warning in reader.warnings:
-                words.print(f"camera: {warning}", markup=False)
+                words.print(f"camera: {warning}")
             while (images := reader.read()) is not None:
                 check_size(images, scene.camera, source)
                 yield images.left, images.right
@@ -116,14 +116,14 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
     missing = capture.missing()
     if missing:
         listed = ", ".join(f"{one.group} {one.name}".strip() for one in missing)
-        words.print(f"not covered: {listed}", markup=False)
+        words.print(f"not covered: {listed}")
     if not accepted:
         raise CommandError(
             "no image pair was accepted, because the board was never at rest and fully visible in "
             "both images; hold it still in view of both cameras",
             FAILED,
         )
-    words.print(f"{accepted} pairs in {folder}", markup=False)
+    words.print(f"{accepted} pairs in {folder}")
     return accepted
 
 
@@ -138,7 +138,7 @@ def _show_coverage(capture: Capture) -> Iterator[Any]:
         def print_accepted(hint: str, accepted: bool) -> None:
             if accepted:
                 missing = len(capture.missing())
-                words.print(f"pair accepted; {missing} coverage bins incomplete", markup=False)
+                words.print(f"pair accepted; {missing} coverage bins incomplete")
 
         yield print_accepted
         return

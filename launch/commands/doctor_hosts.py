@@ -80,7 +80,7 @@ def hosts(
     if as_json:
         print_json({"plan": plan.hash, "here": here, "findings": [asdict(one) for one in findings]})
     else:
-        words.print(f"{plan.launch_file}, plan {plan.hash}, checked from {here}", markup=False)
+        words.print(f"{plan.launch_file}, plan {plan.hash}, checked from {here}")
         print_findings(findings)
     if any(one.state == "failed" for one in findings):
         raise typer.Exit(FAILED)

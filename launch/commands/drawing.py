@@ -73,7 +73,7 @@ def graph(
         if output.suffix not in (".svg", ".mmd"):
             raise CommandError(f"--output {output}: unknown file type; name a .svg or .mmd file")
         write_file(output, mermaid(plan) if output.suffix == ".mmd" else svg(lay_out(plan)))
-        words.print(f"drawn: {output}", markup=False)
+        words.print(f"drawn: {output}")
     if as_json:
         links = [
             {"from": writer, "to": reader, "topics": topics}

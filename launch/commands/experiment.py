@@ -493,7 +493,7 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
     )
     for row in table["rows"]:
         for error in row["failed"]:
-            words.print(f"{row['variant']}: a stroke failed: {error}", markup=False)
+            words.print(f"{row['variant']}: a stroke failed: {error}")
     words.print(f"rows: {table['folder']}")
 
 

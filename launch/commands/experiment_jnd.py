@@ -181,18 +181,15 @@ def _measure(
     from flexsheet.launch.experiments.run import run_experiment
 
     session = _open(plan, folder)
-    words.print(INSTRUCTIONS, markup=False)
+    words.print(INSTRUCTIONS)
 
     async def run(presenter: PairPresenter) -> None:
         await run_session(session, presenter.present, lambda done, total: None)
 
-    def tell(text: str) -> None:
-        words.print(text, markup=False)
-
     # No spinner, since it would overwrite the operator's input; no bag, since recorded motion can
     # identify a person.
     if session.done < plan.trials:
-        run_experiment(launch_file, settings, None, make_jnd_procedure(run), tell)
+        run_experiment(launch_file, settings, None, make_jnd_procedure(run), words.print)
     row = session.result()
     _write_result(row, folder)
     return row

@@ -136,7 +136,7 @@ def robustness(
         rows.append([statistic, *values, "", ""])
     print_table(["seed", *experiment.METRICS, "out of tolerance", "flagged"], rows)
     for one in result["failed"]:
-        words.print(f"seed {one['seed']} failed: {one['error']}", markup=False)
+        words.print(f"seed {one['seed']} failed: {one['error']}")
     words.print(f"rows: {folder}")
 
 
@@ -228,7 +228,7 @@ def sensitivity(
             row["parameter"] for row in result["rows"] if row["evaluation"] == name
         )
         if listed:
-            words.print(f"{name.replace('_', ' ')}: {', '.join(listed)}", markup=False)
+            words.print(f"{name.replace('_', ' ')}: {', '.join(listed)}")
     words.print(f"image: {image}")
 
 

@@ -74,7 +74,7 @@ async def receive_until(
             plan,
             run,
             make_handler(handle),
-            on_problem=lambda text: words.print(text, markup=False),
+            on_problem=words.print,
         )
         for topic, handle in handlers.items()
     ]

@@ -66,10 +66,8 @@ def new(
         write_secret(file, secret, replace=replace)
     except SecurityError as error:
         raise CommandError(str(error), FAILED) from error
-    words.print(f"secret key: {file}; do not copy it to another computer", markup=False)
-    words.print(
-        f"run on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'", markup=False
-    )
+    words.print(f"secret key: {file}; do not copy it to another computer")
+    words.print(f"run on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'")
     if as_json:
         print_json({"host": host, "public": public, "secret_file": str(file)})
     else:
@@ -112,7 +110,7 @@ def show(
         columns = ("host", "public", "secret_file")
         print_table(columns, [tuple(row[name] for name in columns) for row in rows])
     for problem in problems:
-        words.print(problem, markup=False)
+        words.print(problem)
     if problems:
         raise typer.Exit(FAILED)
 
@@ -151,4 +149,4 @@ def install(
     if as_json:
         print_json({"launch_file": str(launch_file), "host": host, "public": key})
     else:
-        words.print(f"{launch_file}: hosts.{host}.key = {key}", markup=False)
+        words.print(f"{launch_file}: hosts.{host}.key = {key}")

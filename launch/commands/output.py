@@ -62,7 +62,7 @@ class Words:
     def in_colour(self) -> bool:
         return self.console.color_system is not None and not self.console.no_color
 
-    def print(self, text: str, *, markup: bool = True, style: str | None = None) -> None:
+    def print(self, text: str, *, markup: bool = False, style: str | None = None) -> None:
         self.console.print(text, markup=markup, style=style)
 
     def status(self, text: str) -> Status:
@@ -167,7 +167,7 @@ def progress_words() -> Iterator[Callable[[str], None]]:
     Without a terminal it prints one line per message.
     """
     if not words.is_terminal:
-        yield lambda text: words.print(text, markup=False)
+        yield words.print
         return
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 

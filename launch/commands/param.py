@@ -135,7 +135,7 @@ def set_parameter(
     if as_json:
         print_json({"parameter": parameter, "value": new})
     else:
-        words.print(f"{parameter} = {json.dumps(new)}", markup=False)
+        words.print(f"{parameter} = {json.dumps(new)}")
 
 
 def _find_node(plan: ResolvedGraph, name: str) -> ResolvedNode:

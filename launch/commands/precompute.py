@@ -85,4 +85,4 @@ def precompute(
         print_json({name: str(file) for name, file in files.items()})
         return
     for name, file in files.items():
-        words.print(f"{name.replace('_', ' ')}: {file}", markup=False)
+        words.print(f"{name.replace('_', ' ')}: {file}")

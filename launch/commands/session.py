@@ -85,18 +85,18 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
             }
         )
     else:
-        words.print(f"{plan.launch_file}, run {found.directory}", markup=False)
+        words.print(f"{plan.launch_file}, run {found.directory}")
         for row in rows:
             row["publishes"] = [f"{one['topic']} {one['rate_hz']:.0f} Hz" for one in row["outputs"]]
             for name in ("inputs", "outputs", "errors"):
                 del row[name]
         print_rows(rows, as_json=False)
         for host, reason in estops.items():
-            words.print(f"e-stop on {host}: {reason}", markup=False, style="red")
+            words.print(f"e-stop on {host}: {reason}", style="red")
         for one in suspicions:
             if one["suspected"]:
-                words.print(f"{one['node']}: {one['text']}", markup=False, style="yellow")
-                words.print(f"  remedy: {one['remedy']}", markup=False)
+                words.print(f"{one['node']}: {one['text']}", style="yellow")
+                words.print(f"  remedy: {one['remedy']}")
     silent = [name for name in plan.nodes if name not in statuses]
     if silent or any(one["suspected"] for one in suspicions):
         raise typer.Exit(FAILED)
@@ -324,7 +324,7 @@ async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | No
             f"start the graph without it: flexsheet launch LAUNCH_FILE --without {name}",
             FAILED,
         )
-    words.print(f"running {name} in {run.directory}; press Ctrl-C to stop", markup=False)
+    words.print(f"running {name} in {run.directory}; press Ctrl-C to stop")
     stop_event = asyncio.Event()
     work = asyncio.create_task(run_config(node_config(plan, plan.nodes[name], run), stop_event))
     try:

@@ -65,8 +65,8 @@ def install(
             words.print(
                 f"{bag}: the service can write only to {STATE_FOLDER}; change the path of the bag "
                 "in the launch file",
-                markup=False, style="yellow",
-            )  # fmt: skip
+                style="yellow",
+            )
     files = list(make_files(launch_file=launch_file, host=host, user=user, root=root))
     if as_json:
         print_json([{"path": str(file.path), "text": file.text} for file in files])
@@ -82,11 +82,10 @@ def install(
             raise CommandError(
                 f"{file.path}: cannot be written: {error.strerror}; run the command as root", FAILED
             ) from error
-        words.print(f"wrote {file.path}", markup=False)
+        words.print(f"wrote {file.path}")
     if not dry_run:
         words.print(
             f"next: sysctl -e -p /etc/sysctl.d/90-flexsheet.conf && systemctl daemon-reload && "
             f"systemctl enable --now flexsheet@{host}; "
-            f"log: journalctl -fu flexsheet@{host}",
-            markup=False,
+            f"log: journalctl -fu flexsheet@{host}"
         )

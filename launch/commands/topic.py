@@ -242,7 +242,7 @@ def pub(
     if as_json:
         print_json({"topic": topic, "sent": sent})
     else:
-        words.print(f'sent {sent} on "{topic}"', markup=False)
+        words.print(f'sent {sent} on "{topic}"')
     raise typer.Exit(code)
 
 
@@ -424,11 +424,7 @@ def _report_no_message(topic: Topic) -> None:
         if topic.rate_hz is None
         else "check its writer: flexsheet topic echo status"
     )
-    words.print(
-        f'no message on "{topic.name}" yet ({when}); press Ctrl-C to stop',
-        markup=False,
-        style="dim",
-    )
+    words.print(f'no message on "{topic.name}" yet ({when}); press Ctrl-C to stop', style="dim")
 
 
 async def _read(
@@ -503,7 +499,7 @@ def make_listener(
         plan,
         run,
         handler,
-        on_problem=lambda text: words.print(text, markup=False),
+        on_problem=words.print,
         raw=raw,
     )
 

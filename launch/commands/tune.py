@@ -120,9 +120,9 @@ def tune(
                 runs=runs,
             )
     for choice in choices:
-        words.print(choice.explain(), markup=False)
+        words.print(choice.explain())
     for line in composition.explain() if composition is not None else ():
-        words.print(line, markup=False)
+        words.print(line)
     met = all(choice.met for choice in choices) if composition is None else composition.accepted
     if as_json:
         report = {
