@@ -7,6 +7,7 @@ simulated time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -304,7 +305,7 @@ def run_gestures(
 
 
 def _critical_damping(hand: Hand | HandImpedance) -> float:
-    return 2.0 * float(hand.mass_kg * hand.stiffness_n_per_m) ** 0.5
+    return 2.0 * math.sqrt(hand.mass_kg * hand.stiffness_n_per_m)
 
 
 def _make_row(gesture: str, hand: HandImpedance, figures: dict[str, Any]) -> dict[str, Any]:

@@ -40,7 +40,7 @@ from flexsheet.nodes.renderer.benchmarks import draw_coordinate_ramps
 from flexsheet.nodes.renderer.gl import headless_context
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import estimate_sheet
-from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import HALF_WINDOW_M, eye_rays, first_hits, seen
@@ -293,14 +293,7 @@ class OfflineEvaluator:
                 rig.pixels_of(lens, rays[:2] / rays[2])
                 for lens, rays in ((camera.left, in_left[0]), (camera.right, in_right[1]))
             ]
-            found = measure(
-                self._geometry,
-                pixels[0],
-                pixels[1],
-                method=dlt,
-                left_covariance=UNIT_COVARIANCE_PX2,
-                right_covariance=UNIT_COVARIANCE_PX2,
-            )
+            found = measure(self._geometry, pixels[0], pixels[1], covariance=UNIT_COVARIANCE_PX2)
             if found is None:
                 raise ExperimentError(
                     f"apparatus {apparatus.origin}: the fingertip at {contact.point} m cannot be "

@@ -48,7 +48,7 @@ from flexsheet.nodes.planner.timing import update_horizon_s
 from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
-from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.arms import Servo, forward
 from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
@@ -116,13 +116,7 @@ class MeasuredFinger:
             for lens, point in ((self._camera.left, in_left), (self._camera.right, in_right))
         ]
         covariance = PIXEL_NOISE_PX**2 * np.eye(2)
-        found = measure(
-            self._geometry,
-            *pixels,
-            method=dlt,
-            left_covariance=covariance,
-            right_covariance=covariance,
-        )
+        found = measure(self._geometry, *pixels, covariance=covariance)
         if found is not None:
             self._tracker.update(at_ns, found.point_world, found.covariance)
         return self._tracker.predict_at(at_ns, self._horizons_s).path

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from ruamel.yaml import YAML
 
 from flexsheet.launch.experiments import ExperimentError
-from flexsheet.launch.plans.documents import did_you_mean
+from flexsheet.launch.plans.documents import did_you_mean, edit_yaml
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.precompute import (
     precompute_deflection_shapes,
@@ -182,16 +181,13 @@ def select_configurations(scene: Scene, names: Collection[str]) -> list[Configur
 
 def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path:
     """Write a copy of a launch file with another scene; relative paths become absolute."""
-    yaml = YAML()
-    launch = yaml.load(launch_file.read_text())
-    launch["scene"] = str(scene_file.resolve())
-    launch.pop("record", None)
-    for spec in launch["nodes"].values():
-        given = spec.get("parameters", {})
-        for parameter, value in given.items():
-            file = launch_file.parent / str(value)
-            if isinstance(value, str) and file.is_file():
-                given[parameter] = str(file.resolve())
-    with target.open("w") as output:
-        yaml.dump(launch, output)
+    with edit_yaml(launch_file, target) as launch:
+        launch["scene"] = str(scene_file.resolve())
+        launch.pop("record", None)
+        for spec in launch["nodes"].values():
+            given = spec.get("parameters", {})
+            for parameter, value in given.items():
+                file = launch_file.parent / str(value)
+                if isinstance(value, str) and file.is_file():
+                    given[parameter] = str(file.resolve())
     return target

@@ -17,7 +17,6 @@ from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     StereoGeometry,
-    dlt,
     measure,
 )
 
@@ -306,14 +305,7 @@ def _marker_tolerance_px(scene: Scene) -> float:
     """
     geometry = StereoGeometry.of(scene.camera)
     left, right = geometry.project(np.zeros(3))
-    one_px = measure(
-        geometry,
-        left,
-        right,
-        method=dlt,
-        left_covariance=np.eye(2),
-        right_covariance=np.eye(2),
-    )
+    one_px = measure(geometry, left, right, covariance=np.eye(2))
     if one_px is None:
         raise ValueError(
             "scene: camera: the centre of the screen (the world's origin) is not in front of both "

@@ -553,9 +553,9 @@ def _triangulate(
         inputs.geometry,
         markers[0].centre + inputs.origins[0],
         markers[1].centre + inputs.origins[1],
-        method=inputs.config.triangulate,
-        left_covariance=left,
+        covariance=left,
         right_covariance=right,
+        method=inputs.config.triangulate,
     )
 
 

@@ -276,13 +276,14 @@ def measure(
     left_px: Floats,
     right_px: Floats,
     *,
-    method: Triangulate,
-    left_covariance: Floats,
-    right_covariance: Floats,
+    covariance: Floats,
+    right_covariance: Floats | None = None,
+    method: Triangulate = dlt,
 ) -> TriangulatedPoint | None:
     """Triangulate a marker from its pixels (2,) in both views, with covariances (2, 2) px^2.
 
-    Return None if the point is not in front of both cameras, or if a pixel is not finite or outside
+    right_covariance: covariance of the right pixel; None: equal to that of the left one.  Return
+    None if the point is not in front of both cameras, or if a pixel is not finite or outside
     the range of the lens model.  Both views have equal weights, as in the triangulation methods.
     Pixel errors are thus propagated by (J^T J)^-1 J^T, with the Jacobian J of the four pixel
     coordinates with respect to the point.
@@ -308,12 +309,12 @@ def measure(
         return None
     inverse = information @ slope.T
     world = geometry.world_from_left
+    of_right = covariance if right_covariance is None else right_covariance
     left_part = world[:3, :3] @ inverse[:, :2]
     right_part = world[:3, :3] @ inverse[:, 2:]
     shifts = np.concatenate((left_projected - left_px, right_projected - right_px))
     return TriangulatedPoint(
         point_world=world[:3, :3] @ point + world[:3, 3],
-        covariance=left_part @ left_covariance @ left_part.T
-        + right_part @ right_covariance @ right_part.T,
+        covariance=left_part @ covariance @ left_part.T + right_part @ of_right @ right_part.T,
         reprojection_px=float(np.sqrt(0.5 * (shifts @ shifts))),
     )
