@@ -544,12 +544,10 @@ def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, floa
     """Return distance (m) and angle (rad) from the base pose in the scene to the measured one."""
     import numpy as np
 
-    from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation
+    from flexsheet.nodes.models.rigid import pose_matrix, vector_from_rotation
 
     nominal = getattr(scene.arms, side).world_from_base
-    before, now = (
-        transform_from_rpy(one.position_m, one.rpy_rad) for one in (nominal, base.world_from_base)
-    )
+    before, now = (pose_matrix(one) for one in (nominal, base.world_from_base))
     return (
         float(np.linalg.norm(now[:3, 3] - before[:3, 3])),
         float(np.linalg.norm(vector_from_rotation(now[:3, :3] @ before[:3, :3].T))),

@@ -61,9 +61,7 @@ class StereoGeometry:
         if calibration is not None:
             refuse_other_camera(calibration, scene_camera)
             optics = calibration
-        world_from_left = rigid.transform_from_rpy(
-            scene_camera.world_from_left.position_m, scene_camera.world_from_left.rpy_rad
-        )
+        world_from_left = rigid.pose_matrix(scene_camera.world_from_left)
         return StereoGeometry(
             device=scene_camera.device,
             width_px=scene_camera.width_px,

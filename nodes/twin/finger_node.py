@@ -22,7 +22,7 @@ from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
 from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.finger import WANDER_BAND_HZ, FingerMotion, FingerState
@@ -148,7 +148,7 @@ class TwinFingerNode(Node):
         if self.parameters.hand == "coupled":
             self.coupled, self.edges = None, EdgeTrack()
             self.clamps = [
-                transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)
+                pose_matrix(arm.flange_from_edge)
                 for arm in (true_scene.arms.left, true_scene.arms.right)
             ]
             if self.preparing is not None:

@@ -18,7 +18,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Positive, Scene
 from flexsheet.messages.types import Force, TwinArms, TwinFinger
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.membrane import solve
@@ -56,7 +56,7 @@ class TrueSheetForce:
         self._radius_m = true_scene.finger.radius_m
         self._history = ForceHistory.of(apparatus)
         self._clamps = [
-            transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)
+            pose_matrix(arm.flange_from_edge)
             for arm in (true_scene.arms.left, true_scene.arms.right)
         ]
 
