@@ -45,7 +45,7 @@ from flexsheet.nodes.triangulator.adaptive import (
     predict_by_model,
 )
 from flexsheet.nodes.triangulator.filters import Estimate
-from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 
 Floats = NDArray[np.float64]
 
@@ -158,14 +158,7 @@ def marker_covariance(noise_px: float) -> Floats:
     geometry = StereoGeometry.of(bench_scene().camera)
     covariance_px = noise_px**2 * np.eye(2)
     left, right = geometry.project(np.zeros(3))
-    found = measure(
-        geometry,
-        left,
-        right,
-        method=dlt,
-        left_covariance=covariance_px,
-        right_covariance=covariance_px,
-    )
+    found = measure(geometry, left, right, covariance=covariance_px)
     assert found is not None
     return 1e6 * found.covariance
 

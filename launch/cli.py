@@ -161,9 +161,9 @@ def main() -> None:
         code = exit_code(error)
         if code is None:
             raise
-        words.print(f"flexsheet: {error_text(error)}", markup=False)
+        words.print(f"flexsheet: {error_text(error)}")
         if "--json" not in sys.argv and (more := explained_by(error)):
-            words.print(f"explanation: {more}", markup=False, style="dim")
+            words.print(f"explanation: {more}", style="dim")
         sys.exit(code)
 
 

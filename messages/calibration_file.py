@@ -28,6 +28,7 @@ class CalibrationFileError(FlexsheetError, ValueError):
     """Raised for an invalid calibration file; the text names file, key and remedy."""
 
     code = "calibration-file"
+    exit_code = 2
     remedy = "Calibrate again, or give another calibration file."
 
 
@@ -35,6 +36,7 @@ class CalibrationMismatchError(FlexsheetError, ValueError):
     """Raised if a calibration is of another device (camera, sheet, ...) than the scene's."""
 
     code = "calibration-mismatch"
+    exit_code = 2
     remedy = "Give the calibration of the scene's device, or the scene of the calibration."
 
 

@@ -456,6 +456,7 @@ class UnfitGeometryError(FlexsheetError, ValueError):
     """Raised for an object shape that a command or method does not support."""
 
     code = "unfit-geometry"
+    exit_code = 2
     remedy = "Choose an object of a supported shape."
 
 

@@ -121,6 +121,7 @@ class UnknownTopicError(FlexsheetError, KeyError):
     """Raised for an unknown topic name; the text suggests a similar one."""
 
     code = "unknown-topic"
+    exit_code = 2
     remedy = "`flexsheet topic list` prints all names."
 
 

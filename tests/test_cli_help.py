@@ -226,7 +226,9 @@ def test_a_slip_is_answered_with_what_was_meant(
 
 def test_colours_are_for_terminals_and_no_color_disables_them() -> None:
     """The text is the same in a pseudo-terminal with NO_COLOR, without it, and in a pipe."""
-    code = "from flexsheet.launch.commands.output import words; words.print('[red]so[/]')"
+    code = (
+        "from flexsheet.launch.commands.output import words; words.print('[red]so[/]', markup=True)"
+    )
 
     def said(terminal: bool, **more: str) -> bytes:
         ours, theirs = os.openpty() if terminal else os.pipe()

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from flexsheet.launch.calibration.simulated_sheet import simulate_push
-from flexsheet.launch.cli import app
-from flexsheet.launch.commands.output import CommandError
+from flexsheet.launch.cli import app, exit_code
+from flexsheet.launch.commands.output import BAD_INPUT
 from flexsheet.launch.health import compliance as compliance_check
 from flexsheet.launch.health.compliance import (
     FINGERTIP_AGE_S,
@@ -26,8 +26,9 @@ from flexsheet.launch.health.compliance import (
     find_loop_risk,
 )
 from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.types import SoftBody
-from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
+from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel, SheetPush
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner import sheet_force
 from flexsheet.nodes.planner.compliance import (
@@ -39,7 +40,6 @@ from flexsheet.nodes.planner.compliance import (
     StretchLimits,
     UnfitCurveError,
     compute_force_uncertainty_ratio,
-    fit_at_stretch,
     fit_compliance,
     make_stretch_limits,
     render_force,
@@ -68,15 +68,7 @@ def soft_curve(scale: float, deepest: float = 0.05) -> ObjectCurve:
 
 
 def compliance(curve: ObjectCurve, deepest: float = 0.05, pull: StretchLimits = PULL) -> Compliance:
-    return fit_compliance(
-        curve,
-        LAW,
-        pull,
-        max_depth_m=deepest,
-        finger_radius_m=RADIUS,
-        usable_half_height_m=SHEET.usable_half_height_m,
-        position_error_m=SCENE.tolerances.sheet_position_m,
-    )
+    return fit_compliance(curve, LAW, pull, SCENE, max_depth_m=deepest)
 
 
 @pytest.mark.parametrize("scale", [0.25, 0.6, 1.0])
@@ -116,7 +108,7 @@ def test_the_retreat_is_smooth_and_bounded_for_any_object(
     inner = slopes[(depths[1:] > 0.02 * deepest) & (depths[1:] < 0.99 * deepest)]
     assert np.abs(np.diff(inner)).max() < 0.25
     held = (min(abs(place[0]), 0.06), min(abs(place[1]), 0.09))
-    pressed = LAW.evaluate(shown.stretch_ratio, pushed, position_m=held, finger_radius_m=RADIUS)
+    pressed = LAW.evaluate(SheetPush(shown.stretch_ratio, RADIUS, held), pushed)
     assert pressed.edge_force_n.max() < SHEET.max_edge_force_n
     assert PULL.min_stretch_ratio <= shown.stretch_ratio <= PULL.max_stretch_ratio
 
@@ -179,9 +171,7 @@ def test_the_edge_force_never_exceeds_the_reserve_at_any_depth() -> None:
     weak = SHEET.model_copy(update={"max_edge_force_n": 9.0})
     pull = make_stretch_limits(weak, LAW)
     assert pull.edge_force_n == pytest.approx(USABLE_FRACTION * 9.0)
-    flat = LAW.evaluate(
-        pull.max_stretch_ratio, np.zeros(1), position_m=CENTRE, finger_radius_m=RADIUS
-    )
+    flat = LAW.evaluate(SheetPush(pull.max_stretch_ratio, RADIUS), np.zeros(1))
     assert flat.edge_force_n[0] == pytest.approx(USABLE_FRACTION * 9.0, rel=1e-6)
     for scale in (0.2, 1.0, 10.0):
         shown = compliance(soft_curve(scale), pull=pull)
@@ -193,9 +183,8 @@ def test_a_sheet_with_too_high_tension_retreats_at_once() -> None:
         soft_curve(1.0),
         LAW,
         StretchLimits(1.08, 1.08, 2.0),
-        stretch_ratio=1.08,
+        SheetPush(1.08, RADIUS),
         max_depth_m=0.05,
-        finger_radius_m=RADIUS,
     )
     assert not shown.indentation_m.any()
     assert shown.force_limited
@@ -218,15 +207,8 @@ def test_an_object_that_is_not_there_is_not_felt() -> None:
 
 def test_a_curve_elsewhere_keeps_the_stretch() -> None:
     here = compliance(soft_curve(1.0))
-    there = fit_at_stretch(
-        soft_curve(0.8),
-        LAW,
-        PULL,
-        stretch_ratio=here.stretch_ratio,
-        max_depth_m=0.05,
-        finger_radius_m=RADIUS,
-        usable_half_height_m=SHEET.usable_half_height_m,
-        position_error_m=0.0005,
+    there = fit_compliance(
+        soft_curve(0.8), LAW, PULL, SCENE, stretch_ratio=here.stretch_ratio, max_depth_m=0.05
     )
     assert there.stretch_ratio == here.stretch_ratio
     depths = np.array([0.005, 0.02])
@@ -270,15 +252,8 @@ def test_a_curve_comes_from_the_soft_bodys_message_and_is_extended_linearly() ->
 def test_a_calibrated_law_serves_as_well() -> None:
     stiffer = ScaledSheetModel(LAW.rubber, cubic_ratio=1.4, stretch_scale=1.004)
     curve = soft_curve(0.8)
-    shown = fit_compliance(
-        curve,
-        stiffer,
-        make_stretch_limits(SHEET, stiffer),
-        max_depth_m=0.05,
-        finger_radius_m=RADIUS,
-        usable_half_height_m=SHEET.usable_half_height_m,
-        position_error_m=0.0005,
-    )
+    limits = make_stretch_limits(SHEET, stiffer)
+    shown = fit_compliance(curve, stiffer, limits, SCENE, max_depth_m=0.05)
     depths = np.array([0.005, 0.02, 0.045])
     assert shown.rendered_force_n(depths) == pytest.approx(curve.force_n(depths), rel=0.01)
     assert shown.stretch_ratio < compliance(curve).stretch_ratio
@@ -348,15 +323,12 @@ def test_a_graph_is_checked_with_the_delay_of_its_planner(monkeypatch: pytest.Mo
 
 
 def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:
-    command = [
-        "doctor",
-        "compliance",
-        str(SCENE_FILE),
-        "--calibration",
-        str(tmp_path / "none.yaml"),
-    ]
-    result = CliRunner().invoke(app, command)
-    assert isinstance(result.exception, CommandError)
+    missing = str(tmp_path / "none.yaml")
+    result = CliRunner().invoke(
+        app, ["doctor", "compliance", str(SCENE_FILE), "--calibration", missing]
+    )
+    assert isinstance(result.exception, CalibrationFileError)
+    assert exit_code(result.exception) == BAD_INPUT
     assert "cannot be read" in str(result.exception)
 
 

@@ -14,6 +14,7 @@ from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import moved
 from flexsheet.nodes.models.sheet.force_models import (
     ScaledSheetModel,
+    SheetPush,
     make_model,
 )
 from flexsheet.nodes.planner.compliance import TARGET_ERROR_RATIO, UnfitCurveError
@@ -146,9 +147,7 @@ def test_a_law_that_is_asked_beyond_its_range_is_named_with_the_reason() -> None
         compliance = ComplianceController(scene, asked, "force_curve")
         compliance.update(soft_body(), in_contact=False)
         indentation_m = depth_m - compliance.normal_offset(depth_m, (0.0, 0.0))[0]
-        why = asked.invalid_reason(
-            compliance.stretch_ratio, indentation_m, position_m=(0.0, 0.0), finger_radius_m=RADIUS
-        )
+        why = asked.invalid_reason(SheetPush(compliance.stretch_ratio, RADIUS), indentation_m)
         assert bool(why) == ("outside the range of sheet force model" in compliance.note)
         assert compliance.note.endswith(why)
         assert bool(why) == (depth_m < 0.01)

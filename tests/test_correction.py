@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from flexsheet.messages.scene import Lens
 from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.renderer.correction import (
     GRAZING_SINE,
@@ -175,13 +176,8 @@ def test_no_points_give_no_points() -> None:
 def test_homography_agrees_with_the_pinhole() -> None:
     world_from_projector = np.diag([-1.0, -1.0, 1.0, 1.0])
     world_from_projector[:3, 3] = PROJECTOR
-    homography = pixel_from_screen(
-        fx_px=2000.0,
-        fy_px=1900.0,
-        cx_px=399.5,
-        cy_px=799.5,
-        world_from_projector=world_from_projector,
-    )
+    lens = Lens(fx_px=2000.0, fy_px=1900.0, cx_px=399.5, cy_px=799.5)
+    homography = pixel_from_screen(lens, world_from_projector)
     x, y, w = homography @ [0.03, -0.02, 1.0]
     assert np.isclose(x / w, 399.5 - 2000.0 * 0.03)
     assert np.isclose(y / w, 799.5 + 1900.0 * (-0.25 + 0.02))

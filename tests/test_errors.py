@@ -12,6 +12,7 @@ from flexsheet.launch import cli
 from flexsheet.launch.commands.explain import Entry, entries, find_entries
 from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError
 from flexsheet.launch.plans.documents import BadInputError, Problem
+from flexsheet.messages.bag import BagError
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.notes import (
     FINGERTIP_REMEDIES,
@@ -87,7 +88,8 @@ def test_nothing_is_explained_without_a_match() -> None:
 @pytest.mark.parametrize(
     ("error", "code"),
     [
-        (UnknownTopicError("so"), FAILED),
+        (UnknownTopicError("so"), BAD_INPUT),
+        (BagError("so"), FAILED),
         (BadInputError([Problem("a.yaml:1", (), "so")]), BAD_INPUT),
         (CommandError("so", BAD_INPUT), BAD_INPUT),
         (ValueError("so"), None),

@@ -12,7 +12,13 @@ import pytest
 from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
-from flexsheet.launch.experiments import ExperimentError, robustness, sensitivity, sweep
+from flexsheet.launch.experiments import (
+    ExperimentError,
+    robustness,
+    select_names,
+    sensitivity,
+    sweep,
+)
 from flexsheet.launch.experiments.follow import (
     LimitedMotion,
     bound_errors,
@@ -351,7 +357,7 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_an_unknown_parameter_is_refused() -> None:
     with pytest.raises(ExperimentError, match=r"sheet\.modulus_ration.*sheet\.modulus_ratio"):
-        sensitivity.select_parameters(["sheet.modulus_ration"])
+        select_names(["sheet.modulus_ration"], TOLERANCES, "parameter")
 
 
 # The bound of a followed finger

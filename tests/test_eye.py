@@ -12,13 +12,13 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, Display, Frame, TwinArms, TwinEye
+from flexsheet.nodes.arrays import Image
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform, transform_from_rpy
 from flexsheet.nodes.models.sheet import edge_poses, flange_pose
 from flexsheet.nodes.renderer.benchmarks import roll_sheet
 from flexsheet.nodes.renderer.sheet import SheetPose
 from flexsheet.nodes.twin.eye import (
     METRES_PER_PX,
-    Image,
     NotMeasurableError,
     Rays,
     TrueProjector,

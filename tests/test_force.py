@@ -31,6 +31,7 @@ from flexsheet.messages.types import Force, SheetTarget, TwinArms, TwinFinger
 from flexsheet.nodes.gauge.node import Gauge, GaugeParameters, SerialSource
 from flexsheet.nodes.gauge.serial_gauge import GaugeError, SerialGauge, parse_line
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
+from flexsheet.nodes.models.sheet.force_models import SheetPush
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.self_checks import MeasuredForceCheck, PlannedPush, check_stiffness
@@ -217,7 +218,7 @@ def test_the_simulated_gauge_has_the_errors_of_the_apparatus() -> None:
     assert rest.force_n == 0.0
     assert lag_ns == 0
     model = make_force_model(SHEET)
-    predicted = model.evaluate(1.05, np.array([0.02]), position_m=(0.0, 0.0), finger_radius_m=0.007)
+    predicted = model.evaluate(SheetPush(1.05, 0.007), np.array([0.02]))
     assert pushed.force_n == pytest.approx(float(predicted.force_n[0]), rel=0.05)
     truth = GaugeTruth(noise_n=0.0, offset_n=0.1, gain_ratio=1.1, lag_s=0.05)
     wrong = Apparatus(scene=SCENE.name, gauge=truth)

@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch import cli
 from flexsheet.launch.commands.options import split_names
-from flexsheet.launch.experiments import ExperimentError, gestures
+from flexsheet.launch.experiments import ExperimentError, gestures, select_names
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Scene
@@ -253,10 +253,10 @@ def test_every_gesture_of_the_demos_scene_is_labelled_by_its_name(name: str) -> 
 
 
 def test_names_are_chosen_once_each_and_checked() -> None:
-    assert gestures.select_gestures([]) == list(gestures.GESTURES)
-    assert gestures.select_gestures(["tap", "stop", "tap"]) == ["tap", "stop"]
+    assert select_names([], gestures.GESTURES, "gesture") == list(gestures.GESTURES)
+    assert select_names(["tap", "stop", "tap"], gestures.GESTURES, "gesture") == ["tap", "stop"]
     with pytest.raises(ExperimentError, match=r'unknown gesture "tapp"; did you mean "tap"\?'):
-        gestures.select_gestures(["hold", "tapp"])
+        select_names(["hold", "tapp"], gestures.GESTURES, "gesture")
     # One value with commas is the former form of a repeated option.
     assert split_names(["tap, stop", "hold"]) == ["tap", "stop", "hold"]
     with pytest.raises(typer.BadParameter, match="omit the option to select all"):

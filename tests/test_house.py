@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("messages", "nodes", "launch")
 SHARED_ROOMS = {
     "flexsheet.nodes",
+    "flexsheet.nodes.arrays",
     "flexsheet.nodes.background",
     "flexsheet.nodes.cache",
     "flexsheet.nodes.methods",
@@ -21,11 +22,7 @@ SHARED_ROOMS = {
     "flexsheet.nodes.node",
     "flexsheet.nodes.parameter_marks",
 }
-TWIN_MAY_SHARE = {
-    "flexsheet.nodes.models.rigid",
-    "flexsheet.nodes.models.shapes",
-    "flexsheet.nodes.models",
-}
+TWIN_MAY_SHARE = {"flexsheet.nodes.models.rigid", "flexsheet.nodes.models.shapes"}
 
 
 def modules(floor: str) -> Iterator[Path]:

@@ -13,6 +13,7 @@ from flexsheet.launch.calibration.sheet_rows import read_rows
 from flexsheet.launch.commands.calibrate_sheet import make_calibration
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.messages.sheet_calibration import SheetCalibration
+from flexsheet.nodes.models.sheet.force_models import SheetPush
 from flexsheet.nodes.planner.compliance_controller import ComplianceController
 from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
 from flexsheet.nodes.planner.sheet_force import make_force_model
@@ -40,9 +41,7 @@ def force_errors(hysteresis_ratio: float) -> Floats:
     indented_m = np.array(
         [depth - controller.normal_offset(float(depth), (0.0, 0.0))[0] for depth in DEPTHS_M]
     )
-    elastic_n = model.evaluate(
-        controller.stretch_ratio, indented_m, position_m=(0.0, 0.0), finger_radius_m=RADIUS
-    ).force_n
+    elastic_n = model.evaluate(SheetPush(controller.stretch_ratio, RADIUS), indented_m).force_n
     felt_n = apply_history(ForceHistory(HYSTERESIS, 0.0), TIMES_S, elastic_n)
     wanted_n = object_force_n(DEPTHS_M)
     pressed = DEPTHS_M > 0.005
@@ -73,9 +72,7 @@ def pushes(ratio: float, noise: float = 0.002) -> list[MeasuredPush]:
     amplitude, rows = ratio / (2.0 - ratio), []
     depths = np.array([0.004, 0.008, 0.015, 0.03, 0.045])
     for stretch in (1.02, 1.06, 1.1):
-        force_n = model.evaluate(
-            stretch, depths, position_m=(0.0, 0.0), finger_radius_m=RADIUS
-        ).force_n
+        force_n = model.evaluate(SheetPush(stretch, RADIUS), depths).force_n
         for unloading in (False, True):
             for depth, elastic_n in zip(depths, force_n, strict=True):
                 factor = 1.0 - amplitude if unloading else 1.0 + amplitude

@@ -486,13 +486,7 @@ async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> 
     await desk.planner.step("soft_body", soft(45.0), desk.header())
     target = await desk.rest_at(position, 300)
     sheet = SCENE.sheet
-    force = edge_force_n(
-        target.stretch_ratio,
-        young_modulus_pa=sheet.young_modulus_pa,
-        width_m=sheet.width_m,
-        height_m=sheet.height_m,
-        thickness_m=sheet.thickness_m,
-    )
+    force = edge_force_n(target.stretch_ratio, sheet)
     assert push_stiffness_n_per_m(force, width_m=sheet.width_m) == pytest.approx(45.0, rel=1e-6)
     assert desk.planner.note == "sheet force model: scaled"
 
@@ -510,13 +504,7 @@ async def test_what_the_sheet_cannot_render_is_reported(stiffness: float, words:
 def test_the_arms_force_limits_the_stretch() -> None:
     weak = SCENE.sheet.model_copy(update={"max_edge_force_n": 8.0})
     _, largest = compute_stretch_range(weak)
-    force = edge_force_n(
-        choose_stretch(1e4, weak).stretch_ratio,
-        young_modulus_pa=weak.young_modulus_pa,
-        width_m=weak.width_m,
-        height_m=weak.height_m,
-        thickness_m=weak.thickness_m,
-    )
+    force = edge_force_n(choose_stretch(1e4, weak).stretch_ratio, weak)
     assert largest < weak.max_stretch_ratio
     assert force == pytest.approx(USABLE_FRACTION * 8.0, rel=1e-9)
 

@@ -478,6 +478,18 @@ async def test_stale_arms_keep_the_last_plane_and_are_reported(bench: Bench) -> 
     assert "the arm poses are 0.50 s old: keeping" in bench.node.note
 
 
+async def test_with_a_slow_camera_older_poses_are_used(bench: Bench) -> None:
+    await bench.step("scene", bench.scene)
+    for number in range(10):
+        bench.forward(1000 / 15)
+        await bench.arms(np.eye(4))
+        tip = fingertip(np.array([0.0, 0.0, 0.1]))
+        await bench.step("fingertip", tip, age_ms=4.0, sequence=number)
+    bench.forward(200)
+    await bench.finger(0.0, 0.0, 0.1)
+    assert "keeping" not in bench.node.note
+
+
 async def test_sheet_turned_away_holds_the_last_plane(bench: Bench) -> None:
     await bench.step("scene", bench.scene)
     await bench.arms(np.eye(4))

@@ -12,6 +12,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.types import SheetTarget
 from flexsheet.nodes.arm_bridge.goal import GoalTiming, make_goal
 from flexsheet.nodes.arm_bridge.report import REPORTED_TARGETS, LastExchange, LatencyMean
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.servo_lag import (
     MAX_SLEW_S_PER_S,
     LagBounds,
@@ -19,7 +20,7 @@ from flexsheet.nodes.models.servo_lag import (
     ServoLagEstimator,
 )
 from flexsheet.nodes.planner.timing import ActuationDelayEstimator
-from flexsheet.nodes.twin.arms import Floats, Servo
+from flexsheet.nodes.twin.arms import Servo
 
 BOUNDS = LagBounds(0.005, 0.1)
 PERIOD_S = 1.0 / 140.0

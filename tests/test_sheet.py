@@ -19,10 +19,10 @@ from flexsheet.nodes.models.sheet import (
     sheet_from_edges,
     stretch_for_edge_force,
 )
-from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel
+from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetPush
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
-PAPER = {"young_modulus_pa": 1e6, "width_m": 0.24, "height_m": 0.24, "thickness_m": 0.001}
+PAPER = Rubber(0.24, 0.24, 0.001, 1e6)
 
 angles = st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
 places = st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))
@@ -32,7 +32,7 @@ places = st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-0.2, 0
     ("stretch", "force"), [(1.02, 5.1), (1.05, 12.3), (1.10, 23.4), (1.20, 43.0)]
 )
 def test_edge_force_agrees_with_membrane_elements(stretch: float, force: float) -> None:
-    assert edge_force_n(stretch, **PAPER) == pytest.approx(force, rel=0.02)
+    assert edge_force_n(stretch, PAPER) == pytest.approx(force, rel=0.02)
 
 
 @pytest.mark.parametrize("height_m", [0.15, 0.24, 0.33])
@@ -50,20 +50,20 @@ def test_the_arms_limit_and_the_planners_model_give_the_same_edge_force(height_m
         workspace_max_m=np.ones(3),
     )
     model = ScaledSheetModel(Rubber(0.24, height_m, 0.001, 1e6))
-    flat = model.evaluate(1.05, np.zeros(1), position_m=(0.0, 0.0), finger_radius_m=0.007)
+    flat = model.evaluate(SheetPush(1.05, 0.007), np.zeros(1))
     assert limits.force_n(1.05 * 0.24) == pytest.approx(float(flat.edge_force_n[0]), rel=1e-12)
 
 
 def test_a_slack_sheet_pulls_at_nothing() -> None:
-    assert edge_force_n(1.0, **PAPER) == 0.0
-    assert edge_force_n(0.9, **PAPER) == 0.0
-    assert stretch_for_edge_force(-3.0, **PAPER) == 1.0
+    assert edge_force_n(1.0, PAPER) == 0.0
+    assert edge_force_n(0.9, PAPER) == 0.0
+    assert stretch_for_edge_force(-3.0, PAPER) == 1.0
 
 
 @given(st.floats(0.0, 500.0))
 def test_stretch_and_force_are_inverse(force: float) -> None:
-    stretch = stretch_for_edge_force(force, **PAPER)
-    assert edge_force_n(stretch, **PAPER) == pytest.approx(force, rel=1e-9, abs=1e-9)
+    stretch = stretch_for_edge_force(force, PAPER)
+    assert edge_force_n(stretch, PAPER) == pytest.approx(force, rel=1e-9, abs=1e-9)
 
 
 @given(st.floats(0.0, 1e4))

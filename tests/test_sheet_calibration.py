@@ -31,7 +31,12 @@ from flexsheet.messages.sheet_calibration import (
     load_sheet_calibration,
     save_sheet_calibration,
 )
-from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel, make_model
+from flexsheet.nodes.models.sheet.force_models import (
+    CENTRE,
+    ScaledSheetModel,
+    SheetPush,
+    make_model,
+)
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 
@@ -54,7 +59,7 @@ def pushes_of(
     rng = np.random.default_rng(seed)
     pushes = []
     for stretch in stretches:
-        pressed = law.evaluate(stretch, np.array(depths), position_m=CENTRE, finger_radius_m=RADIUS)
+        pressed = law.evaluate(SheetPush(stretch, RADIUS), np.array(depths))
         for depth, force, pull in zip(depths, pressed.force_n, pressed.edge_force_n, strict=True):
             pushes.append(
                 MeasuredPush(
@@ -160,9 +165,7 @@ def test_table_keeps_the_residual_of_the_law() -> None:
     table = tabulate_pushes(fit.law, rows, fit.used, NOMINAL.width_m)
     for push in rows:
         stretch = push.edge_distance_m / NOMINAL.width_m
-        pressed = table.evaluate(
-            stretch, np.array([push.depth_m]), position_m=CENTRE, finger_radius_m=RADIUS
-        )
+        pressed = table.evaluate(SheetPush(stretch, RADIUS), np.array([push.depth_m]))
         assert pressed.force_n[0] == pytest.approx(push.force_n, rel=0.02)
 
 
@@ -268,9 +271,7 @@ def test_twin_sheet_is_identified_from_its_pushes(twin_calibration: SheetCalibra
     assert isinstance(law, TabulatedSheetModel)
     for stretch, depth in ((1.03, 0.009), (1.05, 0.016)):
         true = simulate_force(SCENE.sheet, stretch, depth, CENTRE, RADIUS)
-        pressed = law.evaluate(
-            stretch, np.array([depth]), position_m=CENTRE, finger_radius_m=RADIUS
-        )
+        pressed = law.evaluate(SheetPush(stretch, RADIUS), np.array([depth]))
         assert pressed.force_n[0] == pytest.approx(true, rel=0.04)
 
 
@@ -282,8 +283,7 @@ def test_file_round_trip_keeps_the_law(twin_calibration: SheetCalibration, tmp_p
     one, two = make_force_model(SCENE.sheet, twin_calibration), make_force_model(SCENE.sheet, again)
     depths = np.linspace(0.001, 0.04, 9)
     answers = [
-        law.evaluate(1.037, depths, position_m=(0.02, 0.01), finger_radius_m=RADIUS).force_n
-        for law in (one, two)
+        law.evaluate(SheetPush(1.037, RADIUS, (0.02, 0.01)), depths).force_n for law in (one, two)
     ]
     assert np.array_equal(answers[0], answers[1])
 

@@ -19,6 +19,7 @@ from flexsheet.nodes.models.sheet.force_models import (
     ScaledSheetModel,
     SheetForceModel,
     SheetPosition,
+    SheetPush,
     depth_for_force,
     flat_edge_force_n,
     interpolate_inverse,
@@ -50,7 +51,7 @@ def force(
     place: SheetPosition = CENTRE,
     radius: float = RADIUS,
 ) -> float:
-    pressed = law.evaluate(stretch, np.array([depth]), position_m=place, finger_radius_m=radius)
+    pressed = law.evaluate(SheetPush(stretch, radius, place), np.array([depth]))
     return float(pressed.force_n[0])
 
 
@@ -79,7 +80,7 @@ def true_forces() -> Floats:
 def test_within_its_range_the_scaled_law_has_the_stated_accuracy(true_forces: Floats) -> None:
     judged = 0
     for (stretch, depth, place), true in zip(CASES, true_forces, strict=True):
-        if LAW.invalid_reason(stretch, depth, position_m=place, finger_radius_m=RADIUS):
+        if LAW.invalid_reason(SheetPush(stretch, RADIUS, place), depth):
             continue
         judged += 1
         assert force(LAW, stretch, depth, place) == pytest.approx(float(true), rel=0.10)
@@ -102,22 +103,20 @@ def test_the_scaled_law_reports_its_range(
     stretch: float, depth: float, place: SheetPosition, radius: float
 ) -> None:
     law = ScaledSheetModel(RUBBER)
-    assert law.invalid_reason(stretch, depth, position_m=place, finger_radius_m=radius)
+    assert law.invalid_reason(SheetPush(stretch, radius, place), depth)
     assert np.isfinite(force(law, stretch, depth, place, radius))
 
 
 def test_a_sheet_of_another_form_is_outside() -> None:
     tall = Rubber(0.24, 0.36, 0.001, 1e6)
-    assert "square" in ScaledSheetModel(tall).invalid_reason(
-        1.05, 0.012, position_m=CENTRE, finger_radius_m=RADIUS
-    )
+    assert "square" in ScaledSheetModel(tall).invalid_reason(SheetPush(1.05, RADIUS), 0.012)
 
 
 def test_a_slack_sheet_answers_with_the_cube_of_the_depth() -> None:
     law = ScaledSheetModel(RUBBER)
     assert force(law, 1.0, 0.02) == pytest.approx(8.0 * force(law, 1.0, 0.01), rel=1e-9)
     path = MembraneSheetModel(RUBBER, cells=20).evaluate(
-        1.0, np.array([0.01, 0.02]), position_m=CENTRE, finger_radius_m=RADIUS
+        SheetPush(1.0, RADIUS), np.array([0.01, 0.02])
     )
     assert path.force_n[1] / path.force_n[0] == pytest.approx(8.0, rel=0.06)
     true = [true_push(1.0, depth)[0] for depth in (0.01, 0.02)]
@@ -128,9 +127,7 @@ def test_a_slack_sheet_answers_with_the_cube_of_the_depth() -> None:
 def test_the_pushed_sheet_pulls_harder_at_its_clamps(stretch: float) -> None:
     law = ScaledSheetModel(RUBBER)
     flat, pulled = (true_push(stretch, depth)[1] for depth in (1e-4, 0.04))
-    pressed = law.evaluate(
-        stretch, np.array([0.0, 0.04]), position_m=CENTRE, finger_radius_m=RADIUS
-    )
+    pressed = law.evaluate(SheetPush(stretch, RADIUS), np.array([0.0, 0.04]))
     assert pressed.edge_force_n == pytest.approx([flat, pulled], rel=0.03)
     assert pulled > flat + 2.0
 
@@ -143,7 +140,7 @@ def test_force_and_slope_rise_and_agree(
     stretch: float, place: SheetPosition, radius: float
 ) -> None:
     depths = np.linspace(0.002, 0.05, 200)
-    pressed = LAW.evaluate(stretch, depths, position_m=place, finger_radius_m=radius)
+    pressed = LAW.evaluate(SheetPush(stretch, radius, place), depths)
     assert (np.diff(pressed.force_n) >= 0.0).all()
     assert (np.diff(pressed.edge_force_n) >= 0.0).all()
     middle = 0.5 * (pressed.stiffness_n_per_m[1:] + pressed.stiffness_n_per_m[:-1])
@@ -181,10 +178,8 @@ def test_no_depth_presses_nothing_and_what_is_not_finite_is_rejected() -> None:
 @given(st.floats(1.0, 1.13), places)
 def test_depth_for_force_is_the_inverse(stretch: float, place: SheetPosition) -> None:
     depths = np.array([0.0, 1e-4, 0.002, 0.011, 0.03, 0.049])
-    asked = LAW.evaluate(stretch, depths, position_m=place, finger_radius_m=RADIUS).force_n
-    found = depth_for_force(
-        LAW, stretch, asked, max_depth_m=0.05, position_m=place, finger_radius_m=RADIUS
-    )
+    asked = LAW.evaluate(SheetPush(stretch, RADIUS, place), depths).force_n
+    found = depth_for_force(LAW, SheetPush(stretch, RADIUS, place), asked, max_depth_m=0.05)
     assert found == pytest.approx(depths, rel=2e-3)
 
 
@@ -200,7 +195,7 @@ def test_a_table_returns_its_entries_and_interpolates_by_the_law() -> None:
     base = ScaledSheetModel(RUBBER)
 
     def measured(stretch: float, depths: Floats, place: SheetPosition) -> Floats:
-        pressed = base.evaluate(stretch, depths, position_m=place, finger_radius_m=RADIUS)
+        pressed = base.evaluate(SheetPush(stretch, RADIUS, place), depths)
         wave = 1.0 + 0.1 * np.sin(100.0 * depths) + place[0] - 0.5 * place[1] + stretch - 1.0
         result: Floats = pressed.force_n * wave
         return result
@@ -220,9 +215,9 @@ def test_a_table_returns_its_entries_and_interpolates_by_the_law() -> None:
     for stretch, depth, place in ((1.05, 0.002, (0.03, 0.0)), (1.035, 0.017, (-0.04, 0.05))):
         true = measured(stretch, np.array([depth]), (abs(place[0]), abs(place[1])))[0]
         assert force(table, stretch, depth, place) == pytest.approx(true, rel=2e-3)
-        assert not table.invalid_reason(stretch, depth, position_m=place, finger_radius_m=RADIUS)
+        assert not table.invalid_reason(SheetPush(stretch, RADIUS, place), depth)
     depths = np.linspace(0.001, 0.06, 400)
-    pressed = table.evaluate(1.04, depths, position_m=(0.01, 0.02), finger_radius_m=RADIUS)
+    pressed = table.evaluate(SheetPush(1.04, RADIUS, (0.01, 0.02)), depths)
     middle = 0.5 * (pressed.stiffness_n_per_m[1:] + pressed.stiffness_n_per_m[:-1])
     slope = np.diff(pressed.force_n) / np.diff(depths)
     assert np.abs(slope / middle - 1.0).max() < 0.05
@@ -232,7 +227,7 @@ def test_a_table_returns_its_entries_and_interpolates_by_the_law() -> None:
         (1.05, 0.01, (0.07, 0.0)),
         (1.05, 0.01, (0.0, 0.1)),
     ):
-        assert table.invalid_reason(stretch, depth, position_m=place, finger_radius_m=RADIUS)
+        assert table.invalid_reason(SheetPush(stretch, RADIUS, place), depth)
         assert np.isfinite(force(table, stretch, depth, place))
 
 
@@ -280,9 +275,5 @@ def test_rubber_that_is_none_is_rejected(numbers: tuple[float, ...]) -> None:
 
 def test_the_curve_has_no_kink() -> None:
     depths = np.geomspace(0.001, 0.06, 2000)
-    slopes = (
-        ScaledSheetModel(RUBBER)
-        .evaluate(1.05, depths, position_m=CENTRE, finger_radius_m=RADIUS)
-        .stiffness_n_per_m
-    )
+    slopes = ScaledSheetModel(RUBBER).evaluate(SheetPush(1.05, RADIUS), depths).stiffness_n_per_m
     assert all(abs(after / before - 1.0) < 0.01 for before, after in pairwise(slopes))

@@ -14,7 +14,6 @@ from flexsheet.nodes.triangulator.skew import compensate_skew
 from flexsheet.nodes.triangulator.triangulation import (
     StereoGeometry,
     TriangulatedPoint,
-    dlt,
     measure,
 )
 from flexsheet.nodes.twin.clutter import CLUTTER
@@ -29,9 +28,7 @@ NOISE_PX2 = 1e-4 * np.eye(2)
 def seen(point: Floats, velocity: Floats, skew_s: float) -> TriangulatedPoint:
     left = GEOMETRY.project(point - 0.5 * skew_s * velocity)[0]
     right = GEOMETRY.project(point + 0.5 * skew_s * velocity)[1]
-    found = measure(
-        GEOMETRY, left, right, method=dlt, left_covariance=NOISE_PX2, right_covariance=NOISE_PX2
-    )
+    found = measure(GEOMETRY, left, right, covariance=NOISE_PX2)
     assert found is not None
     return found
 

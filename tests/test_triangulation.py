@@ -20,7 +20,6 @@ from flexsheet.nodes.triangulator.triangulation import (
     ClosestApproach,
     StereoGeometry,
     TriangulatedPoint,
-    dlt,
     measure,
     project_with_jacobian,
     undistort_pixel,
@@ -53,9 +52,8 @@ def found_behind(
         geometry,
         left,
         right,
+        covariance=noise_px**2 * np.eye(2),
         method=TRIANGULATION_METHODS[name],
-        left_covariance=noise_px**2 * np.eye(2),
-        right_covariance=noise_px**2 * np.eye(2),
     )
 
 
@@ -286,8 +284,7 @@ def test_uneven_noise_is_carried_to_the_point(geometry: StereoGeometry) -> None:
             geometry,
             left + shifts[0],
             right + shifts[1],
-            method=dlt,
-            left_covariance=spreads[0],
+            covariance=spreads[0],
             right_covariance=spreads[1],
         )
         assert found is not None

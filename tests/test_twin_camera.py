@@ -14,6 +14,7 @@ from scipy.special import erf, ndtr
 from benchmarks.fingertip_bound import BoundError, fingertip_bound, pixel_information
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.scene import Lens, Scene, StereoCamera
+from flexsheet.nodes.arrays import Image
 from flexsheet.nodes.models.rigid import transform, vector_from_rotation
 from flexsheet.nodes.twin.board import BoardError, TwinBoard
 from flexsheet.nodes.twin.clutter import (
@@ -31,7 +32,7 @@ from flexsheet.nodes.twin.clutter import (
     together,
     touching_highlight,
 )
-from flexsheet.nodes.twin.pixels import Image, Sensor, TwinCamera, Window, disjoint
+from flexsheet.nodes.twin.pixels import Sensor, TwinCamera, Window, disjoint
 from flexsheet.nodes.twin.rig import make_true_camera, pixels_of, slopes_of
 from tests.examples import examples
 from tests.scenes import load_cylinder

@@ -79,6 +79,7 @@ class ArmPosesError(FlexsheetError, ValueError):
     """Raised for a folder of arm poses that cannot be used."""
 
     code = "arm-poses"
+    exit_code = 2
     remedy = "Correct the row of joints.csv that the error names, or record that pose again."
 
 

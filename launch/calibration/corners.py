@@ -52,6 +52,7 @@ class CalibrationError(FlexsheetError, ValueError):
     """Raised for images that cannot be used for calibration."""
 
     code = "calibration"
+    exit_code = 2
     remedy = (
         "Capture sharp images of the whole board at different tilts. Check `--board` (inner "
         "corners) and `--square-mm`."

@@ -134,13 +134,7 @@ def _make_rows(poses: Sequence[HeldPose], side: Side, sheet: SheetSpec) -> list[
             continue
         across = np.mean(centres["right"], axis=0) - np.mean(centres["left"], axis=0)
         length_m = float(np.linalg.norm(across))
-        tension_n = edge_force_n(
-            length_m / sheet.width_m,
-            young_modulus_pa=sheet.young_modulus_pa,
-            width_m=sheet.width_m,
-            height_m=sheet.height_m,
-            thickness_m=sheet.thickness_m,
-        )
+        tension_n = edge_force_n(length_m / sheet.width_m, sheet)
         force_n = (1.0 if side == "left" else -1.0) * tension_n * across / length_m
         rows += [
             _Row(pose.joints_rad(side), mark.mark_edge_m, mark.position_world_m, force_n)

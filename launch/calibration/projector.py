@@ -51,6 +51,7 @@ class ProjectorError(FlexsheetError, ValueError):
     """Raised for images or points that do not determine the projector."""
 
     code = "projector-calibration"
+    exit_code = 2
     remedy = "Capture images in more poses, with the whole pattern on the sheet."
 
 

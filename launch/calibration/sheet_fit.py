@@ -13,7 +13,12 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForceModel, make_model
+from flexsheet.nodes.models.sheet.force_models import (
+    ScaledSheetModel,
+    SheetForceModel,
+    SheetPush,
+    make_model,
+)
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 
@@ -255,9 +260,7 @@ def _predict(
         groups.setdefault(key, []).append(number)
     for (distance, position, radius), numbers in groups.items():
         depths = np.array([pushes[number].depth_m for number in numbers])
-        pressed = law.evaluate(
-            distance / width_m, depths, position_m=position, finger_radius_m=radius
-        )
+        pressed = law.evaluate(SheetPush(distance / width_m, radius, position), depths)
         forces[numbers], edges[numbers] = pressed.force_n, pressed.edge_force_n
     return forces, edges
 

@@ -11,7 +11,6 @@ import typer
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
 from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     examples,
@@ -121,11 +120,11 @@ async def _confirm_stop(
     confirmed = shown or any(one.worked for one in attempts)
     _show_stop(arms.states, attempts, confirmed, as_json)
     for text in arms.problems:
-        words.print(text, markup=False)
+        words.print(text)
     if not shown:
         silent = [side for side, state in arms.states.items() if state.mode != "estop"]
         silent += [side for side in SIDES if side not in arms.states]
-        words.print(f"[red]not confirmed by the arms[/]: {', '.join(silent)}")
+        words.print(f"[red]not confirmed by the arms[/]: {', '.join(silent)}", markup=True)
     if any(one.outcome is StopOutcome.REFUSED for one in attempts):
         words.print(
             "the stop was not published on the topic estop, because another tool is writing it"
@@ -271,9 +270,11 @@ async def _command(
         confirmed = await arms.wait_for(done)
     _show(arms.states, as_json)
     for text in arms.problems:
-        words.print(text, markup=False)
+        words.print(text)
     if not confirmed:
-        words.print("[red]not confirmed[/]: see the reasons above and the bridges' logs")
+        words.print(
+            "[red]not confirmed[/]: see the reasons above and the bridges' logs", markup=True
+        )
     return 0 if confirmed else FAILED
 
 
@@ -287,8 +288,7 @@ def _check_may_reset(plan: ResolvedGraph, host: str, command: tuple[str, Message
         raise CommandError(
             f'host "{host}" is not allowed to reset an e-stop; reset it on '
             f"{', '.join(plan.estop_resetters)}, "
-            f"or set hosts.{host}.may_reset_estop in {plan.launch_file}",
-            BAD_INPUT,
+            f"or set hosts.{host}.may_reset_estop in {plan.launch_file}"
         )
 
 

@@ -23,7 +23,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     OTHER_THAN_LIVE,
     CommandError,
@@ -106,9 +105,7 @@ def record(
     running = running_graph(run)
     target = output or bag or Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}.mcap"
     if target.exists():
-        raise CommandError(
-            f"{target}: the file exists and is not overwritten; name a new file", BAD_INPUT
-        )
+        raise CommandError(f"{target}: the file exists and is not overwritten; name a new file")
     logs_on_stderr()
     limits = {
         "max_bag_bytes": None if max_size_mb is None else round(1e6 * max_size_mb),
@@ -129,7 +126,7 @@ def record(
     if as_json:
         print_json({"bag": str(target), "bags": [str(one) for one in bags]})
     else:
-        words.print(f"recorded {', '.join(map(str, bags))}", markup=False)
+        words.print(f"recorded {', '.join(map(str, bags))}")
 
 
 @app.command(
@@ -262,9 +259,7 @@ def export(
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED
         also = f" and {more} more" if more > 0 else ""
-        words.print(
-            f"not exported: {listed}{also} (recorded with incompatible message types)", markup=False
-        )
+        words.print(f"not exported: {listed}{also} (recorded with incompatible message types)")
     if as_json:
         print_json({**asdict(result), "output": str(output)})
         return
@@ -311,7 +306,7 @@ def verify(
         print_json({**asdict(result), "ok": result.ok})
     else:
         _print_verification(result)
-        words.print(_describe_result(result), markup=False)
+        words.print(_describe_result(result))
     if not result.repeatable:
         raise typer.Exit(FAILED)
     if not result.as_live:
@@ -347,7 +342,7 @@ def report(
         print_json(result)
         return
     for finding in result["findings"]:
-        words.print(f"{finding['gravity']}: {finding['text']}", markup=False)
+        words.print(f"{finding['gravity']}: {finding['text']}")
     print(page)
 
 
@@ -390,7 +385,7 @@ def plot(
 
 def _require_output(output: Path | None) -> Path:
     if output is None:
-        raise CommandError("the output file is missing; add --output FILE", BAD_INPUT)
+        raise CommandError("the output file is missing; add --output FILE")
     return output
 
 
@@ -491,9 +486,7 @@ async def _record(
     for name in names:
         if name not in plan.writers:
             option = "--include" if name in include else "--topic"
-            raise CommandError(
-                f"{option} {name}: the topic has no writer in the running graph", BAD_INPUT
-            )
+            raise CommandError(f"{option} {name}: the topic has no writer in the running graph")
     config = NodeConfig(
         name="bag_record",
         type="recorder",
@@ -511,7 +504,7 @@ async def _record(
         keys_file=ring_file(run, tools_host(run)) if plan.keys else None,
         run_dir=str(run.directory),
     )
-    words.print(f"recording {len(names)} topics; press Ctrl-C to stop", markup=False)
+    words.print(f"recording {len(names)} topics; press Ctrl-C to stop")
     stop = asyncio.Event()
     work = asyncio.create_task(run_node(config, stop))
     countdown = asyncio.create_task(_show_remaining(bag.name, seconds))
@@ -570,11 +563,12 @@ async def _play_into(request: PlayRequest, plan: ResolvedGraph, run: Run) -> int
 
     selection = select_topics(BagReader(request.bag).topics, plan, request.topics)
     for name, why in selection.left_out.items():
-        words.print(f"not played: {name}: {why}", markup=False)
+        words.print(f"not played: {name}: {why}")
     if not selection.topics:
         raise CommandError(
             f"{request.bag}: contains no topic that can be played into {plan.launch_file}; "
-            "list the topics to play under external_topics there"
+            "list the topics to play under external_topics there",
+            FAILED,
         )
     sent = 0
     while True:
@@ -593,5 +587,5 @@ async def _play_into(request: PlayRequest, plan: ResolvedGraph, run: Run) -> int
     if request.as_json:
         print_json({"bag": str(request.bag), "messages": sent, "topics": list(selection.topics)})
     else:
-        words.print(f"played {sent} messages on {', '.join(selection.topics)}", markup=False)
+        words.print(f"played {sent} messages on {', '.join(selection.topics)}")
     return 0

@@ -22,7 +22,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -132,7 +131,6 @@ def stereo(
     simulated (--twin).
     """
     from flexsheet.launch.calibration.capture import Capture
-    from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.launch.calibration.stereo import calibrate_stereo
     from flexsheet.launch.commands import capture
     from flexsheet.launch.plans.plan import load_scene
@@ -144,50 +142,47 @@ def stereo(
     described = _parse_board(board, square_mm, marker_mm, dictionary)
     scene: Scene | None = None
     command = ["flexsheet", "calibrate", "stereo"]
-    try:
-        if left and right:
-            left_paths, right_paths = _find_images("--left", left), _find_images("--right", right)
-            command += ["--left", left, "--right", right]
-            scene = None if scene_file is None else load_scene(scene_file)
+    if left and right:
+        left_paths, right_paths = _find_images("--left", left), _find_images("--right", right)
+        command += ["--left", left, "--right", right]
+        scene = None if scene_file is None else load_scene(scene_file)
+    else:
+        camera_scene = twin or scene_file
+        if camera_scene is None:
+            raise CommandError("--device-source requires --scene FILE; add it")
+        scene = load_scene(camera_scene)
+        pose_capture = Capture(
+            described,
+            lens=scene.camera.left,
+            size=(scene.camera.width_px, scene.camera.height_px),
+            pairs=pairs,
+            still_images=1 if device_source is None else 4,
+        )
+        if device_source is None:
+            true = load_true_devices(apparatus, scene)
+            views = capture.simulate_views(scene, described, true, pairs=pairs, seed=seed)
+            command += ["--twin", str(camera_scene), "--pairs", str(pairs), "--seed", str(seed)]
+            command += [] if apparatus is None else ["--apparatus", apparatus]
         else:
-            camera_scene = twin or scene_file
-            if camera_scene is None:
-                raise CommandError("--device-source requires --scene FILE; add it", BAD_INPUT)
-            scene = load_scene(camera_scene)
-            pose_capture = Capture(
-                described,
-                lens=scene.camera.left,
-                size=(scene.camera.width_px, scene.camera.height_px),
-                pairs=pairs,
-                still_images=1 if device_source is None else 4,
-            )
-            if device_source is None:
-                true = load_true_devices(apparatus, scene)
-                views = capture.simulate_views(scene, described, true, pairs=pairs, seed=seed)
-                command += ["--twin", str(camera_scene), "--pairs", str(pairs), "--seed", str(seed)]
-                command += [] if apparatus is None else ["--apparatus", apparatus]
-            else:
-                views = capture.read_device_views(device_source, scene)
-                command += ["--device-source", device_source, "--scene", str(camera_scene)]
-            folder = pictures or Path(f"runs/calibration-{datetime.now():%Y%m%d-%H%M%S}")
-            capture.write_pairs(views, pose_capture, folder)
-            left_paths = sorted(folder.glob("left*.png"))
-            right_paths = sorted(folder.glob("right*.png"))
-        command += ["--board", board, "--square-mm", f"{square_mm:g}"]
-        if marker_mm is not None:
-            command += ["--marker-mm", f"{marker_mm:g}", "--dictionary", dictionary]
-        command += ["-o", str(output)]
-        with _progress("detecting the board") as progress:
-            calibrated = calibrate_stereo(
-                left_paths,
-                right_paths,
-                board=described,
-                device=device or ("stereo" if scene is None else scene.camera.device),
-                working_distance_m=_working_distance_m(distance_mm, scene),
-                progress=progress,
-            )
-    except CalibrationError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+            views = capture.read_device_views(device_source, scene)
+            command += ["--device-source", device_source, "--scene", str(camera_scene)]
+        folder = pictures or Path(f"runs/calibration-{datetime.now():%Y%m%d-%H%M%S}")
+        capture.write_pairs(views, pose_capture, folder)
+        left_paths = sorted(folder.glob("left*.png"))
+        right_paths = sorted(folder.glob("right*.png"))
+    command += ["--board", board, "--square-mm", f"{square_mm:g}"]
+    if marker_mm is not None:
+        command += ["--marker-mm", f"{marker_mm:g}", "--dictionary", dictionary]
+    command += ["-o", str(output)]
+    with _progress("detecting the board") as progress:
+        calibrated = calibrate_stereo(
+            left_paths,
+            right_paths,
+            board=described,
+            device=device or ("stereo" if scene is None else scene.camera.device),
+            working_distance_m=_working_distance_m(distance_mm, scene),
+            progress=progress,
+        )
     save_calibration(calibrated.calibration, output, comment=shlex.join(command))
     page: Path | None = None
     if report is not None:
@@ -241,7 +236,7 @@ def _print_result(
     )
     for pair in calibration.pairs:
         if not pair.used:
-            words.print(f"excluded: {pair.left}: {pair.reason}", markup=False)
+            words.print(f"excluded: {pair.left}: {pair.reason}")
 
 
 @app.command(
@@ -263,27 +258,21 @@ def check(
 ) -> None:
     """Check a calibration: measure a board of known size in images not used to calibrate."""
     from flexsheet.launch.calibration.check import check_stereo
-    from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.messages.calibration import load_calibration
-    from flexsheet.messages.calibration_file import CalibrationFileError
 
-    try:
-        with _progress("measuring the board") as progress:
-            result = check_stereo(
-                load_calibration(calibration),
-                _find_images("--left", left),
-                _find_images("--right", right),
-                board=_parse_board(board, square_mm, marker_mm, dictionary),
-                progress=progress,
-            )
-    except (CalibrationError, CalibrationFileError) as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+    with _progress("measuring the board") as progress:
+        result = check_stereo(
+            load_calibration(calibration),
+            _find_images("--left", left),
+            _find_images("--right", right),
+            board=_parse_board(board, square_mm, marker_mm, dictionary),
+            progress=progress,
+        )
     reused = result["used_to_calibrate"]
     if isinstance(reused, list) and reused:
         words.print(
             f"{', '.join(reused)}: these images were used to calibrate, so the errors are "
-            "underestimated; use other images",
-            markup=False,
+            "underestimated; use other images"
         )
     if as_json:
         print_json(result)
@@ -316,19 +305,15 @@ def cross_check(
     Prints the errors next to those of a calibration by OpenCV's functions alone.
     """
     from flexsheet.launch.calibration import check
-    from flexsheet.launch.calibration.corners import CalibrationError
 
-    try:
-        with _progress("cross-validating") as progress:
-            result = check.cross_check(
-                _find_images("--left", left),
-                _find_images("--right", right),
-                board=_parse_board(board, square_mm, marker_mm, dictionary),
-                leave_out=leave_out,
-                progress=progress,
-            )
-    except CalibrationError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+    with _progress("cross-validating") as progress:
+        result = check.cross_check(
+            _find_images("--left", left),
+            _find_images("--right", right),
+            board=_parse_board(board, square_mm, marker_mm, dictionary),
+            leave_out=leave_out,
+            progress=progress,
+        )
     if as_json:
         print_json(result)
         return
@@ -367,15 +352,11 @@ def print_board(
 
     It is a chessboard; with --marker-mm, it is a ChArUco board.
     """
-    from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.launch.calibration.printing import make_caption, write_board
 
     check_folder("-o", output)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
-    try:
-        write_board(described, output)
-    except CalibrationError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+    write_board(described, output)
     if as_json:
         print_json({"file": str(output), "board": described.model_dump(mode="json")})
     else:
@@ -395,8 +376,7 @@ def _check_single_source(
     if sum(chosen) != 1 or (files and not (left and right)):
         raise CommandError(
             "give exactly one source of images: --left with --right, --device-source with --scene, "
-            "or --twin",
-            BAD_INPUT,
+            "or --twin"
         )
 
 
@@ -404,8 +384,7 @@ def _find_images(option: str, pattern: str) -> list[Path]:
     paths = [Path(name) for name in sorted(glob.glob(pattern))]
     if not paths:
         raise CommandError(
-            f"{option} {pattern}: no file matches; check the path, and put the pattern in quotes",
-            BAD_INPUT,
+            f"{option} {pattern}: no file matches; check the path, and put the pattern in quotes"
         )
     return paths
 
@@ -416,8 +395,7 @@ def _parse_board(text: str, square_mm: float, marker_mm: float | None, dictionar
     columns, _, rows = text.lower().partition("x")
     if not (columns.isdigit() and rows.isdigit() and min(int(columns), int(rows)) >= 3):
         raise CommandError(
-            f"--board {text}: expected COLUMNSxROWS of inner corners, at least 3x3, such as 9x6",
-            BAD_INPUT,
+            f"--board {text}: expected COLUMNSxROWS of inner corners, at least 3x3, such as 9x6"
         )
     charuco = marker_mm is not None
     return Board(
@@ -459,26 +437,22 @@ def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
 def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
     """Load a stereo calibration and check that it fits the scene's camera; None without a path."""
     from flexsheet.messages.calibration import load_calibration, refuse_other_camera
-    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+    from flexsheet.messages.calibration_file import CalibrationMismatchError
 
     if path is None:
         return None
     try:
         calibration = load_calibration(path)
         refuse_other_camera(calibration, scene.camera)
-    except CalibrationFileError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
     except CalibrationMismatchError as error:
-        raise CommandError(f"{path}: {error}", BAD_INPUT) from error
+        raise CommandError(f"{path}: {error}") from error
     return calibration
 
 
 def require_twin(apparatus: str | None, *, simulated: bool) -> None:
     """Raise CommandError if --apparatus is given without --twin."""
     if apparatus is not None and not simulated:
-        raise CommandError(
-            f"--apparatus {apparatus}: the option is for --twin only; remove it", BAD_INPUT
-        )
+        raise CommandError(f"--apparatus {apparatus}: the option is for --twin only; remove it")
 
 
 def load_true_devices(text: str | None, scene: Scene) -> Apparatus | None:

@@ -38,7 +38,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -141,7 +140,7 @@ def arms(
 
     check_folder("-o", output)
     if twin == (left_arm is not None or right_arm is not None):
-        raise CommandError("give either --twin, or --left-arm, --right-arm or both", BAD_INPUT)
+        raise CommandError("give either --twin, or --left-arm, --right-arm or both")
     require_twin(apparatus, simulated=twin)
     if copy is not None:
         _check_new_file(copy, "--write-scene")
@@ -188,18 +187,14 @@ def write_scene(
     """Write a copy of a scene file with the base poses of an arm calibration."""
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.arms_calibration import load_arms_calibration
-    from flexsheet.messages.calibration_file import CalibrationFileError
 
     _check_new_file(output, "-o")
     load_scene(scene_file)
-    try:
-        _write_copy(scene_file, load_arms_calibration(calibration), output)
-    except CalibrationFileError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+    _write_copy(scene_file, load_arms_calibration(calibration), output)
     if as_json:
         print_json({"scene": str(output)})
     else:
-        words.print(f"scene: {output}", markup=False)
+        words.print(f"scene: {output}")
 
 
 def capture(
@@ -237,14 +232,14 @@ def capture(
     from flexsheet.launch.plans.plan import load_scene
 
     if side not in SIDES:
-        raise CommandError(f"--arm {side}: expected left or right", BAD_INPUT)
+        raise CommandError(f"--arm {side}: expected left or right")
     scene = load_scene(scene_file)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
     try:
         output.mkdir(parents=True)
     except OSError as error:
         raise CommandError(
-            f"-o {output}: cannot be created: {error.strerror}; name a new folder", BAD_INPUT
+            f"-o {output}: cannot be created: {error.strerror}; name a new folder"
         ) from error
     recorder = PoseRecorder(
         output, described, make_lens_rig(scene, load_optics(calibration, scene))
@@ -260,7 +255,7 @@ def capture(
     if as_json:
         print_json({"folder": str(output), "poses": recorder.count})
     else:
-        words.print(f"{recorder.count} poses in {output}", markup=False)
+        words.print(f"{recorder.count} poses in {output}")
 
 
 async def record_poses(
@@ -308,7 +303,7 @@ async def record_poses(
                     recorder.update_images, pair.left, pair.right, time_s
                 )
             if hint != printed:
-                words.print(hint, markup=False)
+                words.print(hint)
             printed = hint
     finally:
         for subscriber in subscribers:
@@ -318,7 +313,7 @@ async def record_poses(
 
 def _check_new_file(path: Path, option: str) -> None:
     if path.exists():
-        raise CommandError(f"{option} {path}: the file exists; name a new file", BAD_INPUT)
+        raise CommandError(f"{option} {path}: the file exists; name a new file")
     check_folder(option, path)
 
 
@@ -334,26 +329,21 @@ def simulate_folder(
 ) -> Path:
     """Write the simulated poses of one arm to a new folder, and return its path."""
     from flexsheet.launch.calibration.arm_poses import simulate_poses
-    from flexsheet.nodes.twin.board import BoardError
 
     poses = folder / side
     poses.mkdir()
-    try:
-        with _progress(f"simulating the {side} arm") as progress:
-            for done in simulate_poses(
-                scene, board, side, poses, places=places, seed=seed, apparatus=apparatus
-            ):
-                progress(done, places, f"simulating the {side} arm")
-    except BoardError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+    with _progress(f"simulating the {side} arm") as progress:
+        for done in simulate_poses(
+            scene, board, side, poses, places=places, seed=seed, apparatus=apparatus
+        ):
+            progress(done, places, f"simulating the {side} arm")
     return poses
 
 
 def fit_folder(
     folder: Path, board: Board, scene: Scene, optics: StereoCalibration | None, side: Side
 ) -> tuple[BaseFit, list[tuple[str, str]]]:
-    from flexsheet.launch.calibration.arm_poses import ArmPosesError, make_lens_rig, read_detections
-    from flexsheet.launch.calibration.corners import CalibrationError
+    from flexsheet.launch.calibration.arm_poses import make_lens_rig, read_detections
     from flexsheet.launch.calibration.hand_eye import HandEyeError, calibrate_base
 
     rig = make_lens_rig(scene, optics)
@@ -364,10 +354,8 @@ def fit_folder(
             detections, blind = read_detections(folder, board, rig, size, progress)
         with words.status(f"{side} arm: fitting"):
             return calibrate_base(detections, rig), blind
-    except (ArmPosesError, CalibrationError) as error:
-        raise CommandError(str(error), BAD_INPUT) from error
     except HandEyeError as error:
-        raise CommandError(f"{side} arm, {folder}: {error}", BAD_INPUT) from error
+        raise CommandError(f"{side} arm, {folder}: {error}") from error
 
 
 def make_calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> ArmsCalibration:
@@ -478,7 +466,7 @@ def _print_result(
         lines += [f"  {side}:", f"    world_from_base: {_format_pose(base)}"]
         outliers = [(one.name, one.reason) for one in base.poses if not one.used]
         for name, reason in [*blind[side], *outliers]:
-            words.print(f"{side} arm, excluded {name}: {reason}", markup=False)
+            words.print(f"{side} arm, excluded {name}: {reason}")
         moved_m, turned_rad = _compute_shift(base, scene, side)
         result["arms"][side] = {
             "world_from_base": base.world_from_base.model_dump(mode="json"),
@@ -556,12 +544,10 @@ def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, floa
     """Return distance (m) and angle (rad) from the base pose in the scene to the measured one."""
     import numpy as np
 
-    from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation
+    from flexsheet.nodes.models.rigid import pose_matrix, vector_from_rotation
 
     nominal = getattr(scene.arms, side).world_from_base
-    before, now = (
-        transform_from_rpy(one.position_m, one.rpy_rad) for one in (nominal, base.world_from_base)
-    )
+    before, now = (pose_matrix(one) for one in (nominal, base.world_from_base))
     return (
         float(np.linalg.norm(now[:3, 3] - before[:3, 3])),
         float(np.linalg.norm(vector_from_rotation(now[:3, :3] @ before[:3, :3].T))),

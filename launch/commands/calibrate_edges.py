@@ -26,7 +26,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -85,7 +84,7 @@ def edges(
 
     check_folder("-o", output)
     if twin == (rows is not None):
-        raise CommandError("give exactly one of --rows CSV and --twin", BAD_INPUT)
+        raise CommandError("give exactly one of --rows CSV and --twin")
     require_twin(apparatus, simulated=twin)
     scene = load_scene(scene_file)
     if rows is not None:
@@ -97,7 +96,7 @@ def edges(
     try:
         fits = fit_edges(poses, scene)
     except EdgeFitError as error:
-        raise CommandError(f"{rows or scene_file}: {error}; {error.remedy}", BAD_INPUT) from error
+        raise CommandError(f"{rows or scene_file}: {error}; {error.remedy}") from error
     _write_scene(scene_file, fits, output)
     _print_result(fits, output, as_json=as_json)
 
@@ -173,7 +172,7 @@ def edges_capture(
         recorder = EdgeMarkRecorder(output, scene, load_optics(calibration, scene))
     except OSError as error:
         raise CommandError(
-            f"-o {output}: cannot be created: {error.strerror}; name a new file", BAD_INPUT
+            f"-o {output}: cannot be created: {error.strerror}; name a new file"
         ) from error
     size = (scene.camera.width_px, scene.camera.height_px)
 
@@ -186,4 +185,4 @@ def edges_capture(
     if as_json:
         print_json({"rows": str(output), "poses": recorder.count})
     else:
-        words.print(f"{recorder.count} poses in {output}", markup=False)
+        words.print(f"{recorder.count} poses in {output}")

@@ -20,7 +20,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -83,12 +82,10 @@ def marker(
 
     check_folder("-o", output)
     if (rows is None) == (twin is None):
-        raise CommandError("give exactly one of --rows CSV and --twin SCENE", BAD_INPUT)
+        raise CommandError("give exactly one of --rows CSV and --twin SCENE")
     for name, value in (("--apparatus", apparatus), ("--calibration", calibration_file)):
         if value is not None and twin is None:
-            raise CommandError(
-                f"{name} {value}: the option is for --twin SCENE only; remove it", BAD_INPUT
-            )
+            raise CommandError(f"{name} {value}: the option is for --twin SCENE only; remove it")
     command = ["flexsheet", "calibrate", "marker"]
     if rows is not None:
         scene = load_scene(scene_file)
@@ -118,7 +115,7 @@ def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerC
     try:
         fit = fit_marker(touches)
     except MarkerFitError as error:
-        raise CommandError(f"{source}: {error}; {error.remedy}", BAD_INPUT) from error
+        raise CommandError(f"{source}: {error}; {error.remedy}") from error
     return MarkerCalibration(
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         code_version=version("flexsheet"),

@@ -23,7 +23,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -119,7 +118,6 @@ def projector(
     """
     from flexsheet.launch.calibration import gray_code
     from flexsheet.launch.calibration.projector import (
-        ProjectorError,
         calibrate_projector,
         measure_points,
     )
@@ -136,36 +134,32 @@ def projector(
     if (pictures is not None) + (corners is not None) + twin != 1:
         raise CommandError(
             "give exactly one of --pictures, --corners and --twin; to capture images, first write "
-            "the patterns with --write-patterns FOLDER",
-            BAD_INPUT,
+            "the patterns with --write-patterns FOLDER"
         )
     require_twin(apparatus, simulated=twin)
     if output is not None:
         check_folder("-o", output)
     true: Projector | None = None
-    try:
-        if corners is not None:
-            fit = _fit_corners(scene, corners, rectangle_mm)
-        else:
-            if twin:
-                from flexsheet.nodes.twin.projector import make_true_projector
-                from flexsheet.nodes.twin.truth import apply_apparatus
+    if corners is not None:
+        fit = _fit_corners(scene, corners, rectangle_mm)
+    else:
+        if twin:
+            from flexsheet.nodes.twin.projector import make_true_projector
+            from flexsheet.nodes.twin.truth import apply_apparatus
 
-                devices = load_true_devices(apparatus, scene)
-                if devices is None:
-                    true = make_true_projector(require_projector(scene), seed=seed)
-                else:
-                    true = require_projector(apply_apparatus(scene, devices))
-                views = list(simulate_views(scene, true, devices, poses, seed))
+            devices = load_true_devices(apparatus, scene)
+            if devices is None:
+                true = make_true_projector(require_projector(scene), seed=seed)
             else:
-                assert pictures is not None
-                views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
-            camera = load_camera(scene, calibration)
-            fit = calibrate_projector(
-                measure_points(views, camera, require_projector(scene)), require_projector(scene)
-            )
-    except ProjectorError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+                true = require_projector(apply_apparatus(scene, devices))
+            views = list(simulate_views(scene, true, devices, poses, seed))
+        else:
+            assert pictures is not None
+            views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
+        camera = load_camera(scene, calibration)
+        fit = calibrate_projector(
+            measure_points(views, camera, require_projector(scene)), require_projector(scene)
+        )
     if output is not None:
         write_scene(scene_file, fit.projector, output)
     _print_result(scene, fit, true, output, as_json=as_json)
@@ -179,19 +173,17 @@ def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
         write_file(folder / f"pattern{number:02}.png", encode_png(pattern))
     words.print(
         f"{len(patterns)} patterns written to {folder}; project each without scaling, and capture "
-        "it with both cameras",
-        markup=False,
+        "it with both cameras"
     )
 
 
 def read_views(folder: Path, count: int) -> Iterator[Views]:
-    from flexsheet.launch.calibration.corners import CalibrationError, read_gray
+    from flexsheet.launch.calibration.corners import read_gray
 
     poses = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not poses:
         raise CommandError(
-            f"--pictures {folder}: the folder contains no subfolders; make one for each sheet pose",
-            BAD_INPUT,
+            f"--pictures {folder}: the folder contains no subfolders; make one for each sheet pose"
         )
     for pose in poses:
         sides = []
@@ -200,13 +192,9 @@ def read_views(folder: Path, count: int) -> Iterator[Views]:
             if len(paths) != count:
                 raise CommandError(
                     f"--pictures {pose}: expected {count} files {side}*.png, one per pattern, "
-                    f"found {len(paths)}",
-                    BAD_INPUT,
+                    f"found {len(paths)}"
                 )
-            try:
-                sides.append([read_gray(path) for path in paths])
-            except CalibrationError as error:
-                raise CommandError(str(error), BAD_INPUT) from error
+            sides.append([read_gray(path) for path in paths])
         yield sides[0], sides[1]
 
 
@@ -267,8 +255,7 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
     except ValueError as error:
         raise CommandError(
             f"--corners '{corners}' --rectangle-mm {rectangle_mm}: {error}; for example "
-            "--corners '599,499 199,499 199,99 599,99' --rectangle-mm 200x200",
-            BAD_INPUT,
+            "--corners '599,499 199,499 199,99 599,99' --rectangle-mm 200x200"
         ) from error
     return fit_keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, require_projector(scene))
 
@@ -286,7 +273,6 @@ def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
 
 
 def _make_flow_list(values: Iterable[float]) -> Any:
-    """Return a YAML list of rounded values that is written on one line."""
     from ruamel.yaml.comments import CommentedSeq
 
     row = CommentedSeq([round_digits(value) for value in values])

@@ -19,7 +19,6 @@ from flexsheet.launch.commands.options import (
     output_file,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -113,7 +112,7 @@ def sheet(
 
     check_folder("-o", output)
     if sum(one is not None for one in (rows, bag, twin)) != 1:
-        raise CommandError("give exactly one of --rows CSV, --bag BAG and --twin SCENE", BAD_INPUT)
+        raise CommandError("give exactly one of --rows CSV, --bag BAG and --twin SCENE")
     require_twin(apparatus, simulated=twin is not None)
     command = ["flexsheet", "calibrate", "sheet"]
     if rows is not None:
@@ -149,7 +148,7 @@ def sheet(
             with_prior=bag is not None,
         )
     except SheetModelFitError as error:
-        raise CommandError(f"{source}: {error}", BAD_INPUT) from error
+        raise CommandError(f"{source}: {error}") from error
     save_sheet_calibration(calibration, output, comment=shlex.join([*command, "-o", str(output)]))
     _print_result(calibration, output, as_json)
 
@@ -253,7 +252,7 @@ def _read_bag(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
     try:
         return read_pushes(bag)
     except SheetModelFitError as error:
-        raise CommandError(f"{bag}: {error}", BAD_INPUT) from error
+        raise CommandError(f"{bag}: {error}") from error
 
 
 def simulate_pushes(
@@ -326,7 +325,4 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
         ]
     )
     for one in calibration.left_out:
-        words.print(
-            f"line {one.line} excluded: its residual is {100 * one.residual_ratio:+.0f} %",
-            markup=False,
-        )
+        words.print(f"line {one.line} excluded: its residual is {100 * one.residual_ratio:+.0f} %")

@@ -8,7 +8,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexsheet.launch.commands.output import BAD_INPUT, CommandError, words
+from flexsheet.launch.commands.output import FAILED, CommandError, words
 from flexsheet.messages.files import write_file
 from flexsheet.nodes.camera.image_pair import encode_png
 
@@ -49,13 +49,11 @@ def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
             problem = "; ".join(f"{where}: {what}" for where, what in mistakes)
         raise CommandError(
             f"--device-source {source}: {problem}; use the format of a camera node's parameter "
-            "source, such as '{kind: opencv, left: 0, right: 1}'",
-            BAD_INPUT,
+            "source, such as '{kind: opencv, left: 0, right: 1}'"
         ) from error
     if described.kind == "twin":
         raise CommandError(
-            "--device-source twin: the simulator of a graph shows no board; use --twin SCENE",
-            BAD_INPUT,
+            "--device-source twin: the simulator of a graph shows no board; use --twin SCENE"
         )
     return _read_views(described, source, scene)
 
@@ -67,12 +65,12 @@ def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Vie
     try:
         with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
             for warning in reader.warnings:
-                words.print(f"camera: {warning}", markup=False)
+                words.print(f"camera: {warning}")
             while (images := reader.read()) is not None:
                 check_size(images, scene.camera, source)
                 yield images.left, images.right
     except DeviceError as error:
-        raise CommandError(str(error)) from error
+        raise CommandError(str(error), FAILED) from error
 
 
 def simulate_views(
@@ -82,17 +80,14 @@ def simulate_views(
 
     Raises CommandError for a board that cannot be rendered.
     """
-    from flexsheet.nodes.twin.board import BoardError, TwinBoard
+    from flexsheet.nodes.twin.board import TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera
     from flexsheet.nodes.twin.truth import apply_apparatus
 
-    try:
-        camera = make_true_camera(apply_apparatus(scene, apparatus).camera)
-        shown = TwinBoard(camera, board, seed=seed)
-        for left_from_board in shown.poses(POSES_PER_PAIR * pairs):
-            yield shown.pair(left_from_board)
-    except BoardError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+    camera = make_true_camera(apply_apparatus(scene, apparatus).camera)
+    shown = TwinBoard(camera, board, seed=seed)
+    for left_from_board in shown.poses(POSES_PER_PAIR * pairs):
+        yield shown.pair(left_from_board)
 
 
 def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
@@ -102,7 +97,7 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
     the missing cases. Returns the number of pairs, which is at least one.
     """
     if folder.exists():
-        raise CommandError(f"--pictures {folder}: the folder exists; name a new folder", BAD_INPUT)
+        raise CommandError(f"--pictures {folder}: the folder exists; name a new folder")
     accepted = 0
     try:
         with _show_coverage(capture) as show:
@@ -121,13 +116,14 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
     missing = capture.missing()
     if missing:
         listed = ", ".join(f"{one.group} {one.name}".strip() for one in missing)
-        words.print(f"not covered: {listed}", markup=False)
+        words.print(f"not covered: {listed}")
     if not accepted:
         raise CommandError(
             "no image pair was accepted, because the board was never at rest and fully visible in "
-            "both images; hold it still in view of both cameras"
+            "both images; hold it still in view of both cameras",
+            FAILED,
         )
-    words.print(f"{accepted} pairs in {folder}", markup=False)
+    words.print(f"{accepted} pairs in {folder}")
     return accepted
 
 
@@ -142,7 +138,7 @@ def _show_coverage(capture: Capture) -> Iterator[Any]:
         def print_accepted(hint: str, accepted: bool) -> None:
             if accepted:
                 missing = len(capture.missing())
-                words.print(f"pair accepted; {missing} coverage bins incomplete", markup=False)
+                words.print(f"pair accepted; {missing} coverage bins incomplete")
 
         yield print_accepted
         return

@@ -12,7 +12,6 @@ import typer
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.options import CYLINDER, JsonOption, make_app, output_file
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     examples,
     logs_on_stderr,
@@ -138,8 +137,7 @@ def chart(
         results = charts.read_charts(output)
         if not results:
             raise CommandError(
-                f"--output {output}: the folder contains no results to draw; measure first",
-                BAD_INPUT,
+                f"--output {output}: the folder contains no results to draw; measure first"
             )
         for result in results:
             charts.write_chart(result, output)
@@ -148,12 +146,9 @@ def chart(
             print_json(results)
         return
     if len(chosen) > 1:
-        raise CommandError("--scene: only `chart system` accepts several scenes", BAD_INPUT)
+        raise CommandError("--scene: only `chart system` accepts several scenes")
     scene = load_scene(chosen[0] if chosen else find_file(CYLINDER, SCENES))
-    try:
-        families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]
-    except charts.UnknownFamilyError as error:
-        raise CommandError(str(error), BAD_INPUT) from None
+    families = [charts.find_family(name) for name in ([family] if family else charts.FAMILIES)]
     if busy := describe_load():
         words.print(busy, style="yellow")
     results = []

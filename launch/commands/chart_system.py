@@ -51,7 +51,7 @@ def measure_system(
         return
     _print_points(result)
     for one in result["failed"]:
-        words.print(f"{one['scene']}: {one['trial']} failed: {one['error']}", markup=False)
+        words.print(f"{one['scene']}: {one['trial']} failed: {one['error']}")
     words.print(f"chart: {image}")
 
 

@@ -11,7 +11,6 @@ import typer
 
 from flexsheet.launch.commands.options import JsonOption, SceneArgument, output_file
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     check_folder,
@@ -108,9 +107,9 @@ def check_scene(
             draw_layout(layout, output)
         except (OSError, ValueError) as error:
             raise CommandError(
-                f"--output {output}: cannot be written: {error}; use .png or .svg", BAD_INPUT
+                f"--output {output}: cannot be written: {error}; use .png or .svg"
             ) from error
-        words.print(f"image: {output}", markup=False)
+        words.print(f"image: {output}")
     if as_json:
         print_json(result)
     else:
@@ -170,7 +169,7 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
         ],
     )
     for path in result["blocked_paths"]:
-        words.print(f"no path {path}", markup=False)
+        words.print(f"no path {path}")
     for remedy in result["remedies"]:
         print(f"remedy: {remedy['what']}")
     if not result["reachable"] and not result["remedies"]:

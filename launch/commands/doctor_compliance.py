@@ -9,9 +9,7 @@ import typer
 
 from flexsheet.launch.commands.options import JsonOption, SceneArgument
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
-    CommandError,
     examples,
     print_fields,
     print_json,
@@ -56,21 +54,16 @@ def compliance(
     """
     from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
-    from flexsheet.messages.scene import UnfitGeometryError
     from flexsheet.messages.sheet_calibration import load_sheet_calibration
     from flexsheet.nodes.planner.compliance import ObjectCurve
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
     scene = load_scene(scene_file)
-    try:
-        law = make_force_model(
-            scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
-        )
-        with words.status("computing the soft body's force curve"):
-            curve = ObjectCurve.from_rows(compute_front_curve(scene))
-    except (CalibrationFileError, CalibrationMismatchError, UnfitGeometryError) as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+    law = make_force_model(
+        scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
+    )
+    with words.status("computing the soft body's force curve"):
+        curve = ObjectCurve.from_rows(compute_front_curve(scene))
     result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms)
     if as_json:
         print_json(result)

@@ -13,7 +13,6 @@ from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import running_graph
 from flexsheet.launch.commands.options import JsonOption, find_launch_file
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     examples,
@@ -81,7 +80,7 @@ def hosts(
     if as_json:
         print_json({"plan": plan.hash, "here": here, "findings": [asdict(one) for one in findings]})
     else:
-        words.print(f"{plan.launch_file}, plan {plan.hash}, checked from {here}", markup=False)
+        words.print(f"{plan.launch_file}, plan {plan.hash}, checked from {here}")
         print_findings(findings)
     if any(one.state == "failed" for one in findings):
         raise typer.Exit(FAILED)
@@ -130,8 +129,7 @@ def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> st
     if requested is not None:
         if requested not in plan.hosts:
             raise CommandError(
-                f"--host {requested}: unknown host; {did_you_mean(requested, list(plan.hosts))}",
-                BAD_INPUT,
+                f"--host {requested}: unknown host; {did_you_mean(requested, list(plan.hosts))}"
             )
         return requested
     if run is not None:
@@ -142,8 +140,7 @@ def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> st
         return MAIN if MAIN in found else found[0]
     raise CommandError(
         f"no address of this computer matches exactly one host in {plan.launch_file} "
-        f"({', '.join(plan.hosts.values())}); name the host with --host NAME",
-        BAD_INPUT,
+        f"({', '.join(plan.hosts.values())}); name the host with --host NAME"
     )
 
 

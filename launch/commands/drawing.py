@@ -20,7 +20,6 @@ from flexsheet.launch.commands.options import (
     with_scene,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     check_folder,
     examples,
@@ -72,12 +71,9 @@ def graph(
     if output is not None:
         check_folder("--output", output)
         if output.suffix not in (".svg", ".mmd"):
-            raise CommandError(
-                f"--output {output}: unknown file type; name a .svg or .mmd file",
-                BAD_INPUT,
-            )
+            raise CommandError(f"--output {output}: unknown file type; name a .svg or .mmd file")
         write_file(output, mermaid(plan) if output.suffix == ".mmd" else svg(lay_out(plan)))
-        words.print(f"drawn: {output}", markup=False)
+        words.print(f"drawn: {output}")
     if as_json:
         links = [
             {"from": writer, "to": reader, "topics": topics}

@@ -23,7 +23,6 @@ from flexsheet.launch.commands.options import (
     with_scene,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     examples,
     print_json,
@@ -34,11 +33,10 @@ from flexsheet.launch.commands.output import (
 from flexsheet.launch.plans.features import Feature
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from flexsheet.launch.experiments.hand_gestures import FeltForce
     from flexsheet.launch.experiments.image import Series
-    from flexsheet.launch.experiments.run import Procedure, Progress
 
 app = make_app("Run the experiments of Furukawa et al. 2007, and further ones, on a graph.")
 
@@ -75,32 +73,6 @@ def make_result_folder(output: Path | None, name: str) -> Path:
         return new_folder(name)
     output.mkdir(parents=True, exist_ok=True)
     return output
-
-
-def _record(
-    launch_file: Path,
-    settings: list[str],
-    bag: Path,
-    procedure: Procedure,
-    progress: Progress,
-    *,
-    apparatus: str | None,
-    needed: Sequence[str] = (),
-    without: Sequence[Feature] = (),
-) -> None:
-    from flexsheet.launch.experiments.run import run_experiment
-
-    run_experiment(
-        launch_file,
-        settings,
-        bag,
-        procedure,
-        progress,
-        apparatus=apparatus,
-        needed=needed,
-        without=without,
-    )
-    progress("reading the bag")
 
 
 @app.command(
@@ -157,9 +129,7 @@ def stroke(
     """
     given = with_scene(settings, scene)
     if radii and scene is not None:
-        raise CommandError(
-            "--radii measures the shipped cylinder scenes only; remove --scene", BAD_INPUT
-        )
+        raise CommandError("--radii measures the shipped cylinder scenes only; remove --scene")
     if repeats > 1 or ablations or radii:
         from flexsheet.launch.experiments import stroke_table
 
@@ -184,19 +154,14 @@ def stroke(
             _print_stroke_table(table)
         return
     from flexsheet.launch.experiments import stroke as experiment
-    from flexsheet.launch.experiments.run import make_stroke_procedure
+    from flexsheet.launch.experiments.run import make_stroke_procedure, run_experiment
 
     bag = make_result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
         procedure = make_stroke_procedure([seconds], progress)
-        _record(
-            launch_file,
-            given,
-            bag,
-            procedure,
-            progress,
-            apparatus=apparatus,
-            without=without or (),
+        omitted = without or ()
+        run_experiment(
+            launch_file, given, bag, procedure, progress, apparatus=apparatus, without=omitted
         )
         recording = experiment.read_recording(bag)
         errors = experiment.stroke_errors(recording, seconds)
@@ -280,12 +245,9 @@ def push(
         *make_settings(launch_file, "planner", "compliance_mode=stiffness"),
         *with_scene(settings, scene),
     ]
-    bag, series = (
-        make_result_folder(output, "push") / "push.mcap",
-        make_push_series(at_mm, tilt_deg),
-    )
+    bag = make_result_folder(output, "push") / "push.mcap"
     _measure_images(
-        series,
+        make_push_series(at_mm, tilt_deg),
         bag,
         launch_file,
         settings,
@@ -309,13 +271,14 @@ def compliance(
     """Compare the force on the finger with that of the virtual object at several push depths."""
     from flexsheet.launch.experiments import compliance as experiment
     from flexsheet.launch.experiments.pictures import draw_compliance
+    from flexsheet.launch.experiments.run import run_experiment
 
     folder = make_result_folder(output, "compliance")
     bag, image = folder / "compliance.mcap", folder / "compliance.png"
     with progress_words() as progress:
         procedure = experiment.make_compliance_procedure(progress)
         given = with_scene(settings, scene)
-        _record(launch_file, given, bag, procedure, progress, apparatus=apparatus)
+        run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.compliance_result(bag, progress)
         draw_compliance(result, image)
     if as_json:
@@ -371,7 +334,7 @@ def _measure_images(
 ) -> None:
     from flexsheet.launch.experiments import image
     from flexsheet.launch.experiments.maps import draw_error_maps
-    from flexsheet.launch.experiments.run import make_image_procedure
+    from flexsheet.launch.experiments.run import make_image_procedure, run_experiment
 
     mapped = map_file is not None
     with progress_words() as progress:
@@ -383,27 +346,14 @@ def _measure_images(
             with_maps=mapped,
             with_eyes=both_eyes,
         )
-        _record(
-            launch_file,
-            settings,
-            bag,
-            procedure,
-            progress,
-            apparatus=apparatus,
-            needed=["twin/eye"],
+        needed = ["twin/eye"]
+        run_experiment(
+            launch_file, settings, bag, procedure, progress, apparatus=apparatus, needed=needed
         )
         pictures = image.read_images(bag)
         rows = image.make_rows(pictures, series, with_maps=mapped, with_eyes=both_eyes)
         if map_file is not None:
             draw_error_maps(pictures, series, map_file)
-    _print_rows(rows, bag, map_file, as_json=as_json)
-
-
-def _print_rows(
-    rows: list[dict[str, Any]], bag: Path, map_file: Path | None, *, as_json: bool
-) -> None:
-    from flexsheet.launch.experiments import image
-
     if as_json:
         maps = {} if map_file is None else {"map": str(map_file)}
         by_method = image.summarize_methods(rows)
@@ -441,13 +391,15 @@ def gestures(
 ) -> None:
     """Measure the accuracy of fingertip tracking in strokes, taps, reaches, stops and turns."""
     from flexsheet.launch.experiments import gestures as experiment
+    from flexsheet.launch.experiments import select_names
+    from flexsheet.launch.experiments.run import run_experiment
 
-    selected = experiment.select_gestures(split_names(names))
+    selected = select_names(split_names(names), experiment.GESTURES, "gesture")
     bag = make_result_folder(output, "gestures") / "gestures.mcap"
     with progress_words() as progress:
         procedure = experiment.make_gestures_procedure(selected, progress)
         given = with_scene(settings, scene)
-        _record(launch_file, given, bag, procedure, progress, apparatus=apparatus)
+        run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.gestures_result(bag, selected)
     if as_json:
         print_json(result)
@@ -541,7 +493,7 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
     )
     for row in table["rows"]:
         for error in row["failed"]:
-            words.print(f"{row['variant']}: a stroke failed: {error}", markup=False)
+            words.print(f"{row['variant']}: a stroke failed: {error}")
     words.print(f"rows: {table['folder']}")
 
 
@@ -598,7 +550,7 @@ def stability(
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
     if (graph or apparatus is not None) and not (gestures and graph):
-        raise CommandError("--graph requires --gestures, and --apparatus requires both", BAD_INPUT)
+        raise CommandError("--graph requires --gestures, and --apparatus requires both")
     given = with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")

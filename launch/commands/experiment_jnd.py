@@ -19,7 +19,6 @@ from flexsheet.launch.commands.options import (
     with_scene,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     examples,
     print_json,
@@ -99,11 +98,9 @@ def jnd(
     from flexsheet.messages.apparatus import identify_scene
 
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}", participant):
-        raise CommandError(
-            f'--participant "{participant}": use 1 to 32 letters, digits, - and _', BAD_INPUT
-        )
+        raise CommandError(f'--participant "{participant}": use 1 to 32 letters, digits, - and _')
     if repeats > 1 and not simulated:
-        raise CommandError("--repeats requires --simulated-participant", BAD_INPUT)
+        raise CommandError("--repeats requires --simulated-participant")
     given = with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "jnd")
@@ -184,18 +181,15 @@ def _measure(
     from flexsheet.launch.experiments.run import run_experiment
 
     session = _open(plan, folder)
-    words.print(INSTRUCTIONS, markup=False)
+    words.print(INSTRUCTIONS)
 
     async def run(presenter: PairPresenter) -> None:
         await run_session(session, presenter.present, lambda done, total: None)
 
-    def tell(text: str) -> None:
-        words.print(text, markup=False)
-
     # No spinner, since it would overwrite the operator's input; no bag, since recorded motion can
     # identify a person.
     if session.done < plan.trials:
-        run_experiment(launch_file, settings, None, make_jnd_procedure(run), tell)
+        run_experiment(launch_file, settings, None, make_jnd_procedure(run), words.print)
     row = session.result()
     _write_result(row, folder)
     return row

@@ -136,7 +136,7 @@ def robustness(
         rows.append([statistic, *values, "", ""])
     print_table(["seed", *experiment.METRICS, "out of tolerance", "flagged"], rows)
     for one in result["failed"]:
-        words.print(f"seed {one['seed']} failed: {one['error']}", markup=False)
+        words.print(f"seed {one['seed']} failed: {one['error']}")
     words.print(f"rows: {folder}")
 
 
@@ -175,11 +175,12 @@ def sensitivity(
     are evaluated at rest. To continue an interrupted command, repeat it with the same
     --output.
     """
+    from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments import sensitivity as experiment
     from flexsheet.launch.experiments.pictures import draw_sensitivity
-    from flexsheet.nodes.twin.tolerance_table import Profile
+    from flexsheet.nodes.twin.tolerance_table import TOLERANCES, Profile
 
-    selected = experiment.select_parameters(split_names(parameters))
+    selected = select_names(split_names(parameters), TOLERANCES, "parameter")
     folder = make_result_folder(output, "sensitivity")
     image = folder / "sensitivity.png"
     with progress_words() as progress:
@@ -227,7 +228,7 @@ def sensitivity(
             row["parameter"] for row in result["rows"] if row["evaluation"] == name
         )
         if listed:
-            words.print(f"{name.replace('_', ' ')}: {', '.join(listed)}", markup=False)
+            words.print(f"{name.replace('_', ' ')}: {', '.join(listed)}")
     words.print(f"image: {image}")
 
 

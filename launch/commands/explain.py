@@ -17,7 +17,13 @@ from typing import Annotated
 import typer
 
 from flexsheet.launch.commands.options import JsonOption, make_app
-from flexsheet.launch.commands.output import CommandError, examples, print_fields, print_json
+from flexsheet.launch.commands.output import (
+    FAILED,
+    CommandError,
+    examples,
+    print_fields,
+    print_json,
+)
 from flexsheet.messages.errors import FlexsheetError
 
 app = make_app()
@@ -80,7 +86,6 @@ def entries() -> tuple[Entry, ...]:
 
 
 def _subclasses(kind: type[FlexsheetError]) -> Iterator[type[FlexsheetError]]:
-    """Yield all subclasses of an error class that are defined in this package."""
     for derived in kind.__subclasses__():
         if derived.__module__.startswith("flexsheet."):
             yield derived
@@ -144,5 +149,5 @@ def explain(
         print_fields(entry.items())
     if not found:
         raise CommandError(
-            f'"{message}": no error or note matches; choose a code in docs/errors.md'
+            f'"{message}": no error or note matches; choose a code in docs/errors.md', FAILED
         )

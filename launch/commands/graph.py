@@ -8,7 +8,7 @@ from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from flexsheet.launch.commands.output import BAD_INPUT, CommandError, words
+from flexsheet.launch.commands.output import FAILED, CommandError, words
 from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
@@ -21,6 +21,9 @@ class NoGraphError(CommandError):
 
     code = "no-graph"
     remedy = "Start a graph with `flexsheet launch FILE`, or name the directory of its run (--run)."
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text, FAILED)
 
 
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
@@ -35,8 +38,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
         run = Run(directory.resolve().name, directory.resolve())
         if not run.plan_file.is_file():
             raise CommandError(
-                f"--run {directory}: the folder does not contain plan.json; name a run directory",
-                BAD_INPUT,
+                f"--run {directory}: the folder does not contain plan.json; name a run directory"
             )
     else:
         ready = [run for run in list_live_runs() if run.plan_file.is_file()]
@@ -72,7 +74,7 @@ async def receive_until(
             plan,
             run,
             make_handler(handle),
-            on_problem=lambda text: words.print(text, markup=False),
+            on_problem=words.print,
         )
         for topic, handle in handlers.items()
     ]

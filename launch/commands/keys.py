@@ -9,7 +9,6 @@ from typer.core import TyperCommand
 
 from flexsheet.launch.commands.options import JsonOption, LaunchArgument, make_app
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     examples,
@@ -60,19 +59,15 @@ def new(
     from flexsheet.messages.security import SecurityError, make_key_pair, write_secret
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
-        raise CommandError(
-            f'"{host}": invalid host name; use lower-case letters, digits and _', BAD_INPUT
-        )
+        raise CommandError(f'"{host}": invalid host name; use lower-case letters, digits and _')
     public, secret = make_key_pair()
     file = secret_file(host)
     try:
         write_secret(file, secret, replace=replace)
     except SecurityError as error:
-        raise CommandError(str(error)) from error
-    words.print(f"secret key: {file}; do not copy it to another computer", markup=False)
-    words.print(
-        f"run on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'", markup=False
-    )
+        raise CommandError(str(error), FAILED) from error
+    words.print(f"secret key: {file}; do not copy it to another computer")
+    words.print(f"run on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'")
     if as_json:
         print_json({"host": host, "public": public, "secret_file": str(file)})
     else:
@@ -96,7 +91,8 @@ def show(
     files = [secret_file(host)] if host else sorted(directory().glob("*.secret"))
     if not files:
         raise CommandError(
-            f"{directory()}: the folder contains no keys; create one: flexsheet keys new HOST"
+            f"{directory()}: the folder contains no keys; create one: flexsheet keys new HOST",
+            FAILED,
         )
     rows = []
     problems = []
@@ -114,7 +110,7 @@ def show(
         columns = ("host", "public", "secret_file")
         print_table(columns, [tuple(row[name] for name in columns) for row in rows])
     for problem in problems:
-        words.print(problem, markup=False)
+        words.print(problem)
     if problems:
         raise typer.Exit(FAILED)
 
@@ -148,9 +144,9 @@ def install(
         try:
             key = derive_public_key(read_secret(secret_file(host)))
         except SecurityError as error:
-            raise CommandError(str(error)) from error
+            raise CommandError(str(error), FAILED) from error
     install_key(launch_file, host, key)
     if as_json:
         print_json({"launch_file": str(launch_file), "host": host, "public": key})
     else:
-        words.print(f"{launch_file}: hosts.{host}.key = {key}", markup=False)
+        words.print(f"{launch_file}: hosts.{host}.key = {key}")

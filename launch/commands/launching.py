@@ -138,7 +138,7 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
 
     finding = check_graph(plan)
     if finding is not None:
-        words.print(f"warning: {finding.describe()}", style="yellow", markup=False)
+        words.print(f"warning: {finding.describe()}", style="yellow")
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:
@@ -147,7 +147,7 @@ def print_omitted(plan: ResolvedGraph, host: str | None) -> None:
 
     for one in plan.omitted:
         if host in (None, one.host):
-            words.print(f"not started: {one.name}; {REASON_TEXTS[one.reason]}", markup=False)
+            words.print(f"not started: {one.name}; {REASON_TEXTS[one.reason]}")
 
 
 async def run_graph(
@@ -205,7 +205,8 @@ async def _run_until(
                     ready.result()
                     notify_systemd("READY=1")
                     words.print(
-                        f"[green]all {len(graph.nodes)} nodes are ready[/]; press Ctrl-C to stop"
+                        f"[green]all {len(graph.nodes)} nodes are ready[/]; press Ctrl-C to stop",
+                        markup=True,
                     )
                     when_ready(graph.run)
                     await asyncio.wait(
@@ -229,9 +230,8 @@ async def _run_until(
 
 
 def _print_log_line(node: str, line: str) -> None:
-    """Print one line of a node's log with the node's name."""
     style, text = format_log_line(line)
-    words.print(f"{node:>16} | {text}", style=style, markup=False)
+    words.print(f"{node:>16} | {text}", style=style)
 
 
 def format_log_line(line: str) -> tuple[str, str]:

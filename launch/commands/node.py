@@ -11,7 +11,6 @@ from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import NoGraphError, running_graph
 from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     examples,
     print_fields,
@@ -75,7 +74,7 @@ def info(
     try:
         class_ = node_class(node_type)
     except (UnknownNodeError, ImportError, AttributeError) as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+        raise CommandError(str(error)) from error
     description = {
         **({} if found is None else {"node": node, "host": found.host}),
         "type": node_type,

@@ -30,7 +30,7 @@ class CommandError(FlexsheetError):
     code = "command"
     remedy = "Correct the option or file that the error names."
 
-    def __init__(self, text: str, exit_code: int = FAILED) -> None:
+    def __init__(self, text: str, exit_code: int = BAD_INPUT) -> None:
         super().__init__(text)
         self.exit_code = exit_code
 
@@ -38,9 +38,7 @@ class CommandError(FlexsheetError):
 def check_folder(option: str, file: Path) -> None:
     """Raise CommandError, which names the option, if the folder of an output file is missing."""
     if not file.resolve().parent.is_dir():
-        raise CommandError(
-            f"{option} {file}: the folder {file.parent} does not exist; create it", BAD_INPUT
-        )
+        raise CommandError(f"{option} {file}: the folder {file.parent} does not exist; create it")
 
 
 class Words:
@@ -64,7 +62,7 @@ class Words:
     def in_colour(self) -> bool:
         return self.console.color_system is not None and not self.console.no_color
 
-    def print(self, text: str, *, markup: bool = True, style: str | None = None) -> None:
+    def print(self, text: str, *, markup: bool = False, style: str | None = None) -> None:
         self.console.print(text, markup=markup, style=style)
 
     def status(self, text: str) -> Status:
@@ -169,7 +167,7 @@ def progress_words() -> Iterator[Callable[[str], None]]:
     Without a terminal it prints one line per message.
     """
     if not words.is_terminal:
-        yield lambda text: words.print(text, markup=False)
+        yield words.print
         return
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 

@@ -12,7 +12,7 @@ from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import receive_until, run_interruptible, running_graph
 from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
+    FAILED,
     CommandError,
     examples,
     print_json,
@@ -119,33 +119,30 @@ def set_parameter(
         live = ", ".join(f"{node.name}.{one}" for one in sorted(_live(node))) or "none"
         raise CommandError(
             f"{parameter}: this parameter cannot change while the node runs; start the graph again "
-            f"with --set {parameter}={value} (parameters that may change: {live})",
-            BAD_INPUT,
+            f"with --set {parameter}={value} (parameters that may change: {live})"
         )
     try:
         parsed = parse_value(value)
         kind = find_parameters_type(node_class(node.type))
         checked = kind.model_validate({**node.parameters, name: parsed})
     except YAMLError as error:
-        raise CommandError(f"VALUE {value}: not a valid YAML value: {error}", BAD_INPUT) from error
+        raise CommandError(f"VALUE {value}: not a valid YAML value: {error}") from error
     except ValidationError as error:
         text = "; ".join(one["msg"] for one in error.errors())
-        raise CommandError(f"{parameter}={value}: invalid value: {text}", BAD_INPUT) from error
+        raise CommandError(f"{parameter}={value}: invalid value: {text}") from error
     new = checked.model_dump(mode="json")[name]
     run_interruptible(_set(plan, found, node.name, name, new))
     if as_json:
         print_json({"parameter": parameter, "value": new})
     else:
-        words.print(f"{parameter} = {json.dumps(new)}", markup=False)
+        words.print(f"{parameter} = {json.dumps(new)}")
 
 
 def _find_node(plan: ResolvedGraph, name: str) -> ResolvedNode:
     from flexsheet.launch.plans.documents import did_you_mean
 
     if name not in plan.nodes:
-        raise CommandError(
-            f'"{name}": unknown node; {did_you_mean(name, list(plan.nodes))}', BAD_INPUT
-        )
+        raise CommandError(f'"{name}": unknown node; {did_you_mean(name, list(plan.nodes))}')
     return plan.nodes[name]
 
 
@@ -156,7 +153,7 @@ def _find_parameter(plan: ResolvedGraph, text: str) -> tuple[ResolvedNode, str]:
     node = _find_node(plan, node_name)
     if name not in node.parameters:
         raise CommandError(
-            f'"{text}": unknown parameter; {did_you_mean(name, list(node.parameters))}', BAD_INPUT
+            f'"{text}": unknown parameter; {did_you_mean(name, list(node.parameters))}'
         )
     return node, name
 
@@ -200,7 +197,8 @@ async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) 
         found: dict[str, dict[str, Any]] = {}
         if await _await_statuses(plan, run, lambda: found.get(node, {}).get(name) == value, found):
             raise CommandError(
-                f"{node}.{name}: the node did not confirm the change; see flexsheet logs {node}"
+                f"{node}.{name}: the node did not confirm the change; see flexsheet logs {node}",
+                FAILED,
             )
     finally:
         writer.close()

@@ -9,7 +9,6 @@ import typer
 
 from flexsheet.launch.commands.options import JsonOption, SceneArgument, SchedulerOption, make_app
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     examples,
     print_json,
@@ -80,10 +79,10 @@ def precompute(
                 )
             except NoSoftBodyError as error:
                 raise CommandError(
-                    f"{scene_file}: the soft body cannot be computed: {error}", BAD_INPUT
+                    f"{scene_file}: the soft body cannot be computed: {error}"
                 ) from error
     if as_json:
         print_json({name: str(file) for name, file in files.items()})
         return
     for name, file in files.items():
-        words.print(f"{name.replace('_', ' ')}: {file}", markup=False)
+        words.print(f"{name.replace('_', ' ')}: {file}")

@@ -32,7 +32,6 @@ from flexsheet.launch.commands.options import (
     with_scene,
 )
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     FAILED,
     CommandError,
     examples,
@@ -86,18 +85,18 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
             }
         )
     else:
-        words.print(f"{plan.launch_file}, run {found.directory}", markup=False)
+        words.print(f"{plan.launch_file}, run {found.directory}")
         for row in rows:
             row["publishes"] = [f"{one['topic']} {one['rate_hz']:.0f} Hz" for one in row["outputs"]]
             for name in ("inputs", "outputs", "errors"):
                 del row[name]
         print_rows(rows, as_json=False)
         for host, reason in estops.items():
-            words.print(f"e-stop on {host}: {reason}", markup=False, style="red")
+            words.print(f"e-stop on {host}: {reason}", style="red")
         for one in suspicions:
             if one["suspected"]:
-                words.print(f"{one['node']}: {one['text']}", markup=False, style="yellow")
-                words.print(f"  remedy: {one['remedy']}", markup=False)
+                words.print(f"{one['node']}: {one['text']}", style="yellow")
+                words.print(f"  remedy: {one['remedy']}")
     silent = [name for name in plan.nodes if name not in statuses]
     if silent or any(one["suspected"] for one in suspicions):
         raise typer.Exit(FAILED)
@@ -182,8 +181,7 @@ def logs(
     if not file.is_file():
         known = sorted(one.stem for one in found.logs.glob("*.log"))
         raise CommandError(
-            f'"{node}": {found.logs} contains no log of this node; {did_you_mean(node, known)}',
-            BAD_INPUT,
+            f'"{node}": {found.logs} contains no log of this node; {did_you_mean(node, known)}'
         )
 
     def show(line: str) -> None:
@@ -300,13 +298,11 @@ def run_node(
         if given:
             raise CommandError(
                 "--set and --scene require --launch LAUNCH_FILE, because the running graph has "
-                "fixed settings",
-                BAD_INPUT,
+                "fixed settings"
             )
     if node not in plan.nodes:
         raise CommandError(
-            f'"{node}": unknown node of {plan.launch_file}; {did_you_mean(node, list(plan.nodes))}',
-            BAD_INPUT,
+            f'"{node}": unknown node of {plan.launch_file}; {did_you_mean(node, list(plan.nodes))}'
         )
     if launch_file is not None:
         without = [name for name in plan.nodes if name != node]
@@ -319,16 +315,16 @@ def run_node(
 
 
 async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | None) -> int:
-    """Run a node of the plan in this process, connected to the running graph."""
     from flexsheet.launch.running.supervisor import node_config
     from flexsheet.nodes.runner import run_node as run_config
 
     if (run.directory / f"{name}.status").exists():
         raise CommandError(
             f'node "{name}" is already running in {run.directory}; '
-            f"start the graph without it: flexsheet launch LAUNCH_FILE --without {name}"
+            f"start the graph without it: flexsheet launch LAUNCH_FILE --without {name}",
+            FAILED,
         )
-    words.print(f"running {name} in {run.directory}; press Ctrl-C to stop", markup=False)
+    words.print(f"running {name} in {run.directory}; press Ctrl-C to stop")
     stop_event = asyncio.Event()
     work = asyncio.create_task(run_config(node_config(plan, plan.nodes[name], run), stop_event))
     try:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from flexsheet.launch.commands.options import JsonOption, LaunchArgument
-from flexsheet.launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
+from flexsheet.launch.commands.output import FAILED, CommandError, examples, print_json, words
 from flexsheet.messages.files import write_file
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
@@ -54,21 +54,19 @@ def install(
     plan = load_graph(launch_file)
     if host not in plan.hosts:
         raise CommandError(
-            f'--host "{host}": unknown host; {launch_file} defines {", ".join(plan.hosts)}',
-            BAD_INPUT,
+            f'--host "{host}": unknown host; {launch_file} defines {", ".join(plan.hosts)}'
         )
     if not user or set(user) - set(USER_PATTERN):
         raise CommandError(
-            f'--user "{user}": invalid user name; use lower-case letters, digits, _ and -',
-            BAD_INPUT,
+            f'--user "{user}": invalid user name; use lower-case letters, digits, _ and -'
         )
     for bag in list_bags(plan, host):
         if not bag.is_relative_to(STATE_FOLDER):
             words.print(
                 f"{bag}: the service can write only to {STATE_FOLDER}; change the path of the bag "
                 "in the launch file",
-                markup=False, style="yellow",
-            )  # fmt: skip
+                style="yellow",
+            )
     files = list(make_files(launch_file=launch_file, host=host, user=user, root=root))
     if as_json:
         print_json([{"path": str(file.path), "text": file.text} for file in files])
@@ -82,13 +80,12 @@ def install(
             write_file(file.path, file.text, mode=file.mode)
         except OSError as error:
             raise CommandError(
-                f"{file.path}: cannot be written: {error.strerror}; run the command as root"
+                f"{file.path}: cannot be written: {error.strerror}; run the command as root", FAILED
             ) from error
-        words.print(f"wrote {file.path}", markup=False)
+        words.print(f"wrote {file.path}")
     if not dry_run:
         words.print(
             f"next: sysctl -e -p /etc/sysctl.d/90-flexsheet.conf && systemctl daemon-reload && "
             f"systemctl enable --now flexsheet@{host}; "
-            f"log: journalctl -fu flexsheet@{host}",
-            markup=False,
+            f"log: journalctl -fu flexsheet@{host}"
         )

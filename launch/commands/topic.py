@@ -13,7 +13,7 @@ import typer
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
 from flexsheet.launch.commands.options import JsonOption, RunOption, TopicArgument, make_app
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
+    FAILED,
     CommandError,
     examples,
     print_fields,
@@ -188,7 +188,7 @@ def delay(
     arrivals = [one for one in _measure(topic, run, duration) if one.header.clock_id == own]
     if not arrivals:
         raise CommandError(
-            f'topic "{topic}" has timestamps of another computer; run the command there'
+            f'topic "{topic}" has timestamps of another computer; run the command there', FAILED
         )
     print_rows(measure_delays(arrivals), as_json=as_json)
 
@@ -242,14 +242,15 @@ def pub(
     if as_json:
         print_json({"topic": topic, "sent": sent})
     else:
-        words.print(f'sent {sent} on "{topic}"', markup=False)
+        words.print(f'sent {sent} on "{topic}"')
     raise typer.Exit(code)
 
 
 def make_silence_error(topic: str, duration_s: float) -> CommandError:
     return CommandError(
         f'no message on "{topic}" within {duration_s:g} s; check that its writer is running: '
-        "flexsheet topic echo status"
+        "flexsheet topic echo status",
+        FAILED,
     )
 
 
@@ -384,12 +385,9 @@ def _format_value(value: Any) -> str:
 
 
 def _find_topic(name: str) -> Topic:
-    from flexsheet.messages.topics import UnknownTopicError, find_topic
+    from flexsheet.messages.topics import find_topic
 
-    try:
-        return find_topic(name)
-    except UnknownTopicError as error:
-        raise CommandError(str(error), BAD_INPUT) from error
+    return find_topic(name)
 
 
 def _describe(topic: Topic) -> dict[str, Any]:
@@ -414,8 +412,7 @@ def _get_field(message: Message, path: str | None, topic: str) -> Any:
 
             raise CommandError(
                 f'--field {path}: topic "{topic}" does not contain the field "{name}"; '
-                f"{did_you_mean(name, list(fields))}",
-                BAD_INPUT,
+                f"{did_you_mean(name, list(fields))}"
             )
         value = getattr(value, name)
     return value
@@ -427,11 +424,7 @@ def _report_no_message(topic: Topic) -> None:
         if topic.rate_hz is None
         else "check its writer: flexsheet topic echo status"
     )
-    words.print(
-        f'no message on "{topic.name}" yet ({when}); press Ctrl-C to stop',
-        markup=False,
-        style="dim",
-    )
+    words.print(f'no message on "{topic.name}" yet ({when}); press Ctrl-C to stop', style="dim")
 
 
 async def _read(
@@ -498,14 +491,15 @@ def make_listener(
     if not plan.endpoints_to_read(topic.name):
         raise CommandError(
             f'topic "{topic.name}" has no writer in the running graph {run.directory}; '
-            "add a node that publishes it to the launch file"
+            "add a node that publishes it to the launch file",
+            FAILED,
         )
     return make_subscriber(
         topic.name,
         plan,
         run,
         handler,
-        on_problem=lambda text: words.print(text, markup=False),
+        on_problem=words.print,
         raw=raw,
     )
 
@@ -521,17 +515,17 @@ def _parse_message(topic: Topic, text: str) -> Message:
         try:
             text = Path(source).read_text()
         except OSError as error:
-            raise CommandError(f"{source}: cannot be read: {error.strerror}", BAD_INPUT) from error
+            raise CommandError(f"{source}: cannot be read: {error.strerror}") from error
     try:
         try:
             value = parse_json(text)
         except ValueError:  # JSON is valid YAML, so the YAML error describes faults in both
             value = parse_value(text)
     except YAMLError as error:
-        raise CommandError(f"{source}: not valid YAML or JSON: {error}", BAD_INPUT) from error
+        raise CommandError(f"{source}: not valid YAML or JSON: {error}") from error
     if not isinstance(value, dict):
         raise CommandError(
-            f"{source}: expected a mapping with the fields of {topic.message.__name__}", BAD_INPUT
+            f"{source}: expected a mapping with the fields of {topic.message.__name__}"
         )
     return validate(
         topic.message, Document(Path(f"{source} ({topic.message.__name__})"), value, text, {})

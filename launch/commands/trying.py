@@ -73,7 +73,7 @@ def try_it(
     def ready(run: Run) -> None:
         if as_json:
             print_json_line({"page": url, **describe_run(plan, run, None)})
-        words.print(f"[bold]open {url}[/] and drag on the sheet")
+        words.print(f"[bold]open {url}[/] and drag on the sheet", markup=True)
         if browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(url)
 

@@ -11,7 +11,6 @@ import typer
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, output_file
 from flexsheet.launch.commands.output import (
-    BAD_INPUT,
     CommandError,
     examples,
     logs_on_stderr,
@@ -99,7 +98,7 @@ def tune(
     try:
         tunables = tune.find_tunables(family or [])
     except tune.UnknownTunableError as error:
-        raise CommandError(f"--family: {error}", BAD_INPUT) from None
+        raise CommandError(f"--family: {error}") from None
     target = None if dry_run else output or scene_file
     if target is not None:
         tune.check_target(scene_file, target)  # fail before the long measurement
@@ -121,9 +120,9 @@ def tune(
                 runs=runs,
             )
     for choice in choices:
-        words.print(choice.explain(), markup=False)
+        words.print(choice.explain())
     for line in composition.explain() if composition is not None else ():
-        words.print(line, markup=False)
+        words.print(line)
     met = all(choice.met for choice in choices) if composition is None else composition.accepted
     if as_json:
         report = {

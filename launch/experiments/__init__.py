@@ -5,9 +5,10 @@ They include those of Furukawa et al. 2007.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import TypeVar
 
+from flexsheet.launch.plans.documents import did_you_mean
 from flexsheet.messages.errors import FlexsheetError
 
 Entry = TypeVar("Entry")
@@ -25,6 +26,17 @@ class ExperimentInterruptedError(ExperimentError):
 
     code = "experiment-interrupted"
     remedy = "Start the experiment again; a sweep continues with the trials that are missing."
+
+
+def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
+    """Check names and remove duplicates; without names, return all known ones.
+
+    kind: what the names are, for the error. Raises ExperimentError for an unknown name.
+    """
+    for name in names:
+        if name not in known:
+            raise ExperimentError(f'unknown {kind} "{name}"; {did_you_mean(name, list(known))}')
+    return list(dict.fromkeys(names or known))
 
 
 def find_recorded(entries: Mapping[str, Entry], kind: str, label: str) -> Entry:

@@ -68,7 +68,6 @@ def run_demo(
     run_experiment(
         launch_file, given, bag, procedure, progress, apparatus=apparatus, needed=["twin/eye"]
     )
-    progress("reading the bag and drawing")
     if path is None:
         return summarize(bag, folder, strokes=SECONDS)
     return summarize(bag, folder, strokes=(), path_label=path.label)

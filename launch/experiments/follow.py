@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import linprog
 from scipy.sparse import csr_array, diags_array, hstack, kron, vstack
@@ -44,6 +43,7 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
@@ -61,9 +61,6 @@ from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
 from flexsheet.nodes.twin.finger import validate_path
 from flexsheet.nodes.twin.paths import map_to_surface
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 STEP_S = 1.0 / 30.0
 """Time step of the linear program."""
@@ -301,7 +298,6 @@ class FollowedContact:
         )
 
     def _deviated(self, sheet: RolledSheet) -> list[Floats]:
-        """Return the nominal pose, and poses with a small deviation along x, y and the normal."""
         poses = [sheet.pose()]
         for axis in range(2):
             found = self._shape.closest(

@@ -23,12 +23,12 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene, UnfitGeometryError
 from flexsheet.messages.types import FingerPath, Fingertip, TwinFinger
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.twin import gestures as twin_gestures
 from flexsheet.nodes.twin.finger import FingerPathError
 from flexsheet.nodes.twin.paths import recorded_path
 
-Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 PREDICTION_HORIZONS_S = (0.0, 0.02, 0.05)
@@ -59,15 +59,6 @@ def gesture_path(name: str, scene: Scene) -> FingerPath:
         raise ExperimentError(f'scene "{scene.name}": {error}') from None
 
 
-def select_gestures(names: Sequence[str]) -> list[str]:
-    """Check the names of gestures and remove duplicates; without names, return all names."""
-    selected = list(dict.fromkeys(names)) or list(GESTURES)
-    for name in selected:
-        if name not in GESTURES:
-            raise ExperimentError(f'unknown gesture "{name}"; {did_you_mean(name, list(GESTURES))}')
-    return selected
-
-
 def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = ()) -> FingerPath:
     """Make a finger path in the scene of a launch file, from a gesture's name or a recorded path.
 
@@ -91,8 +82,6 @@ def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = 
 
 
 def make_gestures_procedure(names: Sequence[str], progress: Progress) -> Procedure:
-    """Make a procedure that performs the gestures in sequence."""
-
     async def procedure(driver: Driver, scene: Scene) -> None:
         for i, name in enumerate(names):
             path = gesture_path(name, scene)

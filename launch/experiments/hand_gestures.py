@@ -7,6 +7,7 @@ simulated time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from flexsheet.launch.experiments.driver import Driver
@@ -35,6 +35,8 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, Phase, SheetTarget, TwinFinger
+from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.models.hand_loop import Hand
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
@@ -43,8 +45,6 @@ from flexsheet.nodes.twin.gestures import HOVER_M, SAMPLE_S, minimum_jerk
 from flexsheet.nodes.twin.hand import CoupledFinger, HandImpedance, TrueSheet, VoluntaryPath
 from flexsheet.nodes.twin.paths import inside, limit_path_speed, map_to_surface, touchable
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
-
-Floats = NDArray[np.float64]
 
 DEPTH_FRACTION = 0.3
 """Voluntary depth of the gestures, as a fraction of the scene's push depth."""
@@ -245,10 +245,8 @@ def hand_gestures_result(
     rows: list[dict[str, Any]] = []
     forces: dict[tuple[str, str], FeltForce] = {}
     for number, hand in enumerate(draw_hands(hands, seed)):
-        critical = 2.0 * (hand.mass_kg * hand.stiffness_n_per_m) ** 0.5
-        impedance = HandImpedance(
-            hand.mass_kg, hand.stiffness_n_per_m, hand.damping_ns_per_m / critical
-        )
+        ratio = hand.damping_ns_per_m / _critical_damping(hand)
+        impedance = HandImpedance(hand.mass_kg, hand.stiffness_n_per_m, ratio)
         kind = f"{1e3 * hand.mass_kg:.0f} g"
         progress(f"hand {number + 1} of {3 * hands}: {kind}, {hand.stiffness_n_per_m:.0f} N/m")
         for name in names:
@@ -262,15 +260,7 @@ def hand_gestures_result(
             )
             force = compute_felt_force(scene, recorded, curve)
             forces[kind, name] = force
-            rows.append(
-                {
-                    "gesture": name,
-                    "mass_kg": hand.mass_kg,
-                    "damping_ns_per_m": hand.damping_ns_per_m,
-                    "stiffness_n_per_m": hand.stiffness_n_per_m,
-                    **evaluate_touch(recorded, force, touches),
-                }
-            )
+            rows.append(_make_row(name, impedance, evaluate_touch(recorded, force, touches)))
     return _make_result(scene, seed, rows), forces
 
 
@@ -309,24 +299,29 @@ def run_gestures(
     for name, recorded in read_touches(bag).items():
         force = compute_felt_force(scene, recorded, curve)
         forces[kind, name] = force
-        critical = 2.0 * (hand.mass_kg * hand.stiffness_n_per_m) ** 0.5
-        rows.append(
-            {
-                "gesture": name,
-                "mass_kg": hand.mass_kg,
-                "damping_ns_per_m": hand.damping_ratio * critical,
-                "stiffness_n_per_m": hand.stiffness_n_per_m,
-                **evaluate_touch(recorded, force, HAND_GESTURES[name][1]),
-            }
-        )
+        touches = HAND_GESTURES[name][1]
+        rows.append(_make_row(name, hand, evaluate_touch(recorded, force, touches)))
     return {**_make_result(scene, None, rows), "bag": str(bag)}, forces
+
+
+def _critical_damping(hand: Hand | HandImpedance) -> float:
+    return 2.0 * math.sqrt(hand.mass_kg * hand.stiffness_n_per_m)
+
+
+def _make_row(gesture: str, hand: HandImpedance, figures: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "gesture": gesture,
+        "mass_kg": hand.mass_kg,
+        "damping_ns_per_m": hand.damping_ratio * _critical_damping(hand),
+        "stiffness_n_per_m": hand.stiffness_n_per_m,
+        **figures,
+    }
 
 
 SUMMARY = ("peak_error_n", "mean_error_n", "median_error_percent", "transient_n", "chatter")
 
 
 def _make_result(scene: Scene, seed: int | None, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the result and a summary, which has the worst value of all hands for each gesture."""
     names = dict.fromkeys(row["gesture"] for row in rows)
     summary = {
         name: {key: max(row[key] for row in rows if row["gesture"] == name) for key in SUMMARY}

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
+
 Curve = Callable[[Floats], Floats]
 
 STEPS_PER_PERIOD = 64

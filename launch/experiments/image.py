@@ -93,7 +93,6 @@ class Series:
     values: tuple[float, ...]
 
     def label(self, value: float, correction: Correction) -> str:
-        """Return the label of the image for a value and a correction."""
         return f"{self.name.format(value)}, {correction}"
 
 

@@ -30,13 +30,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.messages.files import make_write_error
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 CRITERION = 0.75
 """Fraction of correct answers, without lapses, at an increment of one Weber fraction."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 STEP_S = 0.002
 MIN_CORRELATION = 0.5

@@ -52,7 +52,6 @@ def draw_error_maps(images: dict[str, EyeImage], series: Series, path: Path) -> 
 
 
 def _find_box(maps: list[ErrorMap]) -> tuple[slice, slice]:
-    """Return the ranges of rows and columns that contain all values of the maps, to crop them."""
     valid = np.any([np.isfinite(each.errors_m).all(axis=2) for each in maps], axis=0)
     if not valid.any():
         return slice(None), slice(None)

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.stroke import project_presented_point
@@ -29,9 +28,11 @@ from flexsheet.messages.marker_calibration import MarkerCalibration, load_marker
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from flexsheet.nodes import node_class
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.models.sheet.force_models import SheetPush
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 from flexsheet.nodes.renderer import deflection_cache
@@ -39,7 +40,7 @@ from flexsheet.nodes.renderer.benchmarks import draw_coordinate_ramps
 from flexsheet.nodes.renderer.gl import headless_context
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import estimate_sheet
-from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import HALF_WINDOW_M, eye_rays, first_hits, seen
@@ -51,8 +52,6 @@ from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.nodes.twin.true_object import TrueBody
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
 
 METRES_PER_PX = 0.0007
 """Resolution of the images in Furukawa et al. 2007."""
@@ -294,14 +293,7 @@ class OfflineEvaluator:
                 rig.pixels_of(lens, rays[:2] / rays[2])
                 for lens, rays in ((camera.left, in_left[0]), (camera.right, in_right[1]))
             ]
-            found = measure(
-                self._geometry,
-                pixels[0],
-                pixels[1],
-                method=dlt,
-                left_covariance=UNIT_COVARIANCE_PX2,
-                right_covariance=UNIT_COVARIANCE_PX2,
-            )
+            found = measure(self._geometry, pixels[0], pixels[1], covariance=UNIT_COVARIANCE_PX2)
             if found is None:
                 raise ExperimentError(
                     f"apparatus {apparatus.origin}: the fingertip at {contact.point} m cannot be "
@@ -392,10 +384,8 @@ class OfflineEvaluator:
             felt.extend((history_ratios * (pushed.finger_force_n @ contact.normal)).tolist())
             believed_m = true_m - float(tip_error @ contact.normal)
             model = self._force_model.evaluate(
-                self._stretch_ratio,
+                SheetPush(self._stretch_ratio, self._scene.finger.radius_m),
                 np.array([max(believed_m, 1e-4)]),
-                position_m=(0.0, 0.0),
-                finger_radius_m=self._scene.finger.radius_m,
             )
             expected.extend([float(model.force_n[0])] * len(history_ratios))
         return np.array(felt), np.array(expected)
@@ -403,7 +393,6 @@ class OfflineEvaluator:
     def _compare_images(
         self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
     ) -> tuple[Floats, ...]:
-        """Return the image error maps of a tilted sheet and of a pushed sheet."""
         tilted, upright = self._touch(self._places_m[-1]), self._touch(0.0)
         depth_m = min(MAX_IMAGE_DEPTH_M, self._scene.working_range.push_depth_m)
         tip = upright.point - depth_m * upright.normal

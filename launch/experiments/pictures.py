@@ -34,7 +34,7 @@ CORRECTION_NAMES = {
 
 
 def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -> None:
-    """Draw one row per case: what the eye sees with each image correction, and should see."""
+    """Draw one row per case: the eye's image with each image correction, and the expected one."""
     columns = max(len(images) for _, images in rows) + 1
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)

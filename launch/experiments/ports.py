@@ -6,7 +6,7 @@ import socket
 from pathlib import Path
 
 from flexsheet.launch.plans.plan import load_graph
-from flexsheet.nodes import NodeRole, node_class
+from flexsheet.nodes import NodeRole
 
 LOOPBACK = "127.0.0.1"
 
@@ -16,15 +16,15 @@ def choose_ports(launch_file: Path) -> list[str]:
 
     For a graph without simulated arms, the list is empty.
     """
-    nodes = load_graph(launch_file).nodes.values()
-    simulators = [one for one in nodes if issubclass(node_class(one.type), node_class("twin_arms"))]
+    graph = load_graph(launch_file)
+    simulators = graph.nodes_of_type("twin_arms")
     if not simulators:
         return []
     left, right = _find_free_ports(2)
     settings = []
     for node in simulators:
         settings += [f"{node.name}.left_port={left}", f"{node.name}.right_port={right}"]
-    for node in nodes:
+    for node in graph.nodes.values():
         if node.role is NodeRole.ARM_BRIDGE:
             port = left if node.parameters["side"] == "left" else right
             settings.append(f"{node.name}.port={port}")
@@ -32,7 +32,6 @@ def choose_ports(launch_file: Path) -> list[str]:
 
 
 def _find_free_ports(count: int) -> list[int]:
-    """Return different TCP ports that are free now on the loopback interface."""
     sockets = [socket.socket() for _ in range(count)]
     try:
         for one in sockets:

@@ -23,7 +23,6 @@ from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Correction, FingerPath, Shading
-from flexsheet.nodes import node_class
 from flexsheet.nodes.signals import handle_signals
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
@@ -123,6 +122,8 @@ def run_experiment(
         if bag is None or not bag.exists():
             raise
         raise type(error)(f"{error}\nrecording until the error: {bag}") from error
+    if bag is not None:
+        progress("reading the bag")
 
 
 async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
@@ -140,12 +141,8 @@ def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
 
     Nodes of derived types are included.
     """
-    base = node_class(node_type)
-    return [
-        f"{node.name}.{setting}"
-        for node in load_graph(launch_file, needed=tuple(TOPICS)).nodes.values()
-        if issubclass(node_class(node.type), base)
-    ]
+    graph = load_graph(launch_file, needed=tuple(TOPICS))
+    return [f"{node.name}.{setting}" for node in graph.nodes_of_type(node_type)]
 
 
 def make_stroke_procedure(

@@ -11,7 +11,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.offline import Metric, metric_tolerances
 from flexsheet.launch.experiments.run import require_scene
 from flexsheet.launch.experiments.sweep import (
@@ -22,14 +21,12 @@ from flexsheet.launch.experiments.sweep import (
     run_sweep,
 )
 from flexsheet.launch.plans.apparatus import format_apparatus
-from flexsheet.launch.plans.documents import did_you_mean
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import nominal_apparatus
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
-    TOLERANCES,
     Profile,
     deviate_apparatus,
 )
@@ -89,17 +86,6 @@ AFFECTED: dict[str, frozenset[Metric]] = {
     "projector": frozenset({Metric.IMAGE}),
 }
 """Metrics that each section of the apparatus affects at rest."""
-
-
-def select_parameters(names: Sequence[str]) -> list[str]:
-    """Check parameter names and remove duplicates; without names, return all of the table."""
-    selected = list(dict.fromkeys(names)) or list(TOLERANCES)
-    for name in selected:
-        if name not in TOLERANCES:
-            raise ExperimentError(
-                f'unknown parameter "{name}"; {did_you_mean(name, list(TOLERANCES))}'
-            )
-    return selected
 
 
 def evaluation_of(parameter: str, *, with_graph: bool) -> EvaluationKind:

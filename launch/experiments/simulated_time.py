@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
 from flexsheet.launch.experiments.stroke import (
@@ -35,6 +34,7 @@ from flexsheet.messages.types import FingerPath, Phase, Side, SoftBody
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import FOLLOW_BOUNDS, extrapolate_goal
 from flexsheet.nodes.arm_bridge.limiter import limit_velocity
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import OffsetBoundsTable
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.motion import SheetMotion, follow_sheet
@@ -48,7 +48,7 @@ from flexsheet.nodes.planner.timing import update_horizon_s
 from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
-from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.arms import Servo, forward
 from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
@@ -57,8 +57,6 @@ from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, VoluntaryPath
 from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
 
 CYCLE_S = 0.0071
 """Period of the commands to the arms."""
@@ -118,13 +116,7 @@ class MeasuredFinger:
             for lens, point in ((self._camera.left, in_left), (self._camera.right, in_right))
         ]
         covariance = PIXEL_NOISE_PX**2 * np.eye(2)
-        found = measure(
-            self._geometry,
-            *pixels,
-            method=dlt,
-            left_covariance=covariance,
-            right_covariance=covariance,
-        )
+        found = measure(self._geometry, *pixels, covariance=covariance)
         if found is not None:
             self._tracker.update(at_ns, found.point_world, found.covariance)
         return self._tracker.predict_at(at_ns, self._horizons_s).path

@@ -26,23 +26,20 @@ from numpy.typing import NDArray
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.hand_simulation import Cases, simulate_release
 from flexsheet.launch.experiments.run import Progress
+from flexsheet.launch.health.compliance import compute_compliance
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import (
     Hand,
-    OffsetBounds,
     SampledLoop,
     compute_critical_slope,
 )
-from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel
+from flexsheet.nodes.models.sheet.force_models import SheetForceModel, SheetPush
 from flexsheet.nodes.planner.compliance import (
     Compliance,
     ObjectCurve,
-    fit_compliance,
-    make_stretch_limits,
 )
 from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
-
-Floats = NDArray[np.float64]
 
 HAND_RANGES = {
     "finger": ((0.004, 0.01), (50.0, 800.0), (0.3, 1.2)),
@@ -229,14 +226,16 @@ def measure_map(
         object_pa = ratio * material.young_modulus_pa
         progress(f"object with Young's modulus {object_pa:.3g} Pa")
         for delay_s, jitter_s in product(settings.delays_s, settings.jitters_s):
-            fitted = _fit(scene, model, scaled, table.at_delay(delay_s + 0.5 * jitter_s))
+            fitted = compute_compliance(
+                scene, model, scaled, bounds=table.at_delay(delay_s + 0.5 * jitter_s)
+            )
             filter_s, suffices = fitted.choose_filter_s()
             loops = [SampledLoop(period_s, delay_s, filter_s)]
             for row in _simulate_pushes(fitted, hands, loops, jitter_s):
                 rows.append(
                     {"object_pa": object_pa, "kind": "bounded", "warned": not suffices} | row
                 )
-        fitted = _fit(scene, model, scaled, None)
+        fitted = compute_compliance(scene, model, scaled)
         for kind, jitter_s in product(("unbounded", "predicted"), settings.jitters_s):
             loops = [
                 SampledLoop(period_s, delay_s, lead_s=delay_s if kind == "predicted" else 0.0)
@@ -247,31 +246,13 @@ def measure_map(
     return rows
 
 
-def _fit(
-    scene: Scene, model: SheetForceModel, curve: ObjectCurve, bounds: OffsetBounds | None
-) -> Compliance:
-    return fit_compliance(
-        curve,
-        model,
-        make_stretch_limits(scene.sheet, model, bounds),
-        max_depth_m=scene.working_range.push_depth_m,
-        finger_radius_m=scene.finger.radius_m,
-        usable_half_height_m=scene.sheet.usable_half_height_m,
-        position_error_m=scene.tolerances.sheet_position_m,
-    )
-
-
 def _simulate_pushes(
     fitted: Compliance, hands: Sequence[Hand], loops: Sequence[SampledLoop], jitter_s: float
 ) -> list[dict[str, Any]]:
     """Return a row for each hand and control loop; stable means stable at every depth."""
     indented_m = np.linspace(0.0, 2.0 * fitted.max_depth_m, 400)
-    forces_n = fitted.model.evaluate(
-        fitted.stretch_ratio,
-        indented_m,
-        position_m=CENTRE,
-        finger_radius_m=fitted.finger_radius_m,
-    ).force_n
+    push = SheetPush(fitted.stretch_ratio, fitted.finger_radius_m)
+    forces_n = fitted.model.evaluate(push, indented_m).force_n
     depths_m = np.linspace(0.0, fitted.max_depth_m, 400)
     offsets_m = fitted.normal_offset_m(depths_m)
 

@@ -35,12 +35,11 @@ from flexsheet.messages.types import (
     TwinArms,
     TwinFinger,
 )
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape, principal_curvatures
 from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
 
 STROKE_ANGLE_RAD = np.radians(60.0)
 APPROACH_S = 0.8

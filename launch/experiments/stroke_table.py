@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from ruamel.yaml import YAML
 from scipy.stats import t as student_t
 
 from flexsheet.launch.experiments.run import make_settings, require_scene
 from flexsheet.launch.experiments.sweep import Progress, Row, raise_if_all_failed, run_sweep
 from flexsheet.launch.plans.apparatus import format_apparatus, load_apparatus
-from flexsheet.launch.plans.documents import read_document
+from flexsheet.launch.plans.documents import edit_yaml
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import nominal_apparatus
 from flexsheet.messages.files import write_file
@@ -95,28 +94,21 @@ def write_radius_variant(launch_file: Path, folder: Path, radius_m: float) -> Pa
 
     Return the path of the copy. Relative paths in it become absolute.
     """
-    yaml = YAML()
-    launch = yaml.load(launch_file.read_text())
     graph = load_graph(launch_file)
-    scene_file = launch_file.parent / launch["scene"]
-    scene = yaml.load(scene_file.read_text())
     added_m = radius_m - require_cylinder(require_scene(graph)).radius_m
-    scene["object"]["geometry"]["radius_m"] = radius_m
-    position = scene["object"]["world_from_object"]["position_m"]
-    position[2] = float(position[2]) - added_m
     name = f"radius-{1e3 * radius_m:.1f}-mm"
-    varied = folder / f"scene-{name}.yaml"
-    with varied.open("w") as file:
-        yaml.dump(scene, file)
-    launch["scene"] = str(varied.resolve())
-    for node, spec in launch["nodes"].items():
-        given = spec.get("parameters", {})
-        for parameter in given:
-            given[parameter] = graph.nodes[node].parameters[parameter]
-    result = folder / f"launch-{name}.yaml"
-    with result.open("w") as file:
-        yaml.dump(launch, file)
-    read_document(result)
+    varied, result = folder / f"scene-{name}.yaml", folder / f"launch-{name}.yaml"
+    assert graph.scene_file is not None  # `require_scene` has raised an error otherwise
+    with edit_yaml(Path(graph.scene_file), varied) as scene:
+        scene["object"]["geometry"]["radius_m"] = radius_m
+        position = scene["object"]["world_from_object"]["position_m"]
+        position[2] = float(position[2]) - added_m
+    with edit_yaml(launch_file, result) as launch:
+        launch["scene"] = str(varied.resolve())
+        for node, spec in launch["nodes"].items():
+            given = spec.get("parameters", {})
+            for parameter in given:
+                given[parameter] = graph.nodes[node].parameters[parameter]
     return result
 
 

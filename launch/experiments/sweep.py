@@ -148,7 +148,6 @@ def run_sweep(
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Make SIGTERM raise KeyboardInterrupt in the main thread, as SIGINT does."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -29,13 +29,13 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.methods import Correction, resolve_method
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, SheetTarget
-from flexsheet.nodes import NodeRole, node_class
+from flexsheet.nodes import NodeRole
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
 from flexsheet.nodes.twin.sheet_surface import SheetSurface
 
-Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 STROKE = "system stroke"
@@ -128,7 +128,6 @@ def scene_speed(scene: Scene) -> float:
 
 
 def _make_rest(scene: Scene, label: str, place: Sequence[float]) -> FingerPath:
-    """Make a path that approaches a surface position from above and rests there."""
     above = [place[0], place[1], HOVER_M]
     return FingerPath(
         label=label,
@@ -147,12 +146,6 @@ def list_image_paths(scene: Scene) -> list[FingerPath]:
         _make_rest(scene, TILTED, (0.0, arc_m, 0.5 * HOVER_M)),
         _make_rest(scene, PUSHED, (0.0, 0.0, -depth_m)),
     ]
-
-
-def has_node(plan: ResolvedGraph, node_type: str) -> bool:
-    """Return whether the graph contains a node of that type or of a type derived from it."""
-    base = node_class(node_type)
-    return any(issubclass(node_class(node.type), base) for node in plan.nodes.values())
 
 
 def find_correction(plan: ResolvedGraph, scene: Scene) -> Correction:
@@ -178,8 +171,8 @@ def run_system(
     seconds: duration of the stroke. apparatus: file with true parameters of the simulated hardware.
     """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
-    has_images = has_node(plan, "renderer") and has_node(plan, "twin_eye")
-    has_forces = has_node(plan, "fem_solver")
+    has_images = bool(plan.nodes_of_type("renderer") and plan.nodes_of_type("twin_eye"))
+    has_forces = bool(plan.nodes_of_type("fem_solver"))
     correction = find_correction(plan, require_scene(plan))
     used = CpuUse()
 
@@ -317,7 +310,6 @@ def _read_force_errors(bag: Path) -> Floats:
 
 
 def _iterate_force_errors(bag: Path) -> Iterator[float]:
-    """Yield the absolute relative force error at each depth of the push, percent."""
     recorded = compliance.read_bag(bag)
     reference = compliance.ForceReference(recorded)
     press = compliance.make_presses(recorded.scene)[0]

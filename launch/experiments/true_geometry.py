@@ -9,18 +9,16 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import ArmSpec, Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
 from flexsheet.nodes.models.sheet import edge_force_n
 from flexsheet.nodes.twin.arms import forward, solve_inverse_kinematics
 from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
 from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
 
 
 def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Floats]:
@@ -74,13 +72,7 @@ class ArmPair:
         across = edges[1][:3, 3] - edges[0][:3, 3]
         length_m = float(np.linalg.norm(across))
         sheet = self._sheet
-        tension_n = edge_force_n(
-            length_m / sheet.width_m,
-            young_modulus_pa=sheet.young_modulus_pa,
-            width_m=sheet.width_m,
-            height_m=sheet.height_m,
-            thickness_m=sheet.thickness_m,
-        )
+        tension_n = edge_force_n(length_m / sheet.width_m, sheet)
         commanded = []
         for side, (spec, wanted) in enumerate(zip(self._specs, edges, strict=True)):
             edge, outwards = wanted.copy(), (-1.0, 1.0)[side]

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration
-from flexsheet.nodes import cache, node_class
+from flexsheet.nodes import cache
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.soft_body_factory import (
@@ -39,8 +39,6 @@ from flexsheet.nodes.planner.compliance import (
 from flexsheet.nodes.planner.hand_bounds import bounds_cache, load_or_compute_bounds
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
-
-Floats = NDArray[np.float64]
 
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
@@ -82,15 +80,8 @@ def compute_compliance(
     max_depth_m: maximum push depth; None for the scene's. bounds: limits that keep the loop of
     sheet and hand stable.
     """
-    return fit_compliance(
-        curve,
-        law,
-        make_stretch_limits(scene.sheet, law, bounds),
-        max_depth_m=scene.working_range.push_depth_m if max_depth_m is None else max_depth_m,
-        finger_radius_m=scene.finger.radius_m,
-        usable_half_height_m=scene.sheet.usable_half_height_m,
-        position_error_m=scene.tolerances.sheet_position_m,
-    )
+    limits = make_stretch_limits(scene.sheet, law, bounds)
+    return fit_compliance(curve, law, limits, scene, max_depth_m=max_depth_m)
 
 
 class LoopRisk(StrEnum):
@@ -166,10 +157,7 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     the planner reports the risk when they have been computed.
     """
     scene = plan.scene_message()
-    planners, solvers = (
-        [node for node in plan.nodes.values() if issubclass(node_class(node.type), kind)]
-        for kind in (node_class("planner"), node_class("fem_solver"))
-    )
+    planners, solvers = plan.nodes_of_type("planner"), plan.nodes_of_type("fem_solver")
     if scene is None or not planners or not solvers:
         return None
     given = PlannerParameters.model_validate(planners[0].parameters)

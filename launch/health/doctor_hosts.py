@@ -129,7 +129,6 @@ SELF_CHECK = "self-check"
 def evaluate_probes(
     plan: ResolvedGraph, here: str, probes: Mapping[str, HostProbe]
 ) -> list[HostFinding]:
-    """Return the findings of all probes, sorted by host."""
     found: list[HostFinding] = []
     own = probes[here].status
     reference = (
@@ -249,7 +248,6 @@ def _check_reachability(
 
 
 def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[HostFinding]:
-    """Compare the plan of a host with the local one, and report a latched e-stop."""
     assert probe.status is not None
     if probe.status.plan_hash == plan.hash:
         yield HostFinding(probe.host, "plan", "ok", plan.hash)
@@ -278,7 +276,6 @@ def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[Ho
 
 
 def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
-    """Compare the keys of a host with the launch file."""
     assert probe.status is not None
     theirs = {one.host: one.key for one in probe.status.keys}
     names = sorted(theirs.keys() | plan.keys.keys())
@@ -297,7 +294,6 @@ def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
 
 
 def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFinding:
-    """Compare the versions of a host with those of this computer."""
     status = probe.status
     assert status is not None
     python, versions, code = reference
@@ -359,7 +355,6 @@ def _check_clocks(
 
 
 def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
-    """Check that all nodes of a host are ready and were not restarted."""
     assert probe.status is not None
     nodes = probe.status.nodes
     missing = [one.name for one in nodes if one.state != "ready"]
@@ -376,7 +371,6 @@ def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
 
 
 def _check_rates(probe: HostProbe) -> HostFinding:
-    """Compare the rates of the nodes' ports with the table of topics."""
     odd, right, refused = [], 0, []
     for name, status in probe.nodes.items():
         ports = [(one, "publishes") for one in status.outputs]
@@ -429,7 +423,6 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
 
 
 def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[HostFinding]:
-    """Check the cameras, the projector and the arm of a host."""
     assert probe.status is not None
     host, missing = probe.host, probe.status.missing_devices
     devices = list_device_files(nodes)
@@ -487,7 +480,6 @@ def _check_arm(node: ResolvedNode, probe: HostProbe) -> HostFinding:
 
 
 def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostFinding:
-    """Distinguish a bridge that waits for its arm from a bridge that does not report."""
     status = probe.nodes.get(node.name)
     if status is None:
         return HostFinding(
@@ -501,7 +493,6 @@ def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostF
 
 
 def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
-    """Check the free disk space and memory of a host."""
     status = probe.status
     assert status is not None
     yield _check_disk(probe.host, status.disk_free_bytes)
@@ -515,7 +506,6 @@ def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
 
 
 def _check_load(status: HostStatus) -> HostFinding:
-    """Check whether the nodes of a host get enough processor time."""
     if is_busy(status):
         return HostFinding(status.host, "load", "warning", describe_busy(status), BUSY_REMEDY)
     what = f"load {status.load_ratio:.2f} per core"
@@ -556,7 +546,6 @@ def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
 def check_before_start(
     plan: ResolvedGraph, here: str, key_problem: str | None
 ) -> Iterator[HostFinding]:
-    """Check this computer, as a host of the graph, before the graph is started."""
     address, nodes = plan.hosts[here], plan.nodes_on(here)
     if is_loopback(address) or address in list_own_addresses():
         yield HostFinding(here, "address", "ok", f"{address} is an address of this computer")
@@ -610,7 +599,6 @@ def check_before_start(
 
 
 def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
-    """Check that the TCP ports of this host are free."""
     address = plan.hosts[here]
     ports = [
         int(writer.tcp.rpartition(":")[2])

@@ -31,6 +31,7 @@ from flexsheet.nodes.arm_bridge.reach import (
     find_best_reach,
     plan_path,
 )
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, make_shape
@@ -42,7 +43,6 @@ from flexsheet.nodes.planner.rolling import (
     roll_contact,
 )
 
-Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 TILTS, SIDE_TILTS, DEPTHS = 17, 5, 6
@@ -188,7 +188,6 @@ def sample_contacts(scene: Scene) -> list[ContactSample]:
 def _find_touchable_points(
     scene: Scene, world_from_object: Floats, closest: Callable[[Floats], Nearest]
 ) -> list[Nearest]:
-    """Return the distinct surface points whose normals are within the scene's maximum tilt."""
     most = scene.working_range.tilt_rad
     low, high = (np.array(v) for v in (scene.finger.volume_min_m, scene.finger.volume_max_m))
     fractions = np.linspace(0.0, 1.0, 3)
@@ -235,7 +234,6 @@ def _find_touchable_points(
 def _list_contacts(
     waiting: SheetContact, starts: Sequence[SheetContact], found: Nearest, most: Floats
 ) -> Iterator[SheetContact]:
-    """Yield the sheet's contact at its centre for one point, and those after the longest rolls."""
     yield waiting
     rolls = [roll_contact(contact, found) for contact in starts]
     position_sheet_m = np.array([contact.position_sheet_m for contact in rolls])
@@ -253,13 +251,7 @@ def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSampl
     speed is one of the motions that the arms must follow.
     """
     sheet = scene.sheet
-    longest = stretch_for_edge_force(
-        sheet.max_edge_force_n,
-        young_modulus_pa=sheet.young_modulus_pa,
-        width_m=sheet.width_m,
-        height_m=sheet.height_m,
-        thickness_m=sheet.thickness_m,
-    )
+    longest = stretch_for_edge_force(sheet.max_edge_force_n, sheet)
     # The margin keeps a rounding error from exceeding the limit.
     largest = max(sheet.min_stretch_ratio, min(sheet.max_stretch_ratio, longest) - 1e-9)
     poses, stretches, twists, tilts, depths, positions = [], [], [], [], [], []
@@ -302,7 +294,6 @@ def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Lay
 
 
 def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -> Iterator[str]:
-    """Yield the paths from the front of the object to the limits of the range that are blocked."""
     poses, reached = layout.samples.poses, layout.reached
     if not reached.any():
         return

@@ -174,7 +174,6 @@ async def _connect(address: str, port: int) -> int:
 
 
 async def _try_handshake(endpoint: str, host: str, keys: KeyRing | None) -> Reachability:
-    """Try a CURVE handshake, and return whether both ends prove their keys."""
     opened: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
     opened.setsockopt(zmq.LINGER, 0)
     monitor = opened.get_monitor_socket(sum(HANDSHAKES))
@@ -258,7 +257,6 @@ async def _listen(
 
 
 def _is_complete(plan: ResolvedGraph, probe: HostProbe) -> bool:
-    """Return whether all messages that the doctor needs from the host's nodes have arrived."""
     nodes = plan.nodes_on(probe.host)
     return (
         probe.status is not None

@@ -11,7 +11,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from textwrap import wrap
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.results import machine_name, replace_non_finite
 from flexsheet.launch.methods.svg import COLOURS, INK, page_style, save_svg
+from flexsheet.launch.plans.documents import did_you_mean
 from flexsheet.launch.running.code_state import read_git_state
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
@@ -51,17 +51,15 @@ class UnknownFamilyError(FlexsheetError, KeyError):
     """Raised if the user names a method family that does not exist."""
 
     code = "unknown-family"
+    exit_code = 2
     remedy = "Use one of the names that the error lists (`flexsheet chart --help`)."
 
 
 def find_family(name: str) -> Family:
     """Return the method family with a name. Raises UnknownFamilyError."""
     if name not in FAMILIES:
-        near = get_close_matches(name, FAMILIES, n=1)
-        hint = (
-            f'; did you mean "{near[0]}"?' if near else f"; known families: {', '.join(FAMILIES)}"
-        )
-        raise UnknownFamilyError(f'unknown family "{name}"{hint}')
+        hint = did_you_mean(name, list(FAMILIES))
+        raise UnknownFamilyError(f'unknown family "{name}"; {hint}')
     return load_family(FAMILIES[name])
 
 
@@ -284,7 +282,6 @@ def _is_finite(value: float | None) -> bool:
 
 
 def _has_reference(point: dict[str, Any]) -> bool:
-    """Return whether the error of a point is known, that is, a reference was available."""
     return _is_finite(point["error"])
 
 
@@ -318,7 +315,6 @@ def read_charts(folder: Path) -> list[dict[str, Any]]:
 
 
 def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
-    """Add the keys that results of earlier versions do not contain."""
     points = [
         {
             "extra_metrics": {},

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from ruamel.yaml import YAML
 
 from flexsheet.launch.experiments import ExperimentError
-from flexsheet.launch.plans.documents import did_you_mean
+from flexsheet.launch.plans.documents import did_you_mean, edit_yaml
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.precompute import (
     precompute_deflection_shapes,
@@ -19,9 +18,8 @@ from flexsheet.launch.running.precompute import (
 )
 from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes import node_class
 from flexsheet.nodes.fem_solver.benchmarks import LINEAR_DEPTH_M
-from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel
+from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetPush
 from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.renderer.benchmarks import MAX_TRIANGLES_DEPTH_MM, is_in_range
 
@@ -94,8 +92,7 @@ class Configuration:
         return [
             f"{node.name}.{text}"
             for node_type, text in chosen
-            for node in graph.nodes.values()
-            if issubclass(node_class(node.type), node_class(node_type))
+            for node in graph.nodes_of_type(node_type)
         ]
 
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
@@ -119,7 +116,7 @@ def choose_cheapest(scene: Scene) -> Methods:
     stretch = 0.5 * (scene.sheet.min_stretch_ratio + scene.sheet.max_stretch_ratio)
     rubber = make_rubber(scene.sheet)
     is_scaled = not ScaledSheetModel(rubber).invalid_reason(
-        stretch, depth_m, position_m=(0.0, 0.0), finger_radius_m=scene.finger.radius_m
+        SheetPush(stretch, scene.finger.radius_m), depth_m
     )
     corrections = ("one_plane", "four_triangles", "two_pass")
     limits = {"tilt_deg": min(float(tilt_deg), 50.0), "push_mm": 1e3 * depth_m}
@@ -184,16 +181,13 @@ def select_configurations(scene: Scene, names: Collection[str]) -> list[Configur
 
 def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path:
     """Write a copy of a launch file with another scene; relative paths become absolute."""
-    yaml = YAML()
-    launch = yaml.load(launch_file.read_text())
-    launch["scene"] = str(scene_file.resolve())
-    launch.pop("record", None)
-    for spec in launch["nodes"].values():
-        given = spec.get("parameters", {})
-        for parameter, value in given.items():
-            file = launch_file.parent / str(value)
-            if isinstance(value, str) and file.is_file():
-                given[parameter] = str(file.resolve())
-    with target.open("w") as output:
-        yaml.dump(launch, output)
+    with edit_yaml(launch_file, target) as launch:
+        launch["scene"] = str(scene_file.resolve())
+        launch.pop("record", None)
+        for spec in launch["nodes"].values():
+            given = spec.get("parameters", {})
+            for parameter, value in given.items():
+                file = launch_file.parent / str(value)
+                if isinstance(value, str) and file.is_file():
+                    given[parameter] = str(file.resolve())
     return target

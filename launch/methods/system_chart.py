@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.offline import metric_tolerances
@@ -39,11 +38,10 @@ from flexsheet.launch.methods.results import describe_load, machine_name
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes import node_class
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.methods import Interval
 from flexsheet.nodes.twin.tolerance_table import Profile
 
-Floats = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 FIRST_SEED = 100
@@ -125,12 +123,8 @@ def plan_trials(
 
 def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
     """Return settings that give the finger the same random motion in all runs of a block."""
-    finger = node_class("twin_finger")
-    return [
-        f"{node.name}.seed={FINGER_SEED + block}"
-        for node in graph.nodes.values()
-        if issubclass(node_class(node.type), finger)
-    ]
+    seed = FINGER_SEED + block
+    return [f"{node.name}.seed={seed}" for node in graph.nodes_of_type("twin_finger")]
 
 
 def plan_configuration(

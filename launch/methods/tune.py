@@ -213,7 +213,6 @@ class Choice:
         return f"{self.family}: {left}; {rest}"
 
     def _describe_fault(self, one: MethodEvaluation) -> str:
-        """Return the reason why a method is not sufficient, as a part of a sentence."""
         parts = []
         if one.wrong:
             error = f"{_format(one.error)} {self.unit} at {_format_case(one.worst_case)}"
@@ -345,7 +344,6 @@ def find_choice(choices: Sequence[Choice], family: str) -> Choice | None:
 
 
 def _load_tracking(path: str, *, noise_px: float) -> Family:
-    """Load the tracking family for measurement noise equal to the chosen marker method's error."""
     from flexsheet.launch.methods.benchmarks import make_finger_motions
     from flexsheet.nodes.triangulator.tracking_benchmark import make_tracking_family
 

@@ -47,7 +47,6 @@ def check_hosts(hosts: dict[str, HostSpec], document: Document) -> None:
 
 
 def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
-    """Check that, if any host has a key, every host has a valid key of its own."""
     host_by_key: dict[str, str] = {}
     for name, host in hosts.items():
         where: Key = ("hosts", name, "key")
@@ -96,5 +95,4 @@ def clock_node(host: str) -> str:
 
 
 def is_loopback(address: str) -> bool:
-    """Return whether an IP address is a loopback address."""
     return ipaddress.ip_address(address).is_loopback

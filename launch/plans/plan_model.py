@@ -17,7 +17,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bus import Source
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes import NodeRole, OmissionReason
+from flexsheet.nodes import NodeRole, OmissionReason, node_class
 
 MAIN = "main"
 """Name of the host on which the launcher's topics, the recorder and command-line tools run."""
@@ -151,7 +151,6 @@ class ResolvedNode(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _add_missing_fields(cls, values: Any) -> Any:
-        """Derive the fields that plans in older bags do not contain."""
         if not isinstance(values, dict):
             return values
         derived: dict[str, Any] = {"role": ROLES_OF_TYPES.get(str(values.get("type")))}
@@ -237,6 +236,11 @@ class ResolvedGraph(StrictModel):
     def nodes_on(self, host: str | None) -> list[ResolvedNode]:
         """Return the nodes on one host; None selects all hosts."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
+
+    def nodes_of_type(self, node_type: str) -> list[ResolvedNode]:
+        """Return the nodes whose class is that of `node_type`, or derives from it."""
+        base = node_class(node_type)
+        return [one for one in self.nodes.values() if issubclass(node_class(one.type), base)]
 
     def processes_on(
         self, host: str | None, *, without: Collection[str] = ()

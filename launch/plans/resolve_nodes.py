@@ -172,7 +172,6 @@ def resolve_entry(entry: NodeEntry, document: Document) -> None:
 
 
 def _describe_import_remedy(type_name: str, error: Exception) -> str:
-    """Return the remedy for a node class that cannot be imported."""
     module, _, name = type_name.partition(":")
     if isinstance(error, ModuleNotFoundError) and error.name:
         if module == error.name or module.startswith(f"{error.name}."):

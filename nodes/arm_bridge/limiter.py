@@ -93,13 +93,7 @@ class SheetLimits:
 
     def force_n(self, length_m: float) -> float:
         """Return the force (N) on each edge of the sheet when the edges are this far apart."""
-        return edge_force_n(
-            length_m / self.width_m,
-            young_modulus_pa=self.young_modulus_pa,
-            width_m=self.width_m,
-            height_m=self.height_m,
-            thickness_m=self.thickness_m,
-        )
+        return edge_force_n(length_m / self.width_m, self)
 
 
 def limit_velocity(

@@ -208,18 +208,7 @@ def _margins(
     position = flanges[:, :3, 3]
     inside = np.minimum(position - limits.workspace_min_m, limits.workspace_max_m - position)
     apart = np.linalg.norm(position - others[:, :3, 3], axis=1)
-    force = np.array(
-        [
-            edge_force_n(
-                stretch,
-                young_modulus_pa=limits.young_modulus_pa,
-                width_m=limits.width_m,
-                height_m=limits.height_m,
-                thickness_m=limits.thickness_m,
-            )
-            for stretch in places.stretch_ratio.tolist()
-        ]
-    )
+    force = np.array([edge_force_n(stretch, limits) for stretch in places.stretch_ratio.tolist()])
     margin = np.minimum(joints - joint_limits.min_rad, joint_limits.max_rad - joints)
     base_from_flange = geometry.base_from_world @ flanges
     wrist = base_from_flange[:, :3, 3] - FLANGE_M * base_from_flange[:, :3, 2]

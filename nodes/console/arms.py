@@ -13,9 +13,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
-
-Floats = NDArray[np.float64]
 
 JOINTS = (
     ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),

@@ -1,7 +1,7 @@
 """Carry out the requests of the console page's viewers, in the console node's asyncio loop.
 
-The "eye view" is an image of what the user sees: a camera in the digital twin traces the projected
-frame from the viewpoint of the user's eye.
+The "eye view" is the image that a user sees: a camera in the simulator traces the projected frame
+from the position of the user's eye.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
@@ -30,7 +29,6 @@ from flexsheet.nodes.console.picking import SurfacePicker
 from flexsheet.nodes.console.replay import Timeline, list_bags
 from flexsheet.nodes.console.state_file import ConsoleState, load_state, save_state
 
-Floats = NDArray[np.float64]
 Publish = Callable[[Message], None]
 
 SETTLE_S = 0.4

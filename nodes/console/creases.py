@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
+
 Triangles = NDArray[np.int32]
 
 CREASE_RAD = 0.7

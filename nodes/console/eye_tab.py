@@ -1,4 +1,4 @@
-"""Show the page's tab with images of what the user's eye sees."""
+"""Show the page's tab with the images that the simulated eye sees."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMAGES = (
 
 
 class EyeTab:
-    """Tab with the images of what the user's eye sees; an image is visible once it exists."""
+    """Tab with the images that the simulated eye sees; each is hidden until it exists."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._enabled = gui.add_checkbox(
@@ -32,7 +32,7 @@ class EyeTab:
         )
         on_value(self._enabled, lambda on: request("eye_view", on))
         on_value(self._correction, lambda name: request("correct", name))
-        self._text = Html(gui)
+        self.text = Html(gui)
         blank = np.full((3, 4, 3), 235, dtype=np.uint8)
         self._images = {
             name: gui.add_image(blank, label=label, jpeg_quality=85, visible=False)
@@ -42,9 +42,6 @@ class EyeTab:
     def show_correction(self, correction: Correction) -> None:
         """Show which image correction is active: the scene's or the one that a viewer chose."""
         self._correction.value = correction
-
-    def show_text(self, html: str) -> None:
-        self._text.show(html)
 
     def show_image(self, name: str, image: NDArray[np.uint8]) -> None:
         self._images[name].image = image

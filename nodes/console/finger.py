@@ -6,13 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.base import Message
 from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
-
-Floats = NDArray[np.float64]
 
 LABEL = "console"
 FRONT_M = 1.5
@@ -77,7 +75,8 @@ class FingerController:
     """Controller that moves the simulated finger to the requested position at a limited speed.
 
     Each step is published as a path of one point. Nothing is published before the viewer's first
-    command, so that other programs can control the finger.
+    command, so that other programs can control the finger. commanded: whether a viewer has moved
+    the finger. position_m: requested position (x, y) as seen from the front.
     """
 
     def __init__(self, publish: Callable[[Message], None], *, speed_m_per_s: float) -> None:
@@ -86,8 +85,8 @@ class FingerController:
         self._target: Floats | None = None
         self._arrived = False
         self._last_point = np.array([0.0, 0.0, 0.08])
-        self._position_m = (0.0, 0.0)
-        self._commanded = False
+        self.position_m = (0.0, 0.0)
+        self.commanded = False
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
@@ -97,18 +96,8 @@ class FingerController:
 
     def restore(self, intent: FingerIntent) -> None:
         """Continue with the request that the previous console process saved."""
-        self.intent, self._commanded = intent, True
+        self.intent, self.commanded = intent, True
         self._update_target()
-
-    @property
-    def commanded(self) -> bool:
-        """Return whether a viewer has moved the finger."""
-        return self._commanded
-
-    @property
-    def position_m(self) -> tuple[float, float]:
-        """Return the requested position (x, y) as seen from the front, m."""
-        return self._position_m
 
     def touch(self, origin: Floats, direction: Floats) -> None:
         """Push at the point where a ray from the viewer's eye meets the object."""
@@ -128,24 +117,22 @@ class FingerController:
         self._request(lifted=True)
 
     def lift_or_lower(self) -> None:
-        """Lift the finger, or lower it if it is lifted."""
         self._request(lifted=not self.intent.lifted)
 
     def _request(self, **changes: object) -> None:
         self.intent = replace(self.intent, **changes)  # type: ignore[arg-type]  # fields of it
-        self._commanded = True
+        self.commanded = True
         self._update_target()
 
     def _update_target(self) -> None:
-        """Compute the target position, if there are a request and an object."""
         self._target, self._arrived = None, False
         position = self.intent.position
         if position.is_from_front:
-            self._position_m = position.origin_m[:2]
-        if self._picker is not None and self._commanded:
+            self.position_m = position.origin_m[:2]
+        if self._picker is not None and self.commanded:
             self._target = target = self.intent.target_m(self._picker)
             if not position.is_from_front:
-                self._position_m = float(target[0]), float(target[1])
+                self.position_m = float(target[0]), float(target[1])
 
     def advance(self, duration_s: float, measured: Floats | None) -> bool:
         """Publish the next step towards the target, if any; return whether it was the last step.

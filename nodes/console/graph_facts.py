@@ -28,11 +28,6 @@ class GraphFacts:
     solvers: tuple[str, ...] = ()
     consoles: tuple[str, ...] = ()
 
-    @property
-    def sampling_readers(self) -> tuple[str, ...]:
-        """Return the names of nodes that skip messages by design, because they only sample them."""
-        return self.consoles
-
     @classmethod
     def from_plan(cls, plan_file: Path, console: str) -> Self:
         """Read the plan of the run.  console: name of the console's node."""

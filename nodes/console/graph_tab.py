@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console import panels
 from flexsheet.nodes.console.controls import Html
 from flexsheet.nodes.console.history import SERIES, WINDOW_S, widen_isolated
-
-Floats = NDArray[np.float64]
 
 
 class GraphTab:

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.types import ArmState, Fingertip, Frame, SheetTarget, SoftBody
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.latest_messages import MessageSource
-
-Floats = NDArray[np.float64]
 
 WINDOW_S = 30.0
 SAMPLE_S = 0.5

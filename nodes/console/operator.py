@@ -27,6 +27,7 @@ from flexsheet.messages.types import (
     Status,
     TwinEye,
 )
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console import panels
 from flexsheet.nodes.console.banner import GraphState
 from flexsheet.nodes.console.controller import SETTLE_S, ConsoleController
@@ -37,8 +38,6 @@ from flexsheet.nodes.console.page import Page
 from flexsheet.nodes.console.record_tab import NO_BAG
 from flexsheet.nodes.console.scene_view import LAYERS
 from flexsheet.nodes.console.snapshot import compute_snapshot
-
-Floats = NDArray[np.float64]
 
 MAX_WIDTH_PX = 340
 """Maximum width of the images on the page."""
@@ -114,9 +113,9 @@ class Operator:
             "bookmark": self._bookmark,
             "open_bag": self._open_bag,
             "leave": self._leave,
-            "play": self._play,
+            "play": controller.replay.play_or_pause,
             "seek": controller.replay.seek,
-            "replay_rate": self._set_rate,
+            "replay_rate": partial(setattr, controller.replay, "rate"),
         }
 
     @property
@@ -218,7 +217,7 @@ class Operator:
         latencies = panels.make_latency_table(self._history.latest_and_max())
         tables = (
             latencies
-            + panels.make_topics_table(ages, self.controller.facts.sampling_readers)
+            + panels.make_topics_table(ages, self.controller.facts.consoles)
             + panels.make_nodes_table(ages)
         )
         self._page.graph.show(tables, self._history.columns())
@@ -282,7 +281,7 @@ class Operator:
             waited_s=eye_view.waited_s(now_s),
             ago_s=None if self._image_s is None else now_s - self._image_s,
         )
-        self._page.eye.show_text(text)
+        self._page.eye.text.show(text)
 
     def _touch(self, origin: Floats, direction: Floats) -> None:
         self._command_finger(self.controller.finger.touch, origin, direction)
@@ -307,7 +306,6 @@ class Operator:
         self._page.touch.show_lifted(finger)
 
     def _on_new_scene(self) -> None:
-        """Store the time at which the scene changed, and prepare picking points on its object."""
         self._sent_ns = round(1e9 * self._now_s)
         self.controller.scenes.make_picker(self.controller.finger, self._page.show_problem)
 
@@ -370,12 +368,6 @@ class Operator:
     def _leave(self) -> None:
         self.controller.replay.leave()
         self._page.record.show_replay(self.controller.replay, opened=True)
-
-    def _play(self) -> None:
-        self.controller.replay.play_or_pause()
-
-    def _set_rate(self, rate: float) -> None:
-        self.controller.replay.rate = rate
 
 
 def downsample_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -60,7 +60,6 @@ class Page:
             self.record = RecordTab(self._gui, request)
 
     def _add_stop(self) -> None:
-        """Add the e-stop button in a separate window, which tabs and scrolling cannot hide."""
         panel = self._gui.add_panel()
         with panel.add_tab("Stop", viser.Icon.HAND_STOP):
             stop = self._gui.add_button(

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Shape, make_shape
-
-Floats = NDArray[np.float64]
 
 MAX_RAY_M = 3.0
 SURFACE_TOLERANCE_M = 1e-4

@@ -57,7 +57,6 @@ class RecordTab:
             self._bookmarks.value = NO_BOOKMARK
 
     def show_state(self, html: str, *, recording: bool) -> None:
-        """Show the state of the recorder."""
         self._text.show(html)
         self._record.label = "Stop recording" if recording else "Start recording"
         self._record.color = RECORDING_COLOR if recording else None

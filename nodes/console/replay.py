@@ -53,7 +53,6 @@ class Timeline:
         return check_type(cached[1], kind)
 
     def _times(self, name: str) -> tuple[list[int], list[Chunk]]:
-        """Return the log times of a topic's messages in order, and the chunk that contains each."""
         entries = [
             (time_ns, chunk.offset, chunk)
             for chunk in self._reader.chunks

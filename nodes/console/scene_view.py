@@ -10,6 +10,7 @@ import viser
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import ArmSpec, Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.arms import (
     CLAMP_SIZE_M,
     PIECES,
@@ -32,7 +33,6 @@ from flexsheet.nodes.models.rigid import (
     transform,
 )
 
-Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
 
 ARM: Color = (222, 226, 232)
@@ -281,7 +281,6 @@ class SceneView:
         self._finger_color = FINGER
 
     def _add_devices(self, scene: Scene) -> None:
-        """Add the stereo camera, the projector and the user's eyes, with their lenses."""
         camera = scene.camera
         left = pose_matrix(camera.world_from_left)
         baseline_m = -float(camera.right_from_left[0, 3])

@@ -7,17 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Geometry, Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rotation_from_rpy
 from flexsheet.nodes.models.shapes import GEOMETRIES
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
-
-Floats = NDArray[np.float64]
-
 
 MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 """Minimum and step of the slider for the sheet's tension (stretch ratio)."""
@@ -90,13 +87,7 @@ def edit_scene(
 def max_stretch_ratio(scene: Scene) -> float:
     """Return the upper end of the tension slider, from the scene's limits of stretch and force."""
     sheet = scene.sheet
-    strongest = stretch_for_edge_force(
-        sheet.max_edge_force_n,
-        young_modulus_pa=sheet.young_modulus_pa,
-        width_m=sheet.width_m,
-        height_m=sheet.height_m,
-        thickness_m=sheet.thickness_m,
-    )
+    strongest = stretch_for_edge_force(sheet.max_edge_force_n, sheet)
     limit = min(sheet.max_stretch_ratio, strongest)
     # Round down to the slider's step, but never below the stretch of the scene itself.
     steps = np.floor((limit - 1.0) / STRETCH_STEP + 1e-6)
@@ -104,7 +95,6 @@ def max_stretch_ratio(scene: Scene) -> float:
 
 
 def _with(part: Any, **changes: Any) -> Any:
-    """Copy a part of a message with some fields changed, and validate it."""
     fields = {name: getattr(part, name) for name in type(part).model_fields}
     return type(part)(**fields | changes)
 

@@ -11,10 +11,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.sheet import corners, sheet_from_edges
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
 COLUMNS, ROWS = 41, 41

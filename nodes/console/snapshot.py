@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, Fingertip, Skin, SoftBody
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.arms import compute_link_poses
 from flexsheet.nodes.console.latest_messages import MessageSource
 from flexsheet.nodes.console.sheet import compute_sheet_points, intersect_sheet
 from flexsheet.nodes.models.rigid import pose_matrix
-
-Floats = NDArray[np.float64]
 
 RAY_POSITIONS = (-0.55, 0.0, 0.55)
 """Positions of the drawn light rays, as fractions of half the object's width and height."""

@@ -99,7 +99,7 @@ def local_processes(count: int) -> Iterator[Executor]:
 
 
 stop_requested: ContextVar[Callable[[], bool]] = ContextVar("stop_requested", default=lambda: False)
-"""Function that tells a worker whether the current job must stop."""
+"""Function that returns whether a worker must stop its current job."""
 
 
 def _init_worker(stop: Event) -> None:

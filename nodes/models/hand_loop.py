@@ -17,10 +17,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 MIN_DECAY_PER_S = 0.5
 """Minimum decay rate of the slowest mode at which the loop counts as stable."""

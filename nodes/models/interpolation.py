@@ -8,10 +8,8 @@ from __future__ import annotations
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-
+from flexsheet.nodes.arrays import Floats
 
 Real = TypeVar("Real", float, Floats)
 

@@ -10,16 +10,14 @@ from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import (
     moved,
     rotation_from_vector,
     transform,
     vector_from_rotation,
 )
-
-Floats = NDArray[np.float64]
 
 BRAKE_FRACTION = 1.0 / 3.0
 """Fraction of the acceleration for braking towards the target; the rest is for following it."""

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 MAX_GAP_S = 1.0
 """Maximum duration of one sample; a longer pause contains no information."""

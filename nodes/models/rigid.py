@@ -10,9 +10,9 @@ from math import atan2, cos, hypot, inf, isfinite, nan, sin, sqrt
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 _UNIT: Floats = np.eye(4)
 

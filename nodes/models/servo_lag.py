@@ -13,9 +13,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 GRID_STEP_S = 0.004
 """Step of the grid of lags.  A parabola through three grid points gives the minimum."""

@@ -23,11 +23,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline, PchipInterpolator
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.scene import SheetSpec
+from flexsheet.messages.scene import Scene, SheetSpec
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import OffsetBounds
 from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.sheet import (
@@ -40,11 +40,10 @@ from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,
     SheetForceModel,
     SheetPosition,
+    SheetPush,
     depth_for_force,
     interpolate_inverse,
 )
-
-Floats = NDArray[np.float64]
 
 USABLE_FRACTION = 0.85
 """Fraction of the maximum edge force and strain that the planner uses.
@@ -188,10 +187,8 @@ def make_stretch_limits(
 
 def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
     """Return the force (N) on each clamp of the sheet without a push."""
-    flat = model.evaluate(
-        stretch_ratio, np.zeros(1), position_m=CENTRE, finger_radius_m=0.03 * model.rubber.width_m
-    )
-    return float(flat.edge_force_n[0])
+    push = SheetPush(stretch_ratio, finger_radius_m=0.03 * model.rubber.width_m)
+    return float(model.evaluate(push, np.zeros(1)).edge_force_n[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,11 +243,9 @@ def render_force(
     curve: ObjectCurve,
     model: SheetForceModel,
     limits: StretchLimits,
+    push: SheetPush,
     *,
-    stretch_ratio: float,
     max_depth_m: float,
-    position_m: SheetPosition = CENTRE,
-    finger_radius_m: float,
 ) -> RenderedForce:
     """Compute the best approximation of the object's force with one stretch at one position.
 
@@ -259,37 +254,19 @@ def render_force(
     """
     depths = max_depth_m * DEPTH_FRACTIONS
     desired = curve.force_n(depths)
-    ideal = depth_for_force(
-        model,
-        stretch_ratio,
-        desired,
-        max_depth_m=(1.0 + limits.max_advance_per_depth) * max_depth_m,
-        position_m=position_m,
-        finger_radius_m=finger_radius_m,
-    )
-    without_offset = model.evaluate(
-        stretch_ratio, depths, position_m=position_m, finger_radius_m=finger_radius_m
-    )
+    max_ideal_m = (1.0 + limits.max_advance_per_depth) * max_depth_m
+    ideal = depth_for_force(model, push, desired, max_depth_m=max_ideal_m)
+    without_offset = model.evaluate(push, depths)
     ideal = _apply_deadband(depths, ideal, np.maximum(desired, without_offset.force_n))
     max_indentation = _indentation_for_edge_force(
-        model,
-        limits.edge_force_n,
-        stretch_ratio=stretch_ratio,
-        max_depth_m=max_depth_m,
-        position_m=position_m,
-        finger_radius_m=finger_radius_m,
+        model, limits.edge_force_n, push, max_depth_m=max_depth_m
     )
     saturated = _saturate(ideal, max_indentation)
-    stiffnesses = model.evaluate(
-        stretch_ratio, saturated, position_m=position_m, finger_radius_m=finger_radius_m
-    ).stiffness_n_per_m
-    advances = limits.max_advance(stiffnesses)
+    advances = limits.max_advance(model.evaluate(push, saturated).stiffness_n_per_m)
     growth = 1.0 + np.minimum(advances[1:], advances[:-1])
     max_growth = np.concatenate([[0.0], np.cumsum(growth * np.diff(depths))])
     indentation = max_growth + np.minimum.accumulate(saturated - max_growth)
-    rendered = model.evaluate(
-        stretch_ratio, indentation, position_m=position_m, finger_radius_m=finger_radius_m
-    )
+    rendered = model.evaluate(push, indentation)
     slopes = np.diff(indentation) / np.diff(depths)
     return RenderedForce(
         depths_m=depths,
@@ -304,24 +281,15 @@ def render_force(
 
 
 def _indentation_for_edge_force(
-    model: SheetForceModel,
-    edge_force_n: float,
-    *,
-    stretch_ratio: float,
-    max_depth_m: float,
-    position_m: SheetPosition,
-    finger_radius_m: float,
+    model: SheetForceModel, edge_force_n: float, push: SheetPush, *, max_depth_m: float
 ) -> float:
     """Return the indentation (m) with this force on each clamp; 0 if the flat sheet exceeds it."""
     grid = 2.0 * max_depth_m * DEPTH_FRACTIONS[1:]
-    flat = _flat_edge_force_n(model, stretch_ratio)
+    flat = _flat_edge_force_n(model, push.stretch_ratio)
     if flat >= edge_force_n:
         # `make_stretch_limits` keeps the flat sheet within the limit, apart from rounding errors.
         return 0.0 if flat > edge_force_n * (1.0 + 1e-6) else float(grid[0])
-    pushed = model.evaluate(
-        stretch_ratio, grid, position_m=position_m, finger_radius_m=finger_radius_m
-    )
-    added = pushed.edge_force_n - flat
+    added = model.evaluate(push, grid).edge_force_n - flat
     if added[-1] <= edge_force_n - flat:
         return float(grid[-1])
     return float(interpolate_inverse(grid, added, np.array([edge_force_n - flat]))[0])
@@ -419,12 +387,8 @@ class Compliance:
 
     def rendered_force_n(self, depths_m: Floats, position_m: SheetPosition = CENTRE) -> Floats:
         """Return the force (n,), N, that the sheet's model predicts at depths (n,)."""
-        return self.model.evaluate(
-            self.stretch_ratio,
-            self.indentation_m(depths_m, position_m),
-            position_m=position_m,
-            finger_radius_m=self.finger_radius_m,
-        ).force_n
+        push = SheetPush(self.stretch_ratio, self.finger_radius_m, position_m)
+        return self.model.evaluate(push, self.indentation_m(depths_m, position_m)).force_n
 
     def _weights(self, position_m: SheetPosition) -> Floats:
         """Return weights (9,) for interpolation between the positions of `_nodes`.
@@ -453,29 +417,67 @@ def fit_compliance(
     curve: ObjectCurve,
     model: SheetForceModel,
     limits: StretchLimits,
+    scene: Scene,
     *,
-    max_depth_m: float,
-    finger_radius_m: float,
-    usable_half_height_m: float,
-    position_error_m: float,
+    stretch_ratio: float | None = None,
+    max_depth_m: float | None = None,
 ) -> Compliance:
-    """Find the stretch and the offset that best render the curve for pushes to `max_depth_m`.
+    """Find the stretch and the offset that best render the curve in a scene.
 
-    usable_half_height_m: maximum |y| of a push on the sheet.
-    position_error_m: the scene's tolerance of the sheet's position.  The note reports an object
-        that is so soft that this error changes its force noticeably.
+    stretch_ratio: stretch to keep; None: choose the best one. max_depth_m: depth of the deepest
+    push; None: that of the scene. The note reports an object that is so soft that the scene's
+    tolerance of the sheet's position changes its force noticeably.
     """
-    stretches = np.unique(
-        np.linspace(limits.min_stretch_ratio, limits.max_stretch_ratio, STRETCH_CANDIDATES)
-    )
-    tried = [
+    depth_m = scene.working_range.push_depth_m if max_depth_m is None else max_depth_m
+    radius_m, rubber = scene.finger.radius_m, model.rubber
+    if stretch_ratio is None:
+        stretch_ratio = _find_best_stretch(
+            curve, model, limits, max_depth_m=depth_m, finger_radius_m=radius_m
+        )
+    half_height_m = min(scene.sheet.usable_half_height_m, 0.4 * rubber.height_m)
+    xs = 0.5 * rubber.width_m * np.array([0.0, 0.3, 0.5])
+    ys = half_height_m * np.array([0.0, 0.6, 1.0])
+    at_nodes = [
         render_force(
             curve,
             model,
             limits,
-            stretch_ratio=float(stretch),
-            max_depth_m=max_depth_m,
-            finger_radius_m=finger_radius_m,
+            SheetPush(stretch_ratio, radius_m, (float(x), float(y))),
+            max_depth_m=depth_m,
+        )
+        for x in xs
+        for y in ys
+    ]
+    indentation = BSpline(
+        depth_m * _KNOTS, np.column_stack([one.indentation_m for one in at_nodes]), 2
+    )
+    return Compliance(
+        stretch_ratio=stretch_ratio,
+        note=_note(at_nodes[0], scene.tolerances.sheet_position_m),
+        centre=at_nodes[0],
+        model=model,
+        limits=limits,
+        finger_radius_m=radius_m,
+        _nodes=(xs, ys),
+        _indentation=indentation,
+        _growth=indentation.derivative(),
+    )
+
+
+def _find_best_stretch(
+    curve: ObjectCurve,
+    model: SheetForceModel,
+    limits: StretchLimits,
+    *,
+    max_depth_m: float,
+    finger_radius_m: float,
+) -> float:
+    stretches = np.unique(
+        np.linspace(limits.min_stretch_ratio, limits.max_stretch_ratio, STRETCH_CANDIDATES)
+    ).tolist()
+    tried = [
+        render_force(
+            curve, model, limits, SheetPush(stretch, finger_radius_m), max_depth_m=max_depth_m
         )
         for stretch in stretches
     ]
@@ -485,60 +487,7 @@ def fit_compliance(
         (number for number, error in enumerate(max_errors) if error <= allowed),
         key=lambda number: (round(tried[number].advance_per_depth, 2), number),
     )
-    return fit_at_stretch(
-        curve,
-        model,
-        limits,
-        stretch_ratio=float(stretches[chosen]),
-        max_depth_m=max_depth_m,
-        finger_radius_m=finger_radius_m,
-        usable_half_height_m=usable_half_height_m,
-        position_error_m=position_error_m,
-    )
-
-
-def fit_at_stretch(
-    curve: ObjectCurve,
-    model: SheetForceModel,
-    limits: StretchLimits,
-    *,
-    stretch_ratio: float,
-    max_depth_m: float,
-    finger_radius_m: float,
-    usable_half_height_m: float,
-    position_error_m: float,
-) -> Compliance:
-    """Find the offset that best renders the curve with a given stretch; see `fit_compliance`."""
-    rubber = model.rubber
-    xs = 0.5 * rubber.width_m * np.array([0.0, 0.3, 0.5])
-    ys = min(usable_half_height_m, 0.4 * rubber.height_m) * np.array([0.0, 0.6, 1.0])
-    at_nodes = [
-        render_force(
-            curve,
-            model,
-            limits,
-            stretch_ratio=stretch_ratio,
-            max_depth_m=max_depth_m,
-            position_m=(float(x), float(y)),
-            finger_radius_m=finger_radius_m,
-        )
-        for x in xs
-        for y in ys
-    ]
-    indentation = BSpline(
-        max_depth_m * _KNOTS, np.column_stack([one.indentation_m for one in at_nodes]), 2
-    )
-    return Compliance(
-        stretch_ratio=stretch_ratio,
-        note=_note(at_nodes[0], position_error_m),
-        centre=at_nodes[0],
-        model=model,
-        limits=limits,
-        finger_radius_m=finger_radius_m,
-        _nodes=(xs, ys),
-        _indentation=indentation,
-        _growth=indentation.derivative(),
-    )
+    return float(stretches[chosen])
 
 
 def _note(rendered: RenderedForce, position_error_m: float) -> str:
@@ -587,13 +536,7 @@ class StretchChoice:
 
 def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
     """Return the stretch limits of the scene, reduced to the usable edge force and strain."""
-    at_max_force = stretch_for_edge_force(
-        USABLE_FRACTION * sheet.max_edge_force_n,
-        young_modulus_pa=sheet.young_modulus_pa,
-        width_m=sheet.width_m,
-        height_m=sheet.height_m,
-        thickness_m=sheet.thickness_m,
-    )
+    at_max_force = stretch_for_edge_force(USABLE_FRACTION * sheet.max_edge_force_n, sheet)
     at_max_strain = 1.0 + USABLE_FRACTION * (sheet.max_stretch_ratio - 1.0)
     return sheet.min_stretch_ratio, max(sheet.min_stretch_ratio, min(at_max_strain, at_max_force))
 
@@ -605,20 +548,10 @@ def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
     """
     least, largest = compute_stretch_range(sheet)
     desired = stretch_for_edge_force(
-        edge_force_for_stiffness(stiffness_n_per_m, width_m=sheet.width_m),
-        young_modulus_pa=sheet.young_modulus_pa,
-        width_m=sheet.width_m,
-        height_m=sheet.height_m,
-        thickness_m=sheet.thickness_m,
+        edge_force_for_stiffness(stiffness_n_per_m, width_m=sheet.width_m), sheet
     )
     stretch = min(max(desired, least), largest)
-    force = edge_force_n(
-        stretch,
-        young_modulus_pa=sheet.young_modulus_pa,
-        width_m=sheet.width_m,
-        height_m=sheet.height_m,
-        thickness_m=sheet.thickness_m,
-    )
+    force = edge_force_n(stretch, sheet)
     rendered = push_stiffness_n_per_m(force, width_m=sheet.width_m)
     note = ""
     if desired < least:

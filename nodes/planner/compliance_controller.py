@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.methods import ComplianceMode
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import SoftBody
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import OffsetBoundsTable
-from flexsheet.nodes.models.sheet.force_models import CENTRE, SheetForceModel, SheetPosition
+from flexsheet.nodes.models.sheet.force_models import SheetForceModel, SheetPosition, SheetPush
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
     Compliance,
     ObjectCurve,
     StretchLimits,
     choose_stretch,
-    fit_at_stretch,
     fit_compliance,
     make_stretch_limits,
 )
 from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
-
-Floats = NDArray[np.float64]
 
 EQUAL_RATIO = 0.02
 """Relative difference below which two force curves count as equal; users notice seven times it."""
@@ -66,7 +61,7 @@ class ComplianceController:
         self._scene, self._model, self._mode = scene, model, mode
         ratio = scene.sheet.hysteresis_ratio if hysteresis_ratio is None else hysteresis_ratio
         self._hysteresis = HysteresisCorrection(ratio) if ratio else None
-        self._bounds, self._delay_s, self._bounded_delay_s = bounds, delay_s, delay_s
+        self._bounds, self.delay_s, self._bounded_delay_s = bounds, delay_s, delay_s
         self._limits = self._make_limits()
         self.filter_s: float | None = None if bounds is None else float(bounds.filters_s[-1])
         self._curve: ObjectCurve | None = None
@@ -97,14 +92,9 @@ class ComplianceController:
         self._fit(ObjectCurve.from_rows(rows), in_contact=in_contact)
         self._fitted_n = forces_n
 
-    @property
-    def delay_s(self) -> float:
-        """Return the delay from a measured depth until the sheet has moved accordingly, s."""
-        return self._delay_s
-
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
         """Update the measured delay.  Outside contact, fit again if this changes the bounds."""
-        self._delay_s = delay_s
+        self.delay_s = delay_s
         if self._bounds is None or in_contact:
             return
         if self._bounded_delay_s - DELAY_HYSTERESIS_S <= delay_s <= self._bounded_delay_s:
@@ -123,18 +113,13 @@ class ComplianceController:
 
     def _fit(self, curve: ObjectCurve, *, in_contact: bool) -> None:
         self._curve = curve
-        scene = self._scene
-        fit = fit_compliance
-        if in_contact and self._compliance is not None:
-            fit = partial(fit_at_stretch, stretch_ratio=self._compliance.stretch_ratio)
-        fitted = fit(
+        kept = in_contact and self._compliance is not None
+        fitted = fit_compliance(
             curve,
             self._model,
             self._limits,
-            max_depth_m=scene.working_range.push_depth_m,
-            finger_radius_m=scene.finger.radius_m,
-            usable_half_height_m=scene.sheet.usable_half_height_m,
-            position_error_m=scene.tolerances.sheet_position_m,
+            self._scene,
+            stretch_ratio=self.stretch_ratio if kept else None,
         )
         self._compliance = fitted
         self.stretch_ratio = fitted.stretch_ratio
@@ -144,19 +129,15 @@ class ComplianceController:
             if not suffices:
                 hand_note = (
                     f"a hand of low damping can oscillate with this object: the sheet follows "
-                    f"after {1e3 * self._delay_s:.0f} ms; reduce the delay or use a stiffer object"
+                    f"after {1e3 * self.delay_s:.0f} ms; reduce the delay or use a stiffer object"
                 )
         self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted), hand_note)))
 
     def _range_note(self, fitted: Compliance) -> str:
         """Return why the force model is invalid for the deepest push at the centre; "" if valid."""
         max_depth_m = self._scene.working_range.push_depth_m
-        reason = self._model.invalid_reason(
-            fitted.stretch_ratio,
-            float(fitted.indentation_m(max_depth_m)),
-            position_m=CENTRE,
-            finger_radius_m=self._scene.finger.radius_m,
-        )
+        push = SheetPush(fitted.stretch_ratio, fitted.finger_radius_m)
+        reason = self._model.invalid_reason(push, float(fitted.indentation_m(max_depth_m)))
         if not reason:
             return ""
         return f"outside the range of sheet force model {self._model.name}: {reason}"
@@ -181,15 +162,11 @@ class ComplianceController:
         return depth_m - scale * indented_m, 1.0 - scale * (1.0 - per_depth)
 
     def _force_exponent(self, indentation_m: float, position_m: SheetPosition) -> float:
-        """Return the local exponent of the sheet's force as a power of its indentation."""
         if indentation_m <= 0.0:
             return 1.0
-        below, above = self._model.evaluate(
-            self.stretch_ratio,
-            np.array([0.95, 1.05]) * indentation_m,
-            position_m=position_m,
-            finger_radius_m=self._scene.finger.radius_m,
-        ).force_n
+        push = SheetPush(self.stretch_ratio, self._scene.finger.radius_m, position_m)
+        depths = np.array([0.95, 1.05]) * indentation_m
+        below, above = self._model.evaluate(push, depths).force_n
         if below <= 0.0:
             return 1.0
         return max(float(np.log(above / below) / np.log(1.05 / 0.95)), 0.5)

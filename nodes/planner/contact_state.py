@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from math import hypot
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import Phase, SheetReason
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import inverse
 from flexsheet.nodes.models.shapes import Nearest, Shape, projection_jacobian, tightest_curvature
 from flexsheet.nodes.planner.rolling import (
@@ -27,8 +27,6 @@ from flexsheet.nodes.planner.rolling import (
     roll_contact,
     transport_axes,
 )
-
-Floats = NDArray[np.float64]
 
 SHALLOW_RATIO, DEEP_RATIO = 0.15, 0.5
 """Ratios of the finger's depth to the radius of curvature.  Up to the first, the contact is the
@@ -170,7 +168,6 @@ class ContactStateMachine:
         return replace(contact, axes=axes, position_sheet_m=np.clip(point_sheet[:2], -limit, limit))
 
     def _roll(self, finger: Floats, velocity: Floats) -> ContactCommand:
-        """Roll the sheet to the finger, or hold it and return the reason in the command."""
         contact, limits = self.contact, self._limits
         depth = max(0.0, -contact.height_m(finger))
         moved, self._finger = finger - self._finger, finger
@@ -241,7 +238,6 @@ class ContactStateMachine:
         return rolled, "past_sheet_width" if axis == 0 else "past_sheet_height"
 
     def _lift(self, contact: SheetContact) -> SheetContact:
-        """Return the contact with the sheet lifted above the object's surface around it."""
         return replace(contact, lift_m=compute_rim_lift_m(self._shape, contact))
 
     def _concavity_reason(self) -> SheetReason:
@@ -252,7 +248,6 @@ class ContactStateMachine:
 
 
 def _is_too_deep(found: Nearest) -> bool:
-    """Return whether a new finger is so deep that its side of the object is not clear."""
     curvature = tightest_curvature(found.shape_operator)
     return bool(1.0 + found.height_m * curvature < MIN_RADIUS_FRACTION)
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import (
     EdgeBound,
     SheetBounds,
@@ -22,8 +22,6 @@ from flexsheet.nodes.models.motion import (
     measure_length,
 )
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform, vector_from_rotation
-
-Floats = NDArray[np.float64]
 
 TAPER_FRACTION = 0.5
 """Fraction of the maximum jerk with which the acceleration falls to 0 at the desired velocity."""
@@ -53,7 +51,6 @@ class JerkLimitedState:
 
     @staticmethod
     def at_rest(sheet: SheetMotion) -> JerkLimitedState:
-        """Return the state of the sheet at rest in this pose."""
         still = replace(sheet, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
         return JerkLimitedState(still, np.zeros(7), np.zeros(7))
 

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from math import atan2, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import angle_between, transform
 from flexsheet.nodes.models.shapes import Nearest, Shape
-
-Floats = NDArray[np.float64]
 
 MIN_STEP_RATIO = 1.0 / 512.0
 """Resolution of the search for the last point within the tilt, over the searched distance."""

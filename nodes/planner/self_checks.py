@@ -11,7 +11,7 @@ from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.messages.types import Force, SelfCheck
 from flexsheet.nodes.models.residuals import ResidualMonitor
-from flexsheet.nodes.models.sheet.force_models import SheetForceModel
+from flexsheet.nodes.models.sheet.force_models import SheetForceModel, SheetPush
 
 MAX_STIFFNESS_RATIO = 0.05
 """Accepted relative difference of the stiffness: three standard deviations of a calibration."""
@@ -99,19 +99,10 @@ class MeasuredForceCheck:
         if min(depths) < MIN_INDENTATION_M or max(depths) - min(depths) > QUIET_M:
             return
         push = min(near, key=lambda one: abs(one.valid_at_ns - at_ns))
-        if self._model.invalid_reason(
-            push.stretch_ratio,
-            push.indentation_m,
-            position_m=push.position_m,
-            finger_radius_m=self._radius_m,
-        ):
+        conditions = SheetPush(push.stretch_ratio, self._radius_m, push.position_m)
+        if self._model.invalid_reason(conditions, push.indentation_m):
             return
-        pressed = self._model.evaluate(
-            push.stretch_ratio,
-            np.array([push.indentation_m]),
-            position_m=push.position_m,
-            finger_radius_m=self._radius_m,
-        )
+        pressed = self._model.evaluate(conditions, np.array([push.indentation_m]))
         predicted_n = float(pressed.force_n[0])
         if predicted_n > MIN_FORCE_N:
             self._monitor.add(np.array([force_n / predicted_n - 1.0]), at_ns)

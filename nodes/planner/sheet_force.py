@@ -7,10 +7,10 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.messages.sheet_calibration import SheetCalibration, refuse_other_sheet
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.methods import Family, Trial, clip_range
 from flexsheet.nodes.models.sheet.force_models import (
     MembraneSheetModel,
@@ -18,13 +18,12 @@ from flexsheet.nodes.models.sheet.force_models import (
     SheetForce,
     SheetForceModel,
     SheetPosition,
+    SheetPush,
     make_model,
 )
 from flexsheet.nodes.models.sheet.membrane import push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
-
-Floats = NDArray[np.float64]
 
 ReferenceForce = Callable[[SheetSpec, float, float, SheetPosition, float], float]
 """Reference force (N) at a stretch ratio, a depth, a position and a fingertip radius (m)."""
@@ -143,6 +142,7 @@ def _trials(
             continue
         position = (x * rubber.width_m, y * rubber.height_m)
         reference_n = reference(sheet, stretch, depth, position, radius)
+        push = SheetPush(stretch, radius, position)
         for model in models:
             slow = model.name == "membrane"
             if slow and not (stretch == middle and label == "centre" and depth in SLOW_DEPTHS_M):
@@ -150,17 +150,9 @@ def _trials(
             yield Trial(
                 method=model.name,
                 case={"stretch": stretch, "depth_mm": 1e3 * depth, "position": label},
-                run=partial(
-                    model.evaluate,
-                    stretch,
-                    np.array([depth]),
-                    position_m=position,
-                    finger_radius_m=radius,
-                ),
+                run=partial(model.evaluate, push, np.array([depth])),
                 error=partial(_error_percent, reference_n=reference_n),
-                in_range=not model.invalid_reason(
-                    stretch, depth, position_m=position, finger_radius_m=radius
-                ),
+                in_range=not model.invalid_reason(push, depth),
                 in_scene=stretch >= sheet.min_stretch_ratio,
             )
 

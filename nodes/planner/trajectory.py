@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Phase, SheetReason, SheetTrajectory
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, measure_length
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import make_shape
@@ -26,8 +26,6 @@ from flexsheet.nodes.planner.jerk_limiter import JerkBounds, JerkLimitedState, s
 from flexsheet.nodes.planner.rolling import cross
 from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
-
-Floats = NDArray[np.float64]
 
 EDGE_SPEED_FRACTION = 0.7
 """Fraction of the maximum tool speed that the plan uses; the rest lets a late arm catch up."""

@@ -13,22 +13,20 @@ from functools import cache, partial
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Cylinder, Scene, require_cylinder, require_projector
 from flexsheet.messages.types import Correction, Display, Pattern
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.methods import Case, Family, Trial
 from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import edge_poses
 from flexsheet.nodes.renderer import deflection_cache
-from flexsheet.nodes.renderer.gl import DrawStyle, Image, headless_context
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
 from flexsheet.nodes.renderer.object_surface import make_surface
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
-
-Floats = NDArray[np.float64]
 
 ErrorMeasure = Callable[[Image, Image], Floats]
 """Function that computes the errors (n,), m, at all visible points of the object. Its arguments are

@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Projector
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import camera
-from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
-
-Floats = NDArray[np.float64]
 
 SIDE_M = 0.0053
 """Side of a mark, whose area is that of a marker of 3 mm radius, so that the triangulator detects
@@ -59,7 +58,7 @@ def place_marks(
     deeper: mesh of the sheet with the fingertip FINGER_STEP_M deeper; None without contact.
     """
     pose, lens = projector.world_from_projector, projector.lens
-    world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    world_from_projector = pose_matrix(pose)
     matrix = camera.camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
     distortion = np.array(lens.distortion)
     points = np.array([(x, y, 0.0) for x, y in projector.check_marks_sheet_m])

@@ -20,13 +20,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.messages.scene import Lens
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.camera import camera_matrix
 from flexsheet.nodes.models.rigid import inverse
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 GRAZING_SINE = 0.05
 """Sine of the minimum angle (2.9 degrees) between a ray and the sheet. At this angle a pixel is
@@ -115,21 +113,15 @@ def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
     return crossings
 
 
-def pixel_from_screen(
-    *,
-    fx_px: float,
-    fy_px: float,
-    cx_px: float,
-    cy_px: float,
-    world_from_projector: Floats,
-) -> Floats:
+def pixel_from_screen(lens: Lens, world_from_projector: Floats) -> Floats:
     """Return the homography (3, 3) from (x, y, 1) on the imaginary screen, m, to projector pixels.
 
     The projector is modelled as a pinhole. Lens distortion is applied later (`lens.py`).
     """
     projector_from_world = inverse(world_from_projector)
     columns = projector_from_world[:3, [0, 1, 3]]
-    homography: Floats = camera_matrix(fx_px, fy_px, cx_px, cy_px) @ columns
+    matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
+    homography: Floats = matrix @ columns
     homography /= homography[2, 2]
     return homography
 

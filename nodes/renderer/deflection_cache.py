@@ -11,10 +11,8 @@ from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.background import enter_background
 from flexsheet.nodes.cache import Specification, cached
 from flexsheet.nodes.models.sheet.indentation import (
@@ -25,8 +23,6 @@ from flexsheet.nodes.models.sheet.indentation import (
     solve_indentation_basis,
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
-
-Floats = NDArray[np.float64]
 
 VERSION = 2
 """Version of the computation. Increase it when results for the same inputs change."""

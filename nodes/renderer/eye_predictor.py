@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.types import Eye
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.max_age import MaxAge
-
-Floats = NDArray[np.float64]
 
 WINDOW_S = 0.15
 """Duration over which the velocity is measured; it covers a few frames of a head tracker."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flexsheet.messages.base import Header
 from flexsheet.messages.clock import Clock
 from flexsheet.messages.types import (
     ArmState,
@@ -74,14 +73,14 @@ class FrameRenderer:
         self._output, self._ports, self._latency, self._clock = screen, ports, latency, clock
         self._max_age = max_age
         self._sheet_predictor = SheetPosePredictor(max_age)
-        self._eye_predictor = EyePredictor(max_age)
-        self._extrapolator = SkinExtrapolator()
+        self.eye_predictor = EyePredictor(max_age)
+        self.extrapolator = SkinExtrapolator()
         self._number = 0
         self._check_marks_due_ns = 0
         self._drawn_of: tuple[object, ...] = ()
         self._drawn_arms: tuple[ArmState | None, ArmState | None] = (None, None)
         if ports.soft_body.message is not None and ports.soft_body.header is not None:
-            self.on_soft_body(ports.soft_body.message, ports.soft_body.header)
+            self.extrapolator.add(ports.soft_body.message, ports.soft_body.header)
 
     def is_unchanged(self, shown: Display) -> bool:
         """Return whether a new frame would equal the last one: without contact and motion."""
@@ -107,7 +106,7 @@ class FrameRenderer:
         predicted_to_ns = self._latency.predict_light_ns(begun_ns)
         horizon_s = (predicted_to_ns - self._clock.now_ns()) * 1e-9
         source_ns, shaped_for_ns = self._shape(begun_ns, predicted_to_ns)
-        tracked = self._eye_predictor.predict(ports.eye, horizon_s)
+        tracked = self.eye_predictor.predict(ports.eye, horizon_s)
         eyes, across, eye_note = select_eyes(scene_renderer.scene.eyes, tracked)
         finger_tip = predict_fingertip(ports.fingertip, horizon_s, max_age_s=self._max_age.seconds)
         sheet = self._sheet_predictor.update(
@@ -188,14 +187,6 @@ class FrameRenderer:
             update={"swapped_ns": swapped_ns, "light_ns": light_ns, "late_frames": self.late}
         )
 
-    def on_eye(self, eye: Eye, header: Header) -> None:
-        """Add a measured position of the eyes, for their prediction."""
-        self._eye_predictor.add(eye, header)
-
-    def on_soft_body(self, body: SoftBody, header: Header) -> None:
-        """Add a response of the soft-body solver, for its extrapolation."""
-        self._extrapolator.add(body, header)
-
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
         """Deform the object as predicted for the display time `light_ns`.
 
@@ -206,7 +197,7 @@ class FrameRenderer:
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age.seconds
         if skin is not None and scene_renderer.mesh_id != skin.mesh_id:
             scene_renderer.set_skin(skin)
-        body, shaped_for_ns = self._extrapolator.extrapolate(
+        body, shaped_for_ns = self.extrapolator.extrapolate(
             light_ns if fresh else 0, self._clock.id
         )
         if body is None or body.mesh_id != scene_renderer.mesh_id:

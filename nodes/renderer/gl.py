@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.models.shapes.triangles import triangulate_grid
 from flexsheet.nodes.renderer.correction import (
     GRAZING_SINE,
@@ -23,9 +24,6 @@ from flexsheet.nodes.renderer.correction import (
     sector_normals,
 )
 from flexsheet.nodes.renderer.lens import ClipLens
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 FAR_M = 5.0
 SAMPLES = 4
@@ -266,7 +264,6 @@ class Canvas:
         mesh.array(program).render(moderngl.TRIANGLES)
 
     def _program(self, view: EyeView, look: DrawStyle) -> tuple[moderngl.Program, Uniforms]:
-        """Return the variant of the shader program for a view and a style, and its uniforms."""
         number = LOOKS.get(look.pattern, FLAT_LOOK if look.flat else SOFT_LOOK)
         return self._programs.get(
             LOOK=number,

@@ -115,12 +115,12 @@ class Renderer(Node):
 
     def on_soft_body(self, soft_body: SoftBody, header: Header) -> None:
         if self._frame_renderer is not None:
-            self._frame_renderer.on_soft_body(soft_body, header)
+            self._frame_renderer.extrapolator.add(soft_body, header)
         self._draw_if_due()
 
     def on_eye(self, eye: Eye, header: Header) -> None:
         if self._frame_renderer is not None:
-            self._frame_renderer.on_eye(eye, header)
+            self._frame_renderer.eye_predictor.add(eye, header)
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         self._max_age.add(header)
@@ -164,7 +164,6 @@ class Renderer(Node):
         self._draw(self._frame_renderer, now_ns)
         # If drawing takes longer than a period, leave time to read messages between frames.
         rest_until_ns = self.clock.now_ns() + self._period_ns // 2
-        self._max_age = MaxAge(self.parameters.max_age_s)
         self._due_ns = max(self._due_ns + self._period_ns, rest_until_ns)
 
     def _draw(self, frame_renderer: FrameRenderer, begun_ns: int) -> None:

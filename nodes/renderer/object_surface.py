@@ -17,6 +17,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from flexsheet.messages.scene import Cylinder, Geometry, Mesh, Plane
+from flexsheet.nodes.arrays import Floats, Singles
 from flexsheet.nodes.models.rigid import apply
 from flexsheet.nodes.models.shapes import GEOMETRIES, CuboidMap, MeshError, Shape
 from flexsheet.nodes.models.shapes.triangles import (
@@ -26,8 +27,6 @@ from flexsheet.nodes.models.shapes.triangles import (
     triangulate_grid,
 )
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
 Indices = NDArray[np.int32]
 Real = TypeVar("Real", np.float32, np.float64)
 

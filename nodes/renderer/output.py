@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Eyes
 from flexsheet.messages.types import Eye, StereoMode
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.renderer.gl import ImagePart
 
-Floats = NDArray[np.float64]
 WhichEye = Literal["both", "left", "right"]
 
 MIN_EYE_DISTANCE_M = 0.05

@@ -202,7 +202,6 @@ class ProjectorWindow:
         )
 
     def _shut(self) -> None:
-        """Close the window, but keep the drawing context."""
         if self._presenter is not None:
             self._presenter.stop()
             self._presenter = None

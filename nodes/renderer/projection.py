@@ -14,6 +14,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.renderer.gl import (
     SAMPLES,
     Canvas,
@@ -24,8 +25,6 @@ from flexsheet.nodes.renderer.gl import (
     set_view,
 )
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
-
-Floats = NDArray[np.float64]
 
 CLIP_DISTANCE_0, CLIP_PLANES = 0x3000, 5
 """OpenGL's constant GL_CLIP_DISTANCE0, and the number of clip planes in `sheet.vert.glsl`."""

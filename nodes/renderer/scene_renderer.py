@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from flexsheet.messages.methods import SheetShapeMethod
 from flexsheet.messages.scene import Mesh, Scene, require_projector
 from flexsheet.messages.types import Display, SheetTarget, Skin, SoftBody
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet import corners
@@ -38,7 +39,6 @@ from flexsheet.nodes.renderer.gl import (
     Canvas,
     DrawStyle,
     EyeView,
-    Image,
     ImagePart,
     SurfaceMaterial,
     is_software,
@@ -56,8 +56,6 @@ from flexsheet.nodes.renderer.sheet_mesh import (
     pyramid_mesh,
     refine_mesh,
 )
-
-Floats = NDArray[np.float64]
 
 OVERSAMPLING, UNSAMPLED_OVERSAMPLING = 1.5, 2.5
 """Ratio of the resolution of the eye's image (first pass of two_pass) to that of the projector,
@@ -85,14 +83,8 @@ def projector_homography(scene: Scene) -> Floats:
     Points of the plane (the imaginary screen of Furukawa et al. 2007) are (x, y) in m. The pixels
     are those without lens distortion.
     """
-    lens = require_projector(scene).lens
-    return pixel_from_screen(
-        fx_px=lens.fx_px,
-        fy_px=lens.fy_px,
-        cx_px=lens.cx_px,
-        cy_px=lens.cy_px,
-        world_from_projector=pose_matrix(require_projector(scene).world_from_projector),
-    )
+    projector = require_projector(scene)
+    return pixel_from_screen(projector.lens, pose_matrix(projector.world_from_projector))
 
 
 class SceneRenderer:
@@ -156,7 +148,6 @@ class SceneRenderer:
         self.mesh_id: str | None = None
 
     def _material(self) -> SurfaceMaterial:
-        """Return the object's material, with a texture image scaled to the object's front view."""
         appearance, object_from_world = (
             self.scene.object.appearance,
             inverse(self._world_from_object),

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.types import Correction
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, moved
 from flexsheet.nodes.models.sheet import corners, sheet_from_edges
 from flexsheet.nodes.renderer.correction import (
@@ -16,8 +16,6 @@ from flexsheet.nodes.renderer.correction import (
     make_flat_screen,
     make_pushed_screen,
 )
-
-Floats = NDArray[np.float64]
 
 MIN_EDGE_DISTANCE_M = 0.05
 """Minimum plausible distance between the sheet's edges."""

@@ -8,6 +8,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes.triangles import triangulate_grid
 from flexsheet.nodes.models.sheet.indentation import IndentationBasis
@@ -15,7 +16,6 @@ from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.renderer.correction import GRAZING_SINE, MIN_PUSH_M
 from flexsheet.nodes.renderer.sheet import SheetPose
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
 MAX_TRIANGLES_DEPTH_M = 0.0035

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.max_age import MaxAge
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
-
-Floats = NDArray[np.float64]
 
 
 class SheetPosePredictor:

@@ -11,10 +11,10 @@ from functools import partial
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.methods import Case, Family, Trial, clip_range
 from flexsheet.nodes.models.shapes.triangles import triangulate_grid
 from flexsheet.nodes.models.sheet import edge_poses
@@ -27,8 +27,6 @@ from flexsheet.nodes.renderer.sheet_mesh import (
     deflected_mesh,
     pyramid_mesh,
 )
-
-Floats = NDArray[np.float64]
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats], Floats]
 """Function that returns points (n, 3), world, of the reference sheet. Its arguments are the scene,

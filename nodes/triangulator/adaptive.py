@@ -20,11 +20,10 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.filters import Estimate, Filter, OneEuro, Unfiltered
 
-Floats = NDArray[np.float64]
 Model = tuple[float, float, float, float]
 """Parameters of a motion model: spectral density of the acceleration noise, m^2/s^3, and of the
 jerk noise, m^2/s^5; frequency, Hz, and standard deviation, m, of the oscillator."""

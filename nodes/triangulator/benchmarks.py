@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.methods import Case, Family, Interval, Trial, estimate_rms
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter, Marker, detect_blobs
@@ -17,12 +17,8 @@ from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     StereoGeometry,
-    dlt,
     measure,
 )
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 CASE_POINTS = 2000
 NOISES_PX = (0.01, 0.025, 0.1, 2.0)
@@ -309,14 +305,7 @@ def _marker_tolerance_px(scene: Scene) -> float:
     """
     geometry = StereoGeometry.of(scene.camera)
     left, right = geometry.project(np.zeros(3))
-    one_px = measure(
-        geometry,
-        left,
-        right,
-        method=dlt,
-        left_covariance=np.eye(2),
-        right_covariance=np.eye(2),
-    )
+    one_px = measure(geometry, left, right, covariance=np.eye(2))
     if one_px is None:
         raise ValueError(
             "scene: camera: the centre of the screen (the world's origin) is not in front of both "

@@ -16,15 +16,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from flexsheet.messages.types import FingertipReason
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.fingertip import Candidate, StereoDetection
 from flexsheet.nodes.triangulator.tracking import Tracker
 from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 
-Floats = NDArray[np.float64]
 TrackStatus = Literal["tentative", "ambiguous", "clutter"]
 """Status of a track other than the finger's.
 
@@ -267,7 +266,6 @@ class DataAssociation:
                 track.status = "clutter"
 
     def _update_finger(self, at_ns: int, marker: Candidate, tracker: Tracker) -> None:
-        """Update the finger's track with the marker that the tracker has accepted."""
         assert tracker.estimate is not None
         if self._finger is None:
             self._finger = ClutterTrack.of(marker, at_ns)
@@ -281,7 +279,6 @@ class DataAssociation:
     def _continue_track(
         self, at_ns: int, detection: StereoDetection
     ) -> Candidate | FingertipReason:
-        """Return the marker that continues the finger's track, or the reason if there is none."""
         tracks = self._associate(at_ns, [*detection.markers, *detection.clutter], self._finger)
         near = tracks[: len(detection.markers)]
         finger_markers = [
@@ -302,7 +299,6 @@ class DataAssociation:
     def _initiate_track(
         self, at_ns: int, detection: StereoDetection
     ) -> Candidate | FingertipReason:
-        """Return the marker that may start a track, or the reason if there is none."""
         markers = [*detection.markers, *detection.clutter]
         has_successor = any(track is self._successor for track in self.clutter_tracks)
         tracks = self._associate(at_ns, markers, None if has_successor else self._finger)

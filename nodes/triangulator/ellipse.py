@@ -20,9 +20,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 NODE_SPACING = 1.4
 """Maximum distance between integration nodes on the edge, in standard deviations of the blur.  The

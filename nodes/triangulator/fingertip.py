@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.types import FingertipReason
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.triangulator.flat_marker import DiscView, FlatPose, estimate_flat_pose
 from flexsheet.nodes.triangulator.marker import (
     FLAT_METHODS,
@@ -39,8 +39,6 @@ from flexsheet.nodes.triangulator.triangulation import (
     undistort_pixel,
 )
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Origin = tuple[int, int]
 
 SIZE_SIGMA = 0.2
@@ -243,7 +241,6 @@ def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | Non
 
 
 def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window | None]) -> bool:
-    """Return whether an image or its search window is overexposed."""
     return any(
         is_overexposed(image) or is_overexposed(image, window)
         for image, window in zip(inputs.images, windows, strict=True)
@@ -521,7 +518,6 @@ def _rejection_reason(
 
 
 def _size_cost(inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]) -> float:
-    """Return the mismatch of refined and expected radii, in squared standard deviations."""
     sizes = (
         _size_deviation(inputs, marker.radius, pair.depth_m)
         / math.hypot(MARKER_SIZE_SIGMA, marker.radius_deviation)
@@ -531,7 +527,6 @@ def _size_cost(inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Ma
 
 
 def _size_deviation(inputs: DetectionInput, radius_px: float, depth_m: float) -> float:
-    """Return the absolute log ratio of a radius to the marker's expected radius at that depth."""
     expected_px = _focal_px(inputs.geometry) * inputs.config.marker_radius_m / depth_m
     return abs(math.log(radius_px / expected_px))
 
@@ -558,9 +553,9 @@ def _triangulate(
         inputs.geometry,
         markers[0].centre + inputs.origins[0],
         markers[1].centre + inputs.origins[1],
-        method=inputs.config.triangulate,
-        left_covariance=left,
+        covariance=left,
         right_covariance=right,
+        method=inputs.config.triangulate,
     )
 
 

@@ -14,12 +14,10 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs, fit_ellipses
 
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 Window = tuple[slice, slice]
 """Rows and columns of a part of an image."""
 
@@ -228,7 +226,6 @@ def _add_border(box: Sequence[int]) -> Window:
 
 
 def _surround_level(cut: Image) -> float:
-    """Return the grey level of the surroundings, a quantile over the cut-out's outermost pixels."""
     border = np.concatenate((cut[0], cut[-1], cut[:, 0], cut[:, -1]))
     border.sort()
     return float(border[int(SURROUND_RANK * border.size)])

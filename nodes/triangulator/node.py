@@ -148,7 +148,6 @@ class Triangulator(Node):
             self._check.on_frame(frame)
 
     def _adapt_timeout(self, source_ns: int) -> None:
-        """Adapt the track's timeout to the measured camera rate, so that one pair may be lost."""
         timeout_s = max(
             self.parameters.track_timeout_s, TIMEOUT_PERIODS * self._period.add(source_ns)
         )

@@ -12,13 +12,11 @@ from collections import deque
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Projector
 from flexsheet.messages.types import Frame, SelfCheck, SuspectedCause
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.residuals import ResidualMonitor
-
-Floats = NDArray[np.float64]
 
 RAY_THRESHOLD_M = 7e-4
 """Maximum distance of the marks from their rays (root mean square).  The standard deviation per

@@ -13,15 +13,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Projector
 from flexsheet.messages.types import Frame, SelfCheck, SuspectedCause
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.triangulator.fingertip import StereoDetection
 from flexsheet.nodes.triangulator.projection_check import ProjectionCheck
-
-Floats = NDArray[np.float64]
 
 REPROJECTION_THRESHOLD_PX = 0.2
 """Maximum mean reprojection error.  It is 0.024 px after a calibration, and about 0.1 px after the

@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.fingertip import StereoDetection
 from flexsheet.nodes.triangulator.triangulation import (
     StereoGeometry,
     TriangulatedPoint,
     project_with_jacobian,
 )
-
-Floats = NDArray[np.float64]
 
 
 def compensate_skew(

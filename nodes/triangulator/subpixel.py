@@ -30,10 +30,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.triangulator.ellipse import integrate_ellipse
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 X, Y, RADIUS, BLUR, MARKER, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range(10)
 STILL_PARAMETERS = 8

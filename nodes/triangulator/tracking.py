@@ -10,12 +10,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.types import FingertipState
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
 
-Floats = NDArray[np.float64]
 GateResult = Literal["ok", "too_fast", "unconfirmed"]
 """Result for a measured point.
 
@@ -125,7 +124,6 @@ class Tracker:
         return self._gate_after(*self._history[-1], at_ns)
 
     def _gate_after(self, measurement: PositionMeasurement, estimate: Estimate, at_ns: int) -> Gate:
-        """Return the gate at a time after one of the track's points."""
         dt = (at_ns - estimate.at_ns) * 1e-9
         point = self.filter.predict(estimate, np.array([dt]))[0]
         spread = self.filter.moments(estimate)[2]

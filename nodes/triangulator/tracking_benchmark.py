@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.methods import Case, Family, Trial
 from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
-from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 
-Floats = NDArray[np.float64]
 TruePath = Callable[[float], Floats]
 """Function that returns the true fingertip (3,) m in the world at a given time, s."""
 
@@ -83,9 +83,7 @@ def measure_path(
             geometry,
             left + noise_px * random.standard_normal(2),
             right + noise_px * random.standard_normal(2),
-            method=dlt,
-            left_covariance=covariance_px,
-            right_covariance=covariance_px,
+            covariance=covariance_px,
         )
         if found is not None:
             points.append(found.point_world)

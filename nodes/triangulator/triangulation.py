@@ -13,15 +13,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.calibration import StereoCalibration, refuse_other_camera
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.messages.types import StereoPair
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import camera, rigid
 
-Floats = NDArray[np.float64]
 Triangulate = Callable[[Floats, Floats, Floats], Floats]
 
 NEWTON_STEPS = 12
@@ -62,9 +61,7 @@ class StereoGeometry:
         if calibration is not None:
             refuse_other_camera(calibration, scene_camera)
             optics = calibration
-        world_from_left = rigid.transform_from_rpy(
-            scene_camera.world_from_left.position_m, scene_camera.world_from_left.rpy_rad
-        )
+        world_from_left = rigid.pose_matrix(scene_camera.world_from_left)
         return StereoGeometry(
             device=scene_camera.device,
             width_px=scene_camera.width_px,
@@ -277,13 +274,14 @@ def measure(
     left_px: Floats,
     right_px: Floats,
     *,
-    method: Triangulate,
-    left_covariance: Floats,
-    right_covariance: Floats,
+    covariance: Floats,
+    right_covariance: Floats | None = None,
+    method: Triangulate = dlt,
 ) -> TriangulatedPoint | None:
     """Triangulate a marker from its pixels (2,) in both views, with covariances (2, 2) px^2.
 
-    Return None if the point is not in front of both cameras, or if a pixel is not finite or outside
+    right_covariance: covariance of the right pixel; None: equal to that of the left one.  Return
+    None if the point is not in front of both cameras, or if a pixel is not finite or outside
     the range of the lens model.  Both views have equal weights, as in the triangulation methods.
     Pixel errors are thus propagated by (J^T J)^-1 J^T, with the Jacobian J of the four pixel
     coordinates with respect to the point.
@@ -309,12 +307,12 @@ def measure(
         return None
     inverse = information @ slope.T
     world = geometry.world_from_left
+    of_right = covariance if right_covariance is None else right_covariance
     left_part = world[:3, :3] @ inverse[:, :2]
     right_part = world[:3, :3] @ inverse[:, 2:]
     shifts = np.concatenate((left_projected - left_px, right_projected - right_px))
     return TriangulatedPoint(
         point_world=world[:3, :3] @ point + world[:3, 3],
-        covariance=left_part @ left_covariance @ left_part.T
-        + right_part @ right_covariance @ right_part.T,
+        covariance=left_part @ covariance @ left_part.T + right_part @ of_right @ right_part.T,
         reprojection_px=float(np.sqrt(0.5 * (shifts @ shifts))),
     )

@@ -21,13 +21,13 @@ from itertools import accumulate
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pymodbus.constants import ExcCodes
 from pymodbus.exceptions import NoSuchIdException
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
+
 Fault = Literal[
     "none",
     "silent",
@@ -170,7 +170,6 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
-    """Clip values like numpy.clip, which takes five times as long for six numbers."""
     return np.minimum(np.maximum(values, lowest), highest)
 
 
@@ -333,7 +332,6 @@ class Controller:
             self._pending.append((self._due_s(), joints))
 
     def _due_s(self) -> float:
-        """Return the time at which a set-point that arrives now takes effect."""
         due_s = self._time_s + self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
         if not self._cycle_s:
             return due_s

@@ -17,6 +17,7 @@ from flexsheet.messages.apparatus import ArmTruth, nominal_apparatus
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
@@ -26,7 +27,6 @@ from flexsheet.nodes.twin.arms import (
     ArmServer,
     Controller,
     Fault,
-    Floats,
     check_loopback,
     forward,
     solve_inverse_kinematics,
@@ -161,7 +161,6 @@ class TwinArmsNode(Node):
             self.servers[side] = server
 
     def _server(self, side: str, joints_rad: Floats, port: int, seed: int) -> ArmServer | MxtServer:
-        """Make the controller of an arm at the given joint angles, and its network server."""
         given, before = self.parameters, partial(self._advance, side)
         truth = self._truth(side)
         lag_s = given.servo_lag_s if truth.servo_lag_s is None else truth.servo_lag_s
@@ -220,7 +219,6 @@ class TwinArmsNode(Node):
         return np.asarray(joints_rad - np.array(self._truth(side).joint_offsets_rad))
 
     def _advance(self, side: str) -> None:
-        """Simulate the motion of an arm up to the present time."""
         now_ns = self.clock.now_ns()
         duration_s = (now_ns - self._moved_ns[side]) * 1e-9
         self._moved_ns[side] = now_ns

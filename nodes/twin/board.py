@@ -15,13 +15,10 @@ from numpy.typing import NDArray
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, StereoCamera
+from flexsheet.nodes.arrays import Floats, Image, Singles
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
 from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Image = NDArray[np.uint8]
 
 RAYS = 3
 """Number of rays per pixel in each direction."""
@@ -48,6 +45,7 @@ class BoardError(FlexsheetError, ValueError):
     """Raised for a board that cannot be rendered; the text states the cause."""
 
     code = "board"
+    exit_code = 2
     remedy = "Choose a board that fits into the images: fewer or smaller squares."
 
 
@@ -169,7 +167,6 @@ class TwinBoard:
         return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
 
     def _drawn(self, rays: Singles, eye_from_board: Floats, light: Light) -> Singles:
-        """Render the image of one camera with lens blur, vignetting and uneven illumination."""
         height, width = self.camera.height_px, self.camera.width_px
         levels = light.room.copy()
         in_eye = apply(eye_from_board, self._outline())
@@ -191,14 +188,12 @@ class TwinBoard:
         return np.asarray(levels * lit, dtype=np.float32)
 
     def _through_lens(self, fine: Singles) -> Singles:
-        """Apply the lens blur to values on rays, then average the rays of each pixel."""
         spread = RAYS * self.sensor.blur_px
         smooth = cv2.GaussianBlur(fine, (0, 0), spread, borderType=cv2.BORDER_REPLICATE)
         height, width = fine.shape[0] // RAYS, fine.shape[1] // RAYS
         return np.asarray(smooth.reshape(height, RAYS, width, RAYS).mean(axis=(1, 3)), np.float32)
 
     def _seen(self, rays: Singles, eye_from_board: Floats) -> tuple[Singles, Singles]:
-        """Return the grey level of the board on each ray, and which fraction of a ray hits it."""
         board = self.board
         plane_from_ray = np.linalg.inv(eye_from_board[:3, [0, 1, 3]]).astype(np.float32)
         on_plane = rays @ plane_from_ray[:, :2].T + plane_from_ray[:, 2]
@@ -276,7 +271,6 @@ class TwinBoard:
         return posed(out)
 
     def _shown(self, left_from_board: Floats) -> bool:
-        """Return whether both images show the whole chessboard, or enough ChArUco corners."""
         whole = self.board.kind == "chessboard"
         try:
             views = self._views(left_from_board, self._outline())

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
+
 Point = tuple[float, float, float]
 Views = Literal["both", "left", "right"]
 
@@ -197,7 +197,6 @@ def together(*parts: Clutter) -> Clutter:
 
 
 def _from_knuckle(x: float, y: float, z: float) -> FixedPoint:
-    """Return a point given relative to the knuckle of the pointing finger, from the fingertip."""
     knuckle = [FINGER_LENGTH_M * part for part in FINGER_DIRECTION]
     return FixedPoint((knuckle[0] + x, knuckle[1] + y, knuckle[2] + z))
 

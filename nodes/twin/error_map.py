@@ -12,11 +12,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Image = NDArray[np.uint8]
+from flexsheet.nodes.arrays import Bools, Floats, Image
 
 PERIOD_M, RANGE_M = 0.02, 0.24
 """Period of the phase and range of the coarse position, as in the shader `object.frag.glsl`."""

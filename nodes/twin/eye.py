@@ -24,6 +24,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Projector, Scene, require_projector
 from flexsheet.messages.types import Display, Skin, SoftBody, TwinArms, TwinFinger
+from flexsheet.nodes.arrays import Bools, Floats, Image
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.membrane import DeformedSheet, TrueRubber, solve
@@ -31,10 +32,7 @@ from flexsheet.nodes.twin.rig import slopes_of
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Bools = NDArray[np.bool_]
-Image = NDArray[np.uint8]
 
 METRES_PER_PX = 0.00035
 """Default size of a pixel on the screen plane: half of the paper's 0.7 mm."""
@@ -589,7 +587,7 @@ class EyeCamera:
     def take(
         self, projected: Image, situation: EyeSituation, *, eye: Floats
     ) -> tuple[Image, Image]:
-        """Render what the eye sees of a projected image, and what it should see.
+        """Render the image that the eye sees of a projected frame, and the one that it should see.
 
         Both images are (rows, columns, 3). Raises NotConvergedError if the sheet's shape is not
         found, and ValueError if the object reaches the eye or its deformation is invalid.

@@ -1,4 +1,4 @@
-"""Simulate the user's eye: render what it sees of projected frames, to evaluate experiments.
+"""Simulate the user's eye: render its images of projected frames, to evaluate experiments.
 
 Experiments label the frames that they evaluate. The apparatus holds the true parameters of the
 simulated hardware; the scene holds those that the other nodes assume.
@@ -28,8 +28,9 @@ from flexsheet.messages.types import (
     Viewpoint,
 )
 from flexsheet.nodes import OmissionReason
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.node import Input, Node, Output
-from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation, Floats
+from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation
 from flexsheet.nodes.twin.head import HeadSway
 from flexsheet.nodes.twin.render_queue import RenderQueue
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
@@ -65,7 +66,7 @@ class TwinEyeParameters(SimulatorParameters):
 
 
 class TwinEyeNode(Node):
-    """Render what the eye sees of labelled frames, once per label, correction and eye.
+    """Render the eye's image of labelled frames, once per label, correction and eye.
 
     Only frames with pixels and of a single view are rendered. A mono frame is seen from the
     viewpoint of the parameters, a frame for one eye from that eye.

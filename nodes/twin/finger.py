@@ -12,13 +12,12 @@ from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import PathJoin
+from flexsheet.nodes.arrays import Floats
 
-Floats = NDArray[np.float64]
 Real = TypeVar("Real", float, Floats)
 
 ROUNDING_S = 0.04

@@ -21,10 +21,11 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
 from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
-from flexsheet.nodes.twin.finger import WANDER_BAND_HZ, FingerMotion, FingerState, Floats
+from flexsheet.nodes.twin.finger import WANDER_BAND_HZ, FingerMotion, FingerState
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, HandImpedance, TrueSheet
 from flexsheet.nodes.twin.lit_marks import LitMarks
 from flexsheet.nodes.twin.nail import Nail
@@ -147,7 +148,7 @@ class TwinFingerNode(Node):
         if self.parameters.hand == "coupled":
             self.coupled, self.edges = None, EdgeTrack()
             self.clamps = [
-                transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)
+                pose_matrix(arm.flange_from_edge)
                 for arm in (true_scene.arms.left, true_scene.arms.right)
             ]
             if self.preparing is not None:
@@ -157,7 +158,6 @@ class TwinFingerNode(Node):
             self._follow_waiting()
 
     async def _couple(self, scene: Scene) -> None:
-        """Tabulate the sheet's force in a thread, couple the finger to it, and start the path."""
         given = self.parameters
         reaction = await asyncio.to_thread(
             load_or_compute_reaction, scene, given.apparatus, given.cache_dir
@@ -169,7 +169,6 @@ class TwinFingerNode(Node):
         self._follow_waiting()
 
     def _follow_waiting(self) -> None:
-        """Follow the path that arrived before the finger was ready."""
         path, self.waiting = self.waiting, None
         if path is not None:
             self._follow(path)
@@ -305,7 +304,6 @@ class TwinFingerNode(Node):
         return self.lit_marks.light(arms, finger, at_ns)
 
     def _stamp_error_ns(self) -> int:
-        """Return a random sample of the true time of an exposure minus its timestamp."""
         if self.parameters.apparatus is None:
             return 0
         camera = self.parameters.apparatus.camera

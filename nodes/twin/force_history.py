@@ -17,11 +17,9 @@ import math
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import Apparatus
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 REFERENCE_S = 1.0
 """Age of a force at which the relaxation function is one."""

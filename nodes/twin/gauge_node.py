@@ -11,21 +11,19 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flexsheet.messages.apparatus import Apparatus, GaugeTruth
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Positive, Scene
 from flexsheet.messages.types import Force, TwinArms, TwinFinger
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.membrane import solve
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
-
-Floats = NDArray[np.float64]
 
 CELLS = 12
 """Number of cells per side of the mesh; the force differs by 1 % from that with 32 cells."""
@@ -58,7 +56,7 @@ class TrueSheetForce:
         self._radius_m = true_scene.finger.radius_m
         self._history = ForceHistory.of(apparatus)
         self._clamps = [
-            transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)
+            pose_matrix(arm.flange_from_edge)
             for arm in (true_scene.arms.left, true_scene.arms.right)
         ]
 
@@ -90,7 +88,6 @@ class GaugeErrors:
     random: np.random.Generator
 
     def read_n(self, force_n: float) -> float:
-        """Return the reading of the gauge for a true force."""
         noise_n = self.truth.noise_n * float(self.random.standard_normal())
         return self.truth.gain_ratio * force_n + self.truth.offset_n + noise_n
 

@@ -15,7 +15,7 @@ The gestures follow published measurements of human motion:
   95:319). Hurried taps follow in 170-200 ms, 50-60 in ten seconds (finger tapping test of the
   Halstead Reitan battery). Contact is assumed to last 100-200 ms of an unhurried tap and about half
   of a hurried one; there is no source for soft objects.
-- People who are told to stop a reach need 206 ms on average to react (Mirabella, Pani, Pare and
+- After a signal to stop a reach, people need 206 ms on average to react (Mirabella, Pani, Pare and
   Ferraina 2006, Exp. Brain Res. 174:240). A stop is therefore sudden for an observer only.
 - Ellipses and similar figures are drawn more slowly where they are more curved, as in harmonic
   motion (Richardson and Flash 2002, J. Neurosci. 22:8201).
@@ -34,14 +34,14 @@ from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.finger import minimum_jerk_profile
 from flexsheet.nodes.twin.paths import map_to_surface, place_path, touchable
 
-Floats = NDArray[np.float64]
 Sampled = tuple[Floats, Floats]
 """Times (n,) in s, from zero, and surface positions (n, 3) or distances (n,) in m at these times.
 """
@@ -125,7 +125,6 @@ def touched(motion: Sampled) -> Sampled:
 
 
 def _on_surface(scene: Scene, label: str, motion: Sampled) -> FingerPath:
-    """Make the path of a gesture in contact, with the tremor of a hand that is held out."""
     times, places = touched(motion)
     return place_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
 
@@ -144,7 +143,6 @@ def hover(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed: int) -> FingerPath:
-    """Make ten reaches, alternating between the surface and the air above it."""
     generator = np.random.default_rng(seed)
     along_m, arc_m = touchable(scene)
     half = 0.5 * np.array([along_m, arc_m])

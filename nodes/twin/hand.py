@@ -19,15 +19,14 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.sheet_reaction import SheetReaction
 from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
 
-Floats = NDArray[np.float64]
 VoluntaryPath = Callable[[float], tuple[Floats, Floats]]
 """Voluntary position (3,) m and velocity (3,) m/s at a time, s."""
 
@@ -240,7 +239,6 @@ class CoupledFinger:
 
 
 def _hermite(t: float, span_s: float, before: float, after: float, rates: list[float]) -> float:
-    """Interpolate a value at a fraction t of a time span, from values and rates at both ends."""
     s = 1.0 - t
     return (
         s * s * (1.0 + 2.0 * t) * before

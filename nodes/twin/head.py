@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import EyesTruth
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.finger import SineSum
-
-Floats = NDArray[np.float64]
 
 MIN_SWAY_FREQUENCY_RATIO = 0.1
 """Lowest frequency of the head's sway, relative to the highest."""

@@ -10,19 +10,17 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.messages.types import Frame, TwinArms
-from flexsheet.nodes.models.rigid import apply, inverse, transform, transform_from_rpy
+from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.twin.eye import TrueProjector
 from flexsheet.nodes.twin.membrane import DeformedSheet, NotConvergedError, solve
 from flexsheet.nodes.twin.projector import on_plane
 from flexsheet.nodes.twin.rig import slopes_of
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
-
-Floats = NDArray[np.float64]
 
 CELLS = 8
 """Number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
@@ -61,7 +59,7 @@ class LitMarks:
         )
         projector = require_projector(scene)
         pose = projector.world_from_projector
-        self._world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._world_from_projector = pose_matrix(pose)
         self._frames: deque[tuple[int, Floats]] = deque(maxlen=16)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="sheet")
         self._solving: Future[_Heights | None] | None = None
@@ -108,8 +106,8 @@ class LitMarks:
             spec.flange_from_edge for spec in (self._scene.arms.left, self._scene.arms.right)
         )
         return (
-            arms.world_from_flange_left @ transform_from_rpy(left.position_m, left.rpy_rad),
-            arms.world_from_flange_right @ transform_from_rpy(right.position_m, right.rpy_rad),
+            arms.world_from_flange_left @ pose_matrix(left),
+            arms.world_from_flange_right @ pose_matrix(right),
         )
 
     def _rays(self, pixels: Floats) -> tuple[Floats, Floats]:

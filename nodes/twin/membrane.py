@@ -25,10 +25,9 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Bools, Floats
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
-Bools = NDArray[np.bool_]
 
 CELLS = 32
 """Number of intervals between nodes along each side; an element spans two of them."""

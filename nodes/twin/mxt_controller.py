@@ -2,8 +2,9 @@
 
 This module was written from `docs/mxt.md` only. It shares no code with the bridge (the node that
 sends commands to an arm), because it serves to test the bridge. The robot program
-`Mxt 1,1,<filter>` is assumed to run. Only part of what a real controller refuses is known; this one
-refuses more, and does not answer after its program has ended.
+`Mxt 1,1,<filter>` is assumed to run. The set of packets that a real controller rejects is only
+partly known. The simulated controller rejects more packets, and sends no answer after its program
+has ended.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from collections.abc import Callable
 import numpy as np
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
     JITTER_STREAM,
@@ -23,7 +25,6 @@ from flexsheet.nodes.twin.arms import (
     RANGE_RAD,
     SPEED_RAD_PER_S,
     Fault,
-    Floats,
     Servo,
 )
 
@@ -331,7 +332,6 @@ class MxtServer:
         self._wait_for_cycle()
 
     def _wait_for_cycle(self) -> None:
-        """Schedule the answer for the end of the present cycle."""
         if self._due is None:
             loop = asyncio.get_running_loop()
             self._due = loop.call_later(self.controller.until_cycle_s(), self._flush)

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import FingerTruth
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.twin.clutter import FINGER_DIRECTION, FINGER_LENGTH_M
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,16 +14,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape
 from flexsheet.nodes.twin.finger import FingerPathError, SmoothPath
 
-Floats = NDArray[np.float64]
 FAR_M = 2.0
 MAX_DISTANCE_M = 0.5
 STRIDE_M = 0.001

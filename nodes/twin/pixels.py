@@ -18,11 +18,11 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chndtr
 
 from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.messages.types import Side
+from flexsheet.nodes.arrays import Floats, Image, Singles
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.twin.clutter import (
     CLUTTER,
@@ -37,9 +37,6 @@ from flexsheet.nodes.twin.clutter import (
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.rig import pixel_of, pixels_of, pixels_per_slope, slopes_of
 
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Image = NDArray[np.uint8]
 Window = tuple[slice, slice]
 """Rows and columns of a rectangular part of an image."""
 
@@ -487,7 +484,6 @@ class TwinCamera:
     def _eye(
         self, side: Side, lens: Lens, camera_from_world: Floats, sheet: Singles | None
     ) -> CameraView:
-        """Make the view of one camera, with all static objects drawn into its background."""
         height, width = self.camera.height_px, self.camera.width_px
         slopes = _slopes(lens, width, height)
         canvas = self._room(height, width)
@@ -613,7 +609,6 @@ def quantize(levels: Singles) -> Image:
 
 
 def _spots(clutter: Clutter, side: Side) -> list[SecondMarker | Highlight]:
-    """Return the additional markers and the highlights that one camera sees."""
     spots: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
     return [spot for spot in spots if spot.views in ("both", side)]
 

@@ -14,6 +14,7 @@ from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Lens, Pose, Projector, Scene, StereoCamera
+from flexsheet.nodes.arrays import Floats, Image, Singles
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
@@ -24,10 +25,6 @@ from flexsheet.nodes.models.rigid import (
 )
 from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
-
-Floats = NDArray[np.float64]
-Singles = NDArray[np.float32]
-Image = NDArray[np.uint8]
 
 RAYS = 2
 """Number of rays per camera pixel in each direction."""

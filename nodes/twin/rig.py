@@ -12,12 +12,11 @@ import math
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Lens, StereoCamera
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 
-Floats = NDArray[np.float64]
 T = TypeVar("T", float, Floats)
 
 FOCAL_DEVIATION = 0.005

@@ -9,15 +9,13 @@ from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import SheetSpec
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, TrueRubber, solve
-
-Floats = NDArray[np.float64]
 
 CELLS = 8
 """Number of node intervals per side of the sheet's mesh. Without a finger, the force differs by 1 %

@@ -11,18 +11,16 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import Specification, cached, encode_fields
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.membrane import NotConvergedError, TrueRubber, solve
 from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
 
 VERSION = 1
 """Version of the computation; tables of another version are computed again."""

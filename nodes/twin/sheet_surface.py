@@ -10,17 +10,15 @@ from functools import lru_cache
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.membrane import TrueRubber, solve
 from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
-
-Floats = NDArray[np.float64]
 
 CELLS = 8
 """Membrane elements per side. The sag at the usable height differs by 0.3 % from that with 32."""
@@ -124,7 +122,6 @@ class SheetSurface:
 
     @classmethod
     def of(cls, scene: Scene, apparatus: Apparatus | None = None) -> Self:
-        """Return the surface of the true sheet in an apparatus, or of the sheet in the scene."""
         rubber = true_rubber(apply_apparatus(scene, apparatus).sheet, apparatus)
         if rubber.density_kg_per_m3 == 0.0:
             return cls(None)

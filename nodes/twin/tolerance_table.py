@@ -178,7 +178,6 @@ class Tolerance:
     frame_periods: tuple[Profile, ...] = ()
 
     def of(self, profile: Profile, *, calibrated: bool) -> Distribution | tuple[Distribution, ...]:
-        """Return the distribution for a profile, or a tuple with one for each component."""
         if calibrated and self.calibrated is not None:
             return self.calibrated
         return self.paper if profile is Profile.PAPER and self.paper is not None else self.modern

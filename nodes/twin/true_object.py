@@ -14,11 +14,11 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from flexsheet.messages.scene import Cylinder, Ellipsoid, Geometry, Mesh, Plane, Scene, Sphere
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, pose_matrix
 from flexsheet.nodes.models.shapes import GEOMETRIES, Shape, make_shape
 from flexsheet.nodes.models.shapes.triangles import find_degenerate, nearest_in_triangles
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 AROUND, ALONG = 160, 40
@@ -168,7 +168,6 @@ def _strip(rows: int, around: int) -> Indices:
 
 
 def _fan(rim: Indices, centre: int) -> Indices:
-    """Return triangles from a centre vertex to all edges of a closed rim."""
     return np.column_stack([np.full(len(rim), centre), rim, np.roll(rim, -1)])
 
 
@@ -191,7 +190,6 @@ def _tube(radius_m: float, length_m: float) -> tuple[Floats, Indices]:
 
 
 def _rectangle(width_m: float, height_m: float) -> tuple[Floats, Indices]:
-    """Return vertices and triangles of a rectangle about the origin that faces +z."""
     x = np.linspace(-0.5, 0.5, PLANE_CELLS + 1)
     y, x = (v.ravel() for v in np.meshgrid(height_m * x, width_m * x, indexing="ij"))
     cell = np.arange(PLANE_CELLS)

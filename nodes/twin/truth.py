@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from flexsheet.messages.apparatus import (
@@ -23,16 +22,14 @@ from flexsheet.messages.scene import ArmSpec, Lens, Pose, Scene, StereoCamera
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
+    pose_matrix,
     rotation_from_rpy,
     rotation_from_vector,
     rpy_from_rotation,
     transform,
-    transform_from_rpy,
     vector_from_rotation,
 )
 from flexsheet.nodes.node import NodeParameters
-
-Floats = NDArray[np.float64]
 
 
 class SimulatorParameters(NodeParameters):
@@ -172,12 +169,12 @@ def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
     """
     nominal = apparatus.nominal or devices_of(scene)
     true_scene = apply_apparatus(scene, apparatus)
-    aligned_from_world = _matrix(nominal.camera.world_from_left) @ inverse(
-        _matrix(true_scene.camera.world_from_left)
+    aligned_from_world = pose_matrix(nominal.camera.world_from_left) @ inverse(
+        pose_matrix(true_scene.camera.world_from_left)
     )
 
     def offsets(before: Pose, true: Pose) -> list[tuple[float, ...]]:
-        moved = aligned_from_world @ _matrix(true)
+        moved = aligned_from_world @ pose_matrix(true)
         turned = vector_from_rotation(moved[:3, :3] @ rotation_from_rpy(before.rpy_rad).T)
         return [tuple((moved[:3, 3] - before.position_m).tolist()), tuple(turned.tolist())]
 
@@ -215,10 +212,6 @@ def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
             ),
         }
     )
-
-
-def _matrix(pose: Pose) -> Floats:
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def check_truth(scene: Scene, apparatus: Apparatus) -> list[tuple[tuple[str, ...], Any, str, str]]:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.shapes.smooth_mesh import SmoothMeshShape
 from flexsheet.nodes.models.shapes.solids import (
     CylinderShape,
@@ -23,8 +23,6 @@ from flexsheet.nodes.models.shapes.solids import (
     SphereShape,
 )
 from flexsheet.nodes.models.shapes.surface import Shape
-
-Floats = NDArray[np.float64]
 
 INNER_RATIO = 0.8
 """Size of the undistorted lattice inside the mesh of a round solid over the size of the solid."""

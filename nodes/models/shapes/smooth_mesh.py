@@ -26,10 +26,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.shapes.surface import (
     EQUAL_DISTANCE_M,
-    Bools,
-    Floats,
     Nearest,
     SurfaceProjections,
     Triple,

@@ -10,12 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.shapes.surface import (
     EQUAL_DISTANCE_M,
     FRONT,
-    Bools,
     Convex,
-    Floats,
     Nearest,
     Triple,
     check_points,

@@ -16,10 +16,9 @@ from math import atan2, cos, hypot, sin, sqrt
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from flexsheet.nodes.arrays import Bools, Floats
 
 EQUAL_DISTANCE_M = 1e-6
 """Maximum difference between two distances that are considered equal."""

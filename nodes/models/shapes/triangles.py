@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Floats
 
-Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Indices32 = NDArray[np.int32]
 

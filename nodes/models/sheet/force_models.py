@@ -1,8 +1,8 @@
 """Compute the force of the pushed sheet by interchangeable models.
 
-Inputs of a model are the stretch ratio, depths of a fingertip below the flat sheet, the position on
-the stretched sheet (x, y from its centre, m) and the fingertip's radius. Outputs are the normal
-force, its derivative with respect to the depth, and the force on each clamp.
+Inputs of a model are depths of a fingertip below the flat sheet, and a `SheetPush`: the stretch
+ratio, the position on the stretched sheet (x, y from its centre, m) and the fingertip's radius.
+Outputs are the normal force, its derivative with respect to the depth, and the force on each clamp.
 
 By increasing cost: `ScaledSheetModel`, `nodes.models.sheet.tabulated.TabulatedSheetModel`,
 `MembraneSheetModel`.
@@ -14,16 +14,33 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.sheet.membrane import CELLS, push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tension import edge_force_n, strain_measure
 
-Floats = NDArray[np.float64]
 SheetPosition = tuple[float, float]
 
 CENTRE: SheetPosition = (0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class SheetPush:
+    """Conditions of a push, apart from its depth.
+
+    Raises ValueError for values that are not finite, and for a ratio or radius of 0 or less.
+    """
+
+    stretch_ratio: float
+    finger_radius_m: float
+    position_m: SheetPosition = CENTRE
+
+    def __post_init__(self) -> None:
+        if not np.isfinite((self.stretch_ratio, *self.position_m, self.finger_radius_m)).all():
+            raise ValueError(f"{self}: all values must be finite")
+        if self.stretch_ratio <= 0.0 or self.finger_radius_m <= 0.0:
+            raise ValueError(f"{self}: stretch ratio and finger radius must be above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,59 +61,28 @@ class SheetForceModel(Protocol):
     @property
     def rubber(self) -> Rubber: ...
 
-    def evaluate(
-        self,
-        stretch_ratio: float,
-        depths_m: Floats,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> SheetForce:
+    def evaluate(self, push: SheetPush, depths_m: Floats) -> SheetForce:
         """Return the forces at depths (n,), m; the force is zero for depths <= 0.
 
-        Raises ValueError for values that are not finite.
+        Raises ValueError for depths that are not finite.
         """
         ...
 
-    def invalid_reason(
-        self,
-        stretch_ratio: float,
-        depth_m: float,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> str:
+    def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
         """Return why the model is inaccurate for these inputs, or "" if they are in its range."""
         ...
 
 
 def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
     """Return the force (N) on each clamp of the sheet without a push."""
-    return edge_force_n(
-        stretch_ratio,
-        young_modulus_pa=rubber.young_modulus_pa,
-        width_m=rubber.width_m,
-        height_m=rubber.height_m,
-        thickness_m=rubber.thickness_m,
-        mooney_ratio=rubber.mooney_ratio,
-    )
+    return edge_force_n(stretch_ratio, rubber, mooney_ratio=rubber.mooney_ratio)
 
 
-def _check_push(
-    stretch_ratio: float, depths_m: Floats, position_m: SheetPosition, finger_radius_m: float
-) -> Floats:
-    """Return the depths with negative ones set to 0; raise ValueError for invalid inputs."""
+def _check_depths(depths_m: Floats) -> Floats:
+    """Return the depths with negative ones set to 0; raise ValueError if one is not finite."""
     depths = np.asarray(depths_m, dtype=np.float64)
-    numbers = (stretch_ratio, *position_m, finger_radius_m)
-    if not (np.isfinite(numbers).all() and np.isfinite(depths).all()):
-        raise ValueError(
-            f"push of {depths} m at {position_m}, stretch ratio {stretch_ratio}, finger radius "
-            f"{finger_radius_m} m: all values must be finite"
-        )
-    if stretch_ratio <= 0.0 or finger_radius_m <= 0.0:
-        raise ValueError(
-            f"stretch ratio {stretch_ratio} and finger radius {finger_radius_m} m must be above 0"
-        )
+    if not np.isfinite(depths).all():
+        raise ValueError(f"push of {depths} m: all depths must be finite")
     return np.maximum(depths, 0.0)
 
 
@@ -184,21 +170,14 @@ class ScaledSheetModel:
     stretch_scale: float = 1.0
     name: str = "scaled"
 
-    def evaluate(
-        self,
-        stretch_ratio: float,
-        depths_m: Floats,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> SheetForce:
-        depths = _check_push(stretch_ratio, depths_m, position_m, finger_radius_m)
-        rubber, s = self.rubber, max(self.stretch_scale * stretch_ratio, 1.0)
-        x, y = relative_position(rubber, s, position_m)
+    def evaluate(self, push: SheetPush, depths_m: Floats) -> SheetForce:
+        depths = _check_depths(depths_m)
+        rubber, s = self.rubber, max(self.stretch_scale * push.stretch_ratio, 1.0)
+        x, y = relative_position(rubber, s, push.position_m)
         tension, modulus = _push_tension(rubber, s, depths, (x, y))
         strain = strain_measure(s, rubber.mooney_ratio)
         depth_ratio = depths / rubber.width_m
-        radius = finger_radius_m / rubber.width_m / _FITTED_RADIUS
+        radius = push.finger_radius_m / rubber.width_m / _FITTED_RADIUS
         height = rubber.height_m / rubber.width_m
         cubic = (
             self.cubic_ratio
@@ -232,23 +211,16 @@ class ScaledSheetModel:
             flat_edge_force_n(rubber, s) + tension,
         )
 
-    def invalid_reason(
-        self,
-        stretch_ratio: float,
-        depth_m: float,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> str:
-        rubber, stretch_ratio = self.rubber, self.stretch_scale * stretch_ratio
+    def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
+        rubber, stretch_ratio = self.rubber, self.stretch_scale * push.stretch_ratio
         if not 1.0 <= stretch_ratio <= MAX_STRETCH_RATIO:
             return f"stretch {stretch_ratio:.3f} is not from 1 to {MAX_STRETCH_RATIO:g}"
         if not 0.008 <= depth_m / rubber.width_m <= 0.21:
             return "the depth is not 0.8 to 21 % of the sheet's width"
-        x, y = relative_position(rubber, stretch_ratio, position_m)
+        x, y = relative_position(rubber, stretch_ratio, push.position_m)
         if x > 0.5 or y > 0.76:
             return "the position is too close to an edge"
-        return _invalid_sizes(rubber, finger_radius_m)
+        return _invalid_sizes(rubber, push.finger_radius_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,22 +231,15 @@ class MembraneSheetModel:
     cells: int = CELLS
     name: str = "membrane"
 
-    def evaluate(
-        self,
-        stretch_ratio: float,
-        depths_m: Floats,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> SheetForce:
-        depths = _check_push(stretch_ratio, depths_m, position_m, finger_radius_m)
+    def evaluate(self, push: SheetPush, depths_m: Floats) -> SheetForce:
+        depths = _check_depths(depths_m)
         solved_depths = np.unique(np.concatenate([depths, _SLOPE_FRACTION * depths]))
         path = push_path(
             self.rubber,
-            stretch_ratio=stretch_ratio,
+            stretch_ratio=push.stretch_ratio,
             depths_m=solved_depths,
-            position_m=position_m,
-            finger_radius_m=finger_radius_m,
+            position_m=push.position_m,
+            finger_radius_m=push.finger_radius_m,
             cells=self.cells,
         )
         at = np.searchsorted(solved_depths, depths)
@@ -283,17 +248,10 @@ class MembraneSheetModel:
         run = np.where(depths > 0.0, (1.0 - _SLOPE_FRACTION) * depths, 1.0)
         return SheetForce(path.forces_n[at], rise / run, path.edge_forces_n[at])
 
-    def invalid_reason(
-        self,
-        stretch_ratio: float,
-        depth_m: float,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> str:
-        if depth_m < 0.2 * finger_radius_m:
+    def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
+        if depth_m < 0.2 * push.finger_radius_m:
             return "the contact is smaller than a mesh cell"
-        x, y = relative_position(self.rubber, stretch_ratio, position_m)
+        x, y = relative_position(self.rubber, push.stretch_ratio, push.position_m)
         return "" if x <= 0.8 and y <= 0.9 else "the fingertip overlaps an edge"
 
 
@@ -302,13 +260,7 @@ _SLOPE_FRACTION = 0.96
 
 
 def depth_for_force(
-    model: SheetForceModel,
-    stretch_ratio: float,
-    forces_n: Floats,
-    *,
-    max_depth_m: float,
-    position_m: SheetPosition,
-    finger_radius_m: float,
+    model: SheetForceModel, push: SheetPush, forces_n: Floats, *, max_depth_m: float
 ) -> Floats:
     """Return the depths (n,) at which the model gives these forces (n,), at most `max_depth_m`.
 
@@ -316,9 +268,7 @@ def depth_for_force(
     depth. The relative error is below 1e-3.
     """
     grid = max_depth_m * _INVERSE_GRID
-    grid_forces = model.evaluate(
-        stretch_ratio, grid, position_m=position_m, finger_radius_m=finger_radius_m
-    ).force_n
+    grid_forces = model.evaluate(push, grid).force_n
     return interpolate_inverse(grid, grid_forces, np.asarray(forces_n, dtype=np.float64))
 
 

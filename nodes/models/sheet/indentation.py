@@ -15,12 +15,10 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.sheet.membrane import push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber
-
-Floats = NDArray[np.float64]
 
 HALF_CELLS = 14
 """Number of grid cells from the finger to each side of the sheet."""

@@ -27,10 +27,9 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 CELLS = 32

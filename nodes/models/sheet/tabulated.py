@@ -9,13 +9,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForce, SheetPosition
+from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.models.sheet.force_models import (
+    ScaledSheetModel,
+    SheetForce,
+    SheetPosition,
+    SheetPush,
+)
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
-Floats = NDArray[np.float64]
 Measure = Callable[[float, Floats, SheetPosition], Floats]
 """Function that returns forces (n,), N, at a stretch ratio, depths (n,), m, and a position."""
 
@@ -53,20 +57,12 @@ class TabulatedSheetModel:
     def rubber(self) -> Rubber:
         return self.base.rubber
 
-    def evaluate(
-        self,
-        stretch_ratio: float,
-        depths_m: Floats,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> SheetForce:
-        base = self.base.evaluate(
-            stretch_ratio, depths_m, position_m=position_m, finger_radius_m=finger_radius_m
-        )
-        ratios = _interpolate_linear(self.stretches, stretch_ratio, self.ratios)
-        ratios = _interpolate_linear(self.xs_m, abs(position_m[0]), np.moveaxis(ratios, 1, 0))
-        ratios = _interpolate_linear(self.ys_m, abs(position_m[1]), np.moveaxis(ratios, 1, 0))
+    def evaluate(self, push: SheetPush, depths_m: Floats) -> SheetForce:
+        base = self.base.evaluate(push, depths_m)
+        x, y = map(abs, push.position_m)
+        ratios = _interpolate_linear(self.stretches, push.stretch_ratio, self.ratios)
+        ratios = _interpolate_linear(self.xs_m, x, np.moveaxis(ratios, 1, 0))
+        ratios = _interpolate_linear(self.ys_m, y, np.moveaxis(ratios, 1, 0))
         if len(self.depths_m) == 1:
             ratio, slope = np.full(base.force_n.shape, ratios[0]), np.zeros(1)
         else:
@@ -80,17 +76,10 @@ class TabulatedSheetModel:
             base.edge_force_n,
         )
 
-    def invalid_reason(
-        self,
-        stretch_ratio: float,
-        depth_m: float,
-        *,
-        position_m: SheetPosition,
-        finger_radius_m: float,
-    ) -> str:
-        x, y = abs(position_m[0]), abs(position_m[1])
+    def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
+        x, y = map(abs, push.position_m)
         inputs = {
-            "stretch": (stretch_ratio, self.stretches),
+            "stretch": (push.stretch_ratio, self.stretches),
             "depth": (depth_m, self.depths_m),
             "position along x": (x, self.xs_m),
             "position along y": (y, self.ys_m),
@@ -130,7 +119,7 @@ def make_tabulated_model(
             for d, y in enumerate(ys_m):
                 position = (float(x), float(y))
                 scaled = base.evaluate(
-                    float(stretch), depths_m, position_m=position, finger_radius_m=finger_radius_m
+                    SheetPush(float(stretch), finger_radius_m, position), depths_m
                 )
                 ratios[a, :, c, d] = measure(float(stretch), depths_m, position) / scaled.force_n
                 done += 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,29 +43,33 @@ def strain_measure(stretch_ratio: float, mooney_ratio: float = 0.0) -> float:
     return (s - s**-2) / 3.0 * (1.0 - mooney_ratio + mooney_ratio / s)
 
 
-def edge_force_n(
-    stretch_ratio: float,
-    *,
-    young_modulus_pa: float,
-    width_m: float,
-    height_m: float,
-    thickness_m: float,
-    mooney_ratio: float = 0.0,
-) -> float:
-    """Return the force (N) on each clamped edge of the sheet without a push; 0 for a slack sheet.
+class SlackSheet(Protocol):
+    """Dimensions and modulus of a slack sheet, as in the scene, in `Rubber` and in arm limits.
 
-    width_m: distance of the edges of the slack sheet. height_m: length of an edge.
+    width_m: distance of the clamped edges. height_m: length of an edge.
     """
-    area_modulus = _clamp_factor(width_m, height_m) * (young_modulus_pa * thickness_m * height_m)
-    return area_modulus * strain_measure(stretch_ratio, mooney_ratio)
+
+    @property
+    def width_m(self) -> float: ...
+
+    @property
+    def height_m(self) -> float: ...
+
+    @property
+    def thickness_m(self) -> float: ...
+
+    @property
+    def young_modulus_pa(self) -> float: ...
 
 
-def stretch_for_edge_force(
-    force_n: float, *, young_modulus_pa: float, width_m: float, height_m: float, thickness_m: float
-) -> float:
+def edge_force_n(stretch_ratio: float, sheet: SlackSheet, *, mooney_ratio: float = 0.0) -> float:
+    """Return the force (N) on each clamped edge without a push; 0 for a slack sheet."""
+    return _area_modulus_n(sheet) * strain_measure(stretch_ratio, mooney_ratio)
+
+
+def stretch_for_edge_force(force_n: float, sheet: SlackSheet) -> float:
     """Return the stretch ratio for an edge force (N) of neo-Hookean rubber, by Newton's method."""
-    scale = _clamp_factor(width_m, height_m) * (young_modulus_pa * thickness_m * height_m) / 3.0
-    target = max(force_n, 0.0) / scale
+    target = max(force_n, 0.0) / (_area_modulus_n(sheet) / 3.0)
     stretch = 1.0 + target / 3.0
     for _ in range(20):
         step = (stretch - stretch**-2 - target) / (1.0 + 2.0 * stretch**-3)
@@ -74,8 +79,12 @@ def stretch_for_edge_force(
     return stretch
 
 
-def _clamp_factor(width_m: float, height_m: float) -> float:
-    return CLAMP_FACTOR + CLAMP_FACTOR_PER_ASPECT * height_m / width_m
+def _area_modulus_n(sheet: SlackSheet) -> float:
+    return _clamp_factor(sheet) * (sheet.young_modulus_pa * sheet.thickness_m * sheet.height_m)
+
+
+def _clamp_factor(sheet: SlackSheet) -> float:
+    return CLAMP_FACTOR + CLAMP_FACTOR_PER_ASPECT * sheet.height_m / sheet.width_m
 
 
 def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
@@ -112,8 +121,7 @@ def compute_sag_m(
     u = np.asarray(across, dtype=np.float64)
     if load_pa == 0.0:
         return np.zeros(u.shape)
-    clamp_factor = _clamp_factor(rubber.width_m, rubber.height_m)
-    stiffness = clamp_factor * rubber.young_modulus_pa * rubber.thickness_m
+    stiffness = _clamp_factor(rubber) * rubber.young_modulus_pa * rubber.thickness_m
     tension = stiffness * strain_measure(stretch, rubber.mooney_ratio)
     # r = sag/L solves  (8/3 stiffness) r^3 + tension r = |load| L / 8, which has one real root.
     stiffening = 8.0 / 3.0 * stiffness
