@@ -56,6 +56,8 @@ class Planner(Node):
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_latency", "force"})
 
+    watched_inputs: ClassVar[frozenset[str]] = frozenset({"fingertip"})
+    ends_with_inputs: ClassVar[bool] = True
     live_parameters: ClassVar[frozenset[str]] = frozenset({"max_age_s"})
     parameters: PlannerParameters
     scene: Input[Scene]

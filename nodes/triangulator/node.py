@@ -68,6 +68,8 @@ class Triangulator(Node):
     """
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame"})
+    watched_inputs: ClassVar[frozenset[str]] = frozenset({"stereo"})
+    ends_with_inputs: ClassVar[bool] = True
     live_parameters: ClassVar[frozenset[str]] = frozenset({"track_timeout_s"})
     parameters: TriangulatorParameters
     scene: Input[Scene]
