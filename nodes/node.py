@@ -357,6 +357,7 @@ class Node:
             epoch = self.started_ns
         declared = find_ports(type(self))
         for port in declared.values():
+            port.message.model_rebuild()  # otherwise done during the first message
             topic = find_topic((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
                 raise TypeError(

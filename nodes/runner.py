@@ -352,6 +352,7 @@ async def run_node(
         # Exclude the objects that `setup` has made from garbage collection while the node runs.
         gc.collect()
         gc.freeze()
+        gc.enable()
         heartbeat.report_ready()
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
