@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.triangulator.fingertip import Candidate, StereoDetection
@@ -370,7 +370,7 @@ class DataAssociation:
                 _association_cost(one, at_ns, marker) for one in all_tracks
             ]
             costs[row, len(all_tracks) + row] = NEW_TRACK_COST
-        columns = linear_sum_assignment(costs)[1].tolist()
+        columns = scipy.optimize.linear_sum_assignment(costs)[1].tolist()
         ambiguous = (
             set[int]() if finger is None else _ambiguous_rows(costs, columns, len(all_tracks) - 1)
         )

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
@@ -144,7 +144,8 @@ class Ground:
         headings = np.gradient(points, axis=0)
         grid, _ = _walk(self._shape, points, np.cross(normals, headings), ticks[1])
         self._splines = [
-            RectBivariateSpline(*ticks, grid[:, :, axis].T, s=0.0) for axis in range(3)
+            scipy.interpolate.RectBivariateSpline(*ticks, grid[:, :, axis].T, s=0.0)
+            for axis in range(3)
         ]
 
 

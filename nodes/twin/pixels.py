@@ -18,8 +18,8 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import chndtr
 
 from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.messages.types import Side
@@ -603,7 +603,7 @@ def rasterize_ball(
         du, dv = u - single(x), v - single(y)
         turn = du * single(y) - dv * single(x)
         distance_sq = (du * du + dv * dv + turn * turn) * single(c * c / spread_sq) / ray_sq
-        cover += chndtr(single(radius_m**2 / spread_sq), single(2.0), distance_sq)
+        cover += scipy.special.chndtr(single(radius_m**2 / spread_sq), single(2.0), distance_sq)
     return np.asarray(cover / single(len(centres)), dtype=np.float32)
 
 

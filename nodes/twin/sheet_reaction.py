@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
@@ -146,7 +146,9 @@ def compute_reaction(
     fine_m = np.linspace(0.0, depths_m[-1], DEPTH_STEPS)
 
     def refine(values: Floats) -> Floats:
-        return np.asarray(PchipInterpolator(depths_m, values)(np.maximum(fine_m, depths_m[0])))
+        return np.asarray(
+            scipy.interpolate.PchipInterpolator(depths_m, values)(np.maximum(fine_m, depths_m[0]))
+        )
 
     centre = [push_n(stretch, 0.0, 0.0) for stretch in stretches]
     middle = len(stretches) // 2

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForce, SheetPosition
 from flexsheet.nodes.models.sheet.rubber import Rubber
@@ -70,7 +70,7 @@ class TabulatedSheetModel:
         if len(self.depths_m) == 1:
             ratio, slope = np.full(base.force_n.shape, ratios[0]), np.zeros(1)
         else:
-            curve = PchipInterpolator(self.depths_m, ratios)
+            curve = scipy.interpolate.PchipInterpolator(self.depths_m, ratios)
             within = np.clip(depths_m, self.depths_m[0], self.depths_m[-1])
             ratio = curve(within)
             slope = np.where(within == depths_m, curve(within, 1), 0.0)
