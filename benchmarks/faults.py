@@ -29,9 +29,13 @@ from tests.lab_bags import Arm, Floats, Gap, Times, gaps, measure_hold, read_arm
 
 
 class Span:
-    """Start and end of a fault, s of the monotonic clock."""
+    """Start and end of a fault, s of the monotonic clock.
+
+    killed_side: arm whose bridge is killed, if any.
+    """
 
     def __init__(self) -> None:
+        self.killed_side: str | None = None
         self.begun_s = self.over_s = time.monotonic()
 
     def begin(self) -> None:
@@ -52,6 +56,9 @@ MAX_LENGTH_M = 0.24 * 1.15
 BACK_WITHIN_S = 60.0
 SILENT_S = 0.1
 """Maximum age of a state of a bridge that follows."""
+
+KILLED_SILENT_S = 0.02
+"""Maximum age of the last state of a bridge that is killed; the other arm must stop by itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,13 +96,14 @@ async def run_fault(lab: Lab, name: str, work: Work) -> Result:
     async def watch() -> None:
         newest: dict[str, tuple[float, object]] = {}
         while True:
-            modes = lab.modes()
+            modes: set[str] = set()
             for side in SIDES:
                 state = lab.newest.get(f"arm_{side}")
                 if newest.get(side, (0.0, None))[1] is not state:
                     newest[side] = (time.monotonic(), state)
-                elif time.monotonic() - newest[side][0] > SILENT_S:
-                    modes = {"silent"}
+                max_age_s = KILLED_SILENT_S if side == span.killed_side else SILENT_S
+                is_silent = time.monotonic() - newest[side][0] > max_age_s
+                modes.add(state.mode if isinstance(state, ArmState) and not is_silent else "silent")
             if not told or told[-1][1] != modes:
                 told.append((time.monotonic(), modes))
             await asyncio.sleep(0.005)
@@ -191,19 +199,23 @@ async def kill(lab: Lab, host: str, node: str, span: Span) -> None:
     # Finding the process takes up to 0.1 s on a busy computer; the time counts from the kill.
     pid = lab.pid_of(host, node)
     before = lab.restarts(host, node)
+    span.killed_side = host if "bridge" in node else None
     span.begin()
     os.kill(pid, signal.SIGKILL)
     await lab.until(lambda: lab.restarts(host, node) > before, f"{node} to be started again")
+    span.killed_side = None
 
 
 async def kill_launcher(lab: Lab, host: str, span: Span) -> None:
     """Kill the launcher with its nodes, and restart it as systemd does."""
     process = lab.launchers[host]
+    span.killed_side = host if host in SIDES else None
     span.begin()
     process.kill()
     await asyncio.to_thread(process.wait)
     await asyncio.sleep(4.0)
     span.end()
+    span.killed_side = None
     lab.start(host)
     await lab.watch_usual(host)
 

@@ -41,6 +41,7 @@ def main() -> None:
 
         exit_with_parent()
         apply_niceness()
+        _shorten_imports()
         from flexsheet.nodes.runner import main as run_node
 
         sys.exit(run_node(sys.argv[2]))
@@ -53,6 +54,16 @@ def main() -> None:
     from flexsheet.launch.cli import main as run_command
 
     run_command()
+
+
+def _shorten_imports() -> None:
+    """Shorten the imports of a node, until `nodes.runner` enables garbage collection again."""
+    gc.disable()
+    # Without `rich`, structlog leaves out its coloured tracebacks, which nodes do not print.
+    sys.modules["rich"] = None  # type: ignore[assignment]  # makes `import rich` fail
+    import structlog  # noqa: F401
+
+    del sys.modules["rich"]
 
 
 def _avoid_garbage_collection() -> None:

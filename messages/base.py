@@ -28,16 +28,21 @@ class Message(BaseModel):
     """Base class of typed, immutable messages.
 
     Subclasses declare fields; `flexsheet.messages.arrays` defines array types.  Numbers are in SI
-    units and radians.  Units and frames are in the names (`age_s`, `world_from_sheet`).
+    units and radians.  Units and frames are in the names (`age_s`, `world_from_sheet`).  A type's
+    validator is built on its first use, because a node uses few of the types.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True
+    )
 
 
 class MessagePart(BaseModel):
     """Base class of the named groups of fields in a message."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True
+    )
 
 
 @dataclass(frozen=True, slots=True)

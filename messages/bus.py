@@ -62,6 +62,9 @@ MAX_SUBSCRIPTION_BYTES = 512
 
 HANDSHAKE_MS = 5000
 REOPEN_DELAY_S = 0.5
+WATCHED_RECONNECT_MS = 50
+"""Maximum period of attempts to connect to a writer whose end the subscriber watches."""
+
 MAX_PAST_CLOCKS = 16
 
 # Plain integers, because operations on Python's enumerations take longer than ZeroMQ's calls.
@@ -218,6 +221,17 @@ class Publisher:
             self._close_socket(unbind=True)
             self._open(self.endpoints)
 
+    def interrupt(self) -> None:
+        """Disconnect all readers, as the end of this process would.
+
+        They connect again by themselves. Messages sent before are still delivered.
+        """
+        if self._channel is not None:
+            self._channel.interrupt()
+        if not self._socket.closed:
+            self._close_socket(unbind=True)
+            self._open(self.endpoints)
+
     def send(self, message: Message, header: Header) -> None:
         """Pass the message to the socket without blocking.
 
@@ -329,6 +343,8 @@ class Subscriber:
     keys: keys of this host and the others; None: tcp connects to loopback only.
     plan: hash of the plan whose messages are accepted; None: messages of any plan.
     message_filter: called with each valid message before `on_message`.
+    on_disconnected: called after the last message of a connection that has ended: because the
+      writer's process has ended, because of `Publisher.interrupt`, or by a fault of the network.
     local: bus inside this process, by which writers of the same process are read; not with `raw`.
     """
 
@@ -345,8 +361,10 @@ class Subscriber:
         keys: KeyRing | None = None,
         plan: str | None = None,
         message_filter: MessageFilter | None = None,
+        on_disconnected: Callable[[], None] | None = None,
         local: LocalBus | None = None,
     ) -> None:
+        self.on_disconnected = on_disconnected
         self.topic, self.counts, self.on_problem = topic, counts, on_problem
         self.on_handshake_failed = on_handshake_failed or on_problem
         self._on_message, self._message_filter, self._plan = on_message, message_filter, plan
@@ -588,7 +606,9 @@ class _HostConnection:
                 # then disconnect, and libzmq would abort the process as described at `HEARTBEATS`.
                 self._socket.setsockopt(zmq.RCVHWM, 0)
             self._socket.setsockopt(zmq.SUBSCRIBE, b"")
-            if self.secured:
+            if self._subscriber.on_disconnected is not None:
+                self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, WATCHED_RECONNECT_MS)
+            if self.secured or self._subscriber.on_disconnected is not None:
                 self._monitor = self._socket.get_monitor_socket(MONITORED_EVENTS)
                 self._loop.add_reader(self._monitor.fileno(), self._handle_monitor_events)
                 self._loop.call_soon(self._handle_monitor_events)
@@ -627,9 +647,9 @@ class _HostConnection:
         self._disconnected.clear()
 
     def _handle_monitor_events(self) -> None:
-        """Schedule a new connection after ZeroMQ has permanently ended one; a loop callback.
+        """Report the end of a connection, and connect again if ZeroMQ does not; a loop callback.
 
-        ZeroMQ does so after a rejected key and after corrupted data.
+        ZeroMQ ends a connection permanently after a rejected key and after corrupted data.
         """
         while self._monitor is not None:
             try:
@@ -641,6 +661,10 @@ class _HostConnection:
                 self._disconnected.discard(endpoint)
                 continue
             self._disconnected.add(endpoint)
+            if event == zmq.EVENT_DISCONNECTED and self._subscriber.on_disconnected is not None:
+                # Messages that arrived before the end of the connection are delivered first.
+                self._read()
+                self._subscriber.on_disconnected()
             if self._loop is not None:
                 self._loop.call_later(REOPEN_DELAY_S, self._reopen, self._socket)
             if event in HANDSHAKE_FAILED and event not in self._reported_events:

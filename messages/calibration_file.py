@@ -9,8 +9,10 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import YAMLError
-from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
+from ruamel.yaml.events import AliasEvent, CollectionStartEvent
+from ruamel.yaml.nodes import CollectionNode
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
@@ -68,16 +70,26 @@ def _parse(path: Path) -> Any:
 @lru_cache(maxsize=8)
 def _parse_text(text: str) -> Any:
     """Parse YAML text.  The values are shared by all calls: they must not be changed."""
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Composer = CalibrationComposer
+    return yaml.load(text)
+
+
+class CalibrationComposer(Composer):
+    """Composer of YAML without aliases and with a limited depth."""
+
     depth = 0
-    for event in YAML(typ="safe").parse(text):
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
         # A few aliases could expand to any number of values.
-        if isinstance(event, AliasEvent):
+        if self.parser.check_event(AliasEvent):
             raise YAMLError("the file contains a YAML alias (*), which calibrations never do")
-        depth += isinstance(event, CollectionStartEvent)
-        depth -= isinstance(event, CollectionEndEvent)
-        if depth > MAX_CALIBRATION_DEPTH:
+        self.depth += self.parser.check_event(CollectionStartEvent)
+        if self.depth > MAX_CALIBRATION_DEPTH:
             raise YAMLError(f"more than {MAX_CALIBRATION_DEPTH} lists or mappings are nested")
-    return YAML(typ="safe").load(text)
+        node = super().compose_node(parent, index)
+        self.depth -= isinstance(node, CollectionNode)
+        return node
 
 
 def read_calibration(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -82,6 +82,7 @@ class LocalReceiver(Protocol):
 
     topic: Topic
     counts: Any
+    on_disconnected: Callable[[], None] | None
 
     def accept_header(self, header: Header, writers: frozenset[str] | None) -> bool: ...
     def deliver(self, envelope: Envelope) -> None: ...
@@ -117,6 +118,11 @@ class LocalChannel:
     def forget(self) -> None:
         """Discard the message that is stored for late readers."""
         self._last = None
+
+    def interrupt(self) -> None:
+        """Tell the readers that no more messages come for now."""
+        for reader in self._readers:
+            reader.report_end()
 
     def add(self, reader: LocalConnection) -> None:
         self._readers.append(reader)
@@ -186,6 +192,11 @@ class LocalConnection:
         if not self._scheduled and self._loop is not None:
             self._scheduled = True
             self._loop.call_soon(self._read)
+
+    def report_end(self) -> None:
+        """Call `on_disconnected` after the delivery of the queued messages."""
+        if self._receiver.on_disconnected is not None and self._loop is not None:
+            self._loop.call_soon(self._receiver.on_disconnected)
 
     def _read(self) -> None:
         """Deliver the messages that were queued when the callback began."""

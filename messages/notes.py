@@ -32,6 +32,15 @@ class NodeNote(Enum):
         "no sheet target",
         BUSY_FIRST + "Then check camera, triangulator and planner: `flexsheet topic hz`.",
     )
+    PLANNER_ENDED = (
+        "the connection to the planner has ended",
+        "A node between camera and planner has ended and restarts. If the note remains, read its "
+        "log: `flexsheet logs`.",
+    )
+    OTHER_BRIDGE_ENDED = (
+        "the connection to the other arm's bridge has ended",
+        "The bridge has ended and restarts. If the note remains, read its log: `flexsheet logs`.",
+    )
     ARM_WATCHDOG = (
         "the arm's watchdog stopped it",
         BUSY_FIRST + "Then read the log of the arm's bridge, which sent no command for 100 ms.",

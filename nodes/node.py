@@ -132,6 +132,8 @@ class Input(Generic[M]):
 
     All timestamps are converted to this host's clock.
     clock_problem: why the conversion is not reliable, or "".
+    has_ended: whether the connection to the writer has ended since the last message; only of the
+        `watched_inputs` of a node.
     """
 
     def __init__(self, topic: Topic, clock: Clock) -> None:
@@ -139,7 +141,7 @@ class Input(Generic[M]):
         self.message: M | None = None
         self.header: Header | None = None
         self.received_ns: int = 0
-        self.clock_problem = ""
+        self.clock_problem, self.has_ended = "", False
         self.counts = PortCounts()
         self.on_accept: Callable[[Header, int], None] | None = None
         self._clock = clock
@@ -276,6 +278,11 @@ class Node:
     live_parameters: ClassVar[frozenset[str]] = frozenset()
     """Parameters that may change while the node runs, because each use reads them from
     `parameters`.  A class with such parameters declares `parameter: Input[ParameterChange]`."""
+    watched_inputs: ClassVar[frozenset[str]] = frozenset()
+    """Ports at which the node must notice at once that the writer's process has ended."""
+    ends_with_inputs: ClassVar[bool] = False
+    """Whether the end of a watched input also disconnects the readers of the node's outputs, so
+    that the nodes after it notice it too."""
     on_demand: ClassVar[bool] = False
     """Whether the node is left out of a graph in which no other node reads its topics."""
     opens_devices: ClassVar[bool] = False
@@ -350,6 +357,7 @@ class Node:
             epoch = self.started_ns
         declared = find_ports(type(self))
         for port in declared.values():
+            port.message.model_rebuild()  # otherwise done during the first message
             topic = find_topic((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
                 raise TypeError(
@@ -401,6 +409,7 @@ class Node:
     def deliver(self, port: str, message: Message, header: Header) -> None:
         """Pass a message to its input and handler; a coroutine handler runs in a separate task."""
         message, header, clock_problem = self._localise(message, header)
+        self.inputs[port].has_ended = False
         mailbox = self._mailboxes.get(port)
         if mailbox is not None:
             mailbox.put(message, header, clock_problem)

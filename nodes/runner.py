@@ -25,7 +25,7 @@ import uvloop
 from pydantic import BaseModel, ConfigDict
 
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.bus import MessageFilter, Publisher, Source, Subscriber
+from flexsheet.messages.bus import BusError, MessageFilter, Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.notes import NodeNote
@@ -92,9 +92,10 @@ class ProcessConfig(BaseModel):
 
 
 class NodeTransport:
-    """Sockets of one node's inputs and outputs.
+    """Sockets of one node's inputs and outputs; needs a running loop.
 
     local: bus between the nodes of one process; None if it has only one node.
+    failed: has an exception when a socket could not be opened again.
     """
 
     def __init__(self, config: NodeConfig, log: Any, local: LocalBus | None = None) -> None:
@@ -104,6 +105,7 @@ class NodeTransport:
         self._subscribers: list[Subscriber] = []
         self._keys_problem = ""
         self._stop_socket: StopSocket | None = None
+        self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
 
     def open_outputs(self, node: Node) -> None:
         for output in self._config.outputs:
@@ -160,6 +162,9 @@ class NodeTransport:
                 if node_input.topic.message in (Status, HostStatus)
                 else self._config.plan_hash,
                 message_filter=self._message_filter(node_input.topic),
+                on_disconnected=partial(self._end_input, node, config.port)
+                if config.port in node.watched_inputs
+                else None,
                 local=self._local,
             )
             subscriber.start()
@@ -177,6 +182,18 @@ class NodeTransport:
 
         self._stop_socket = StopSocket(Path(self._config.run_dir), "node", node.name, stop)
         self._stop_socket.open()
+
+    def _end_input(self, node: Node, port: str) -> None:
+        """Mark a watched input as ended; pass the end on to the nodes that read this one."""
+        node.inputs[port].has_ended = True
+        if not node.ends_with_inputs or self.failed.done():
+            return
+        try:
+            for topic, publisher in self._publishers.items():
+                if topic != node.status.topic.name:
+                    publisher.interrupt()
+        except BusError as error:
+            self.failed.set_exception(error)
 
     def _report_problem(self, node: Node, text: str) -> None:
         node.last_error = text
@@ -317,7 +334,7 @@ async def run_node(
         plan_hash=config.plan_hash,
     )
     process = psutil.Process()
-    tasks: list[asyncio.Task[Any]] = []
+    tasks: list[asyncio.Future[Any]] = [transport.failed]
     try:
         transport.open_outputs(node)
         await node.setup()
@@ -326,10 +343,8 @@ async def run_node(
         raise
     try:
         transport.open_inputs(node)
-        tasks = [
-            asyncio.create_task(run_timer(node, number, timer))
-            for number, timer in enumerate(find_timers(class_))
-        ]
+        for number, timer in enumerate(find_timers(class_)):
+            tasks.append(asyncio.create_task(run_timer(node, number, timer)))
         tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))
         tasks.append(asyncio.create_task(stop.wait()))
         if transport.keys is not None:
@@ -337,6 +352,7 @@ async def run_node(
         # Exclude the objects that `setup` has made from garbage collection while the node runs.
         gc.collect()
         gc.freeze()
+        gc.enable()
         heartbeat.report_ready()
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
@@ -350,7 +366,7 @@ async def run_node(
             transport.close()
 
 
-async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
+async def end_tasks(tasks: list[asyncio.Future[Any]]) -> None:
     """Cancel tasks repeatedly until they have ended.
 
     Once is not enough, because a handler can suppress a cancellation.  `wait_for` of Python 3.11

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import sys
+from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,6 +21,7 @@ import zmq
 from flexsheet.messages.bag import BagReader, BagWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import BusError, Publisher, Subscriber, compute_queue_length
+from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import EStop, StereoPair, TwinArms, TwinFinger
 from flexsheet.messages.wire import WireError, encode
@@ -530,3 +533,79 @@ async def test_unopened_frames_of_every_message_for_the_recorder(
     for _, message, head, _ in BagReader(tmp_path / "a.mcap"):
         assert isinstance(message, StereoPair)
         assert (message.left == head.sequence).all()
+
+
+def make_ending_subscriber(
+    connections: Connections, endpoint: str, local: LocalBus | None = None
+) -> tuple[list[str], Counts]:
+    """Return the list to which a subscriber adds each e-stop's reason, and "end" for each end."""
+    seen: list[str] = []
+    counts = Counts()
+    subscriber = Subscriber(
+        TOPICS["estop"],
+        [endpoint],
+        lambda message, _: seen.append(message.reason),
+        counts,
+        on_disconnected=lambda: seen.append("end"),
+        local=local,
+    )
+    subscriber.start()
+    connections.closers.append(subscriber.close)
+    return seen, counts
+
+
+PUBLISH_AND_WAIT = """
+import sys, time, zmq
+socket = zmq.Context.instance().socket(zmq.XPUB)
+socket.bind(sys.argv[1])
+print(socket.getsockopt_string(zmq.LAST_ENDPOINT), flush=True)
+socket.recv()
+socket.send(bytes.fromhex(sys.argv[2]))
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("transport", ["ipc", "tcp"])
+async def test_the_end_of_a_killed_writer_is_reported_after_its_last_message(
+    connections: Connections, transport: str
+) -> None:
+    (frame,) = encode(stop("a"), header(1))
+    endpoint = connections.endpoint() if transport == "ipc" else "tcp://127.0.0.1:*"
+    writer = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", PUBLISH_AND_WAIT, endpoint, bytes(frame).hex(), stdout=PIPE
+    )
+    try:
+        assert writer.stdout is not None
+        endpoint = (await writer.stdout.readline()).decode().strip()
+        seen, counts = make_ending_subscriber(connections, endpoint)
+        await until(lambda: seen)
+    finally:
+        writer.kill()
+        await writer.wait()
+    await until(lambda: len(seen) > 1)
+    restarted = connections.mouth(TOPICS["estop"], endpoint)
+    restarted.send(stop("b"), header(1, epoch=2))
+    await until(lambda: "b" in seen)
+    assert seen == ["a", "end", "b"]
+    assert counts == Counts()
+
+
+@pytest.mark.parametrize("transport", ["ipc", "tcp", "local"])
+async def test_an_interrupted_publisher_disconnects_its_readers_and_goes_on(
+    connections: Connections, transport: str
+) -> None:
+    endpoint = "tcp://127.0.0.1:*" if transport == "tcp" else connections.endpoint()
+    local = LocalBus([endpoint]) if transport == "local" else None
+    publisher = Publisher(TOPICS["estop"], [endpoint], local=local)
+    connections.closers.append(publisher.close)
+    seen, counts = make_ending_subscriber(connections, publisher.endpoints[0], local)
+    for number in range(1, 4):
+        reason = f"stop {number}"
+        publisher.send(stop(reason), header(number))
+        await until(lambda reason=reason: reason in seen)
+        publisher.interrupt()
+        await until(lambda number=number: seen.count("end") == number)
+    messages = [one for one in seen if one != "end"]
+    assert messages == ["stop 1", "stop 2", "stop 3"]
+    assert seen.index("end") == 1
+    assert counts == Counts()

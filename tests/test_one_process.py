@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import structlog
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagReader, BagWriter
 from flexsheet.messages.base import Header
-from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.bus import Publisher, Subscriber
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.topics import TOPICS
@@ -19,7 +20,13 @@ from flexsheet.messages.types import EStop, SheetTarget
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
-from flexsheet.nodes.runner import NodeConfig, NodeTransport, PortConfig
+from flexsheet.nodes.runner import (
+    NodeConfig,
+    NodeTransport,
+    PortConfig,
+    ProcessConfig,
+    run_nodes,
+)
 from tests.fingertips import fingertip
 from tests.plans import ROOT
 from tests.test_messages_bus import Counts
@@ -171,3 +178,53 @@ async def test_the_same_bag_gives_the_same_bytes_in_one_process_and_in_many(tmp_
     one = await run_chain(tmp_path / "one", bag, in_one_process=True)
     assert len(several) == 2 * STEPS
     assert sorted(one) == sorted(several)
+
+
+async def test_the_end_of_the_images_is_passed_on_to_the_arms(tmp_path: Path) -> None:
+    """Camera in its own process, triangulator and planner in another one, no process that ends."""
+    topics = ("twin/stereo", "stereo", "fingertip", "sheet_target")
+    ends = {one: f"ipc://{tmp_path}/{number}" for number, one in enumerate(topics)}
+
+    def configure(kind: str, reads: str, writes: str, **parameters: Any) -> NodeConfig:
+        def port(topic: str) -> PortConfig:
+            return PortConfig(port=topic.replace("/", "__"), topic=topic, endpoints=(ends[topic],))
+
+        return NodeConfig(
+            name=kind, type=kind, parameters=parameters, inputs=(port(reads),),
+            outputs=(port(writes),), plan_hash="", run_dir=str(tmp_path),
+        )  # fmt: skip
+
+    processes = [
+        [configure("camera", "twin/stereo", "stereo")],
+        [
+            configure("triangulator", "stereo", "fingertip"),
+            configure("planner", "fingertip", "sheet_target"),
+        ],
+    ]
+    stop, ended = asyncio.Event(), asyncio.Event()
+    images = Publisher(TOPICS["twin/stereo"], [ends["twin/stereo"]])
+    bridge = Subscriber(
+        TOPICS["sheet_target"],
+        [ends["sheet_target"]],
+        lambda *_: None,
+        Counts(),
+        on_disconnected=ended.set,
+    )
+    running = [
+        asyncio.create_task(run_nodes(ProcessConfig(name=nodes[0].name, nodes=tuple(nodes)), stop))
+        for nodes in processes
+    ]
+    try:
+        bridge.start()
+
+        def interrupt() -> bool:
+            # Until all nodes have connected, an end reaches only some of them.
+            images.interrupt()
+            return ended.is_set()
+
+        await until(interrupt, period_s=0.2)
+    finally:
+        stop.set()
+        await asyncio.gather(*running)
+        bridge.close()
+        images.close()

@@ -148,3 +148,15 @@ def test_every_module_has_one_file() -> None:
         assert os.readlink(ROOT / "flexsheet" / name) == f"../{name}"
         module = importlib.import_module(f"flexsheet.{name}")
         assert Path(str(module.__file__)).resolve() == ROOT / name / "__init__.py"
+
+
+def test_the_launcher_loads_no_numerical_library_of_the_nodes() -> None:
+    """SciPy would take half of the time in which a graph starts; nodes load the parts they use."""
+    code = (
+        "import sys; from flexsheet.nodes import NODES, node_class\n"
+        "for name in NODES: node_class(name)\n"
+        "print([one for one in sys.modules if one.startswith('scipy.') and one.count('.') == 1"
+        " and not one.startswith(('scipy._', 'scipy.version'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import ArmState, SheetTarget, SheetTrajectory
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
@@ -397,6 +398,81 @@ async def test_an_arm_falls_back_when_the_other_follows_no_trajectory() -> None:
     modes = [state.mode for state in pair.states["left"][began:]]
     assert modes.index("hold") * CYCLE_NS * 1e-9 < 0.06
     assert modes[-1] == "idle"
+    pair.check_limits()
+
+
+def drop(pair: Pair, port: str, *sides: str) -> None:
+    """End the connection of a port at some bridges: no message, and the end is noticed."""
+    send, bridges = pair.network.send, [pair.bridges[side] for side in sides]
+
+    def send_other(to: ArmBridge, to_port: str, message: Message, header: Header) -> None:
+        if to_port != port or to not in bridges:
+            send(to, to_port, message, header)
+
+    pair.network.send = send_other  # type: ignore[method-assign]
+    pair.network.queue.clear()
+    for bridge in bridges:
+        bridge.inputs[port].has_ended = True
+
+
+@pytest.mark.parametrize("sides", [SIDES, ("left",)], ids=["both", "one"])
+async def test_both_arms_brake_at_once_when_the_planner_ends(sides: tuple[str, ...]) -> None:
+    """At one arm only, the end is a fault of the network, and the other arm may stop later."""
+    pair = await start_pair(lambda: 0.002)
+    began, before = len(pair.states["left"]), pair.network.send
+    drop(pair, "sheet_target", *sides)
+    await pair.run(0.06, pair.targets())
+    for side in sides:
+        states = pair.states[side][began:]
+        assert [state.mode for state in states] == ["hold"] * len(states)
+        assert {state.reason for state in states} == {NodeNote.PLANNER_ENDED.phrase}
+    await pair.run(0.4, pair.targets())
+    ends = {states[-1].mode for states in pair.states.values()}
+    assert ends == {"idle"}
+    assert {pair.states[side][-1].reason for side in sides} <= {
+        NodeNote.PLANNER_ENDED.phrase,
+        "other arm: " + NodeNote.PLANNER_ENDED.phrase,
+    }
+    # New targets of a planner that has started again.
+    pair.network.send = before  # type: ignore[method-assign]
+    for side in sides:
+        pair.bridges[side].sheet_target.has_ended = False
+    await pair.run(1.0, pair.targets())
+    assert {states[-1].mode for states in pair.states.values()} == {"follow"}
+    assert not any(state.faults for states in pair.states.values() for state in states)
+    pair.check_limits()
+
+
+async def test_an_arm_brakes_at_once_when_the_other_bridge_ends() -> None:
+    pair = await start_pair(lambda: 0.002)
+    began = len(pair.states["left"])
+    drop(pair, "other_arm", "left")
+    killed = pair.bridges.pop("right")
+    await pair.run(0.3, pair.targets())
+    states = pair.states["left"][began:]
+    assert {state.mode for state in states[:4]} == {"hold"}
+    assert {state.reason for state in states[:4]} == {NodeNote.OTHER_BRIDGE_ENDED.phrase}
+    assert states[-1].mode == "idle"
+    assert not states[-1].ready
+    assert not any(state.faults for state in states)
+    # The other arm rests at its last command.
+    pair.bridges["right"], commanded = killed, pair.servos["right"].commanded
+    commanded += [commanded[-1]] * (len(pair.servos["left"].commanded) - len(commanded))
+    pair.check_limits()
+
+
+async def test_a_short_interruption_makes_the_arms_neither_stop_nor_disarm() -> None:
+    pair = await start_pair(lambda: 0.002)
+    began = len(pair.states["left"])
+    for bridge in pair.bridges.values():
+        bridge.sheet_target.has_ended = True
+    await pair.run(0.015, pair.targets())
+    for bridge in pair.bridges.values():
+        bridge.sheet_target.has_ended = False
+    await pair.run(0.2, pair.targets())
+    for states in pair.states.values():
+        assert all(state.ready for state in states[began:])
+        assert states[-1].mode == "follow"
     pair.check_limits()
 
 

@@ -30,6 +30,7 @@ from flexsheet.launch.commands.output import (
     print_table,
     words,
 )
+from flexsheet.nodes import node_class
 from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
@@ -109,8 +110,8 @@ def launch(
         console=console,
         apparatus=apparatus,
     )
-    warn_of_loop_risk(plan)
     if dry_run:
+        warn_of_loop_risk(plan)
         if as_json:
             print_json(plan.model_dump(mode="json"))
         else:
@@ -120,6 +121,7 @@ def launch(
     def ready(run: Run) -> None:
         if as_json:
             print_json_line(describe_run(plan, run, host))
+        start_loop_check(plan, host)
 
     work = run_graph(plan, host, duration, without=without or (), when_ready=ready)
     raise typer.Exit(asyncio.run(work))
@@ -139,6 +141,14 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
     finding = check_graph(plan)
     if finding is not None:
         words.print(f"warning: {finding.describe()}", style="yellow")
+
+
+def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
+    """Start `warn_of_loop_risk` on the planner's host in a thread, as it takes half a second."""
+    if any(
+        issubclass(node_class(node.type), node_class("planner")) for node in plan.nodes_on(host)
+    ):
+        asyncio.get_running_loop().run_in_executor(None, warn_of_loop_risk, plan)
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:

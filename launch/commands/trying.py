@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.launching import describe_run, run_graph, warn_of_loop_risk
+from flexsheet.launch.commands.launching import describe_run, run_graph, start_loop_check
 from flexsheet.launch.commands.options import (
     DEMO,
     ApparatusOption,
@@ -66,7 +66,6 @@ def try_it(
     )
     with keyboard_interrupts(), progress_words() as progress:
         precompute_graph(plan, progress)
-    warn_of_loop_risk(plan)
     console = plan.nodes["console"].parameters
     url = f"http://{console['address']}:{console['page_port']}/"
 
@@ -74,6 +73,7 @@ def try_it(
         if as_json:
             print_json_line({"page": url, **describe_run(plan, run, None)})
         words.print(f"[bold]open {url}[/] and drag on the sheet", markup=True)
+        start_loop_check(plan, None)
         if browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(url)
 

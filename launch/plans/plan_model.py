@@ -61,9 +61,9 @@ class StrictModel(LimitedModel):
 class RestartSpec(StrictModel):
     """Restart policy that is applied when the process of a node exits.
 
-    The delay before a restart starts at `delay_s` and doubles with each restart in the last
-    `window_s`, up to `max_delay_s`. If the process exits after `max_restarts` restarts in this
-    time, the node has failed and the run ends.
+    The first restart in the last `window_s` is immediate. The delay before the second one is
+    `delay_s` and doubles with each further one, up to `max_delay_s`. If the process exits after
+    `max_restarts` restarts in this time, the node has failed and the run ends.
     """
 
     policy: Literal["never", "on_failure", "always"] = "on_failure"

@@ -565,7 +565,8 @@ class RunningGraph:
                     f"{name} {problem or 'ended'}, after {len(recent)} restarts "
                     f"in {policy.window_s:g} s"
                 )
-            delay_s = min(policy.delay_s * 2 ** len(recent), policy.max_delay_s)
+            delay_s = min(policy.delay_s * 2 ** (len(recent) - 1), policy.max_delay_s)
+            delay_s = delay_s if recent else 0.0
             recent.append(loop.time())
             self._report(LAUNCHER, f"{name} {problem or 'ended'}; next start in {delay_s:g} s")
             await asyncio.sleep(delay_s)

@@ -412,7 +412,10 @@ class ArmControl:
         if self._disarm_reason is None and (
             goal is None or not goal.overdue_s <= self._timeouts.stop_after_s
         ):
-            return "waiting for a sheet target" if goal is None else NodeNote.NO_SHEET_TARGET.phrase
+            if goal is None:
+                return "waiting for a sheet target"
+            note = NodeNote.PLANNER_ENDED if goal.planner_ended else NodeNote.NO_SHEET_TARGET
+            return note.phrase
         return None
 
     def _settle(self) -> None:
@@ -443,9 +446,11 @@ class ArmControl:
             self._must_idle = self._must_idle and measured is None
             return self._send("idle", self.commanded_rad, geometry, step_s)
         self.handle(Event.CONNECTED)
-        self._silence = (
-            NodeNote.OTHER_ARM_SILENT.phrase if other else NodeNote.WAITING_FOR_OTHER_ARM.phrase
-        )
+        if other is None:
+            self._silence = NodeNote.WAITING_FOR_OTHER_ARM.phrase
+        else:
+            note = NodeNote.OTHER_BRIDGE_ENDED if other.ended else NodeNote.OTHER_ARM_SILENT
+            self._silence = note.phrase
         if other is not None and (invalid := other.invalid_reason) is not None:
             self._silence, other = f"state of the other arm: {invalid}", None
         self._check_measurement(geometry, other, measured)
@@ -520,12 +525,15 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """Move the sheet with its target; decelerate while target or other arm's state is late."""
+        """Move the sheet with its target; decelerate while target or other arm's state is late.
+
+        If the planner or the other arm's bridge has ended, decelerate at once.
+        """
         late_s = max(goal.overdue_s, other.age_s - self._timeouts.hold_after_s)
-        is_late = late_s > self._timeouts.hold_after_s
+        is_late = goal.planner_ended or other.ended or late_s > self._timeouts.hold_after_s
         self.handle(Event.LATE if is_late else Event.IN_TIME)
         if is_late:
-            self.reason = NodeNote.TARGET_OR_ARM_LATE.phrase
+            self.reason = _find_late_note(goal, other).phrase
         else:
             self._together = self._together or other.mode == "follow"
             self.reason = "" if self._together else NodeNote.FOLLOWS_OTHER_ARM.phrase
@@ -901,6 +909,13 @@ class ArmControl:
     def _drop_path(self) -> None:
         self._sheet = self._goal_rad = self._relax_from = self._clear_path = self._alignment = None
         self._settled = self._together = False
+
+
+def _find_late_note(goal: Goal, other: OtherArm) -> NodeNote:
+    """Return the cause of a late target or state of the other arm."""
+    if goal.planner_ended:
+        return NodeNote.PLANNER_ENDED
+    return NodeNote.OTHER_BRIDGE_ENDED if other.ended else NodeNote.TARGET_OR_ARM_LATE
 
 
 def _is_valid(motion: SheetMotion) -> bool:

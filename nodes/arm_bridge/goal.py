@@ -55,10 +55,12 @@ class Goal:
     """Target of the sheet at the time at which a command takes effect.
 
     overdue_s: how late the next target is; negative if it is not yet due.
+    planner_ended: whether the planner's process, or one before it, has ended since the target.
     """
 
     motion: SheetMotion
     overdue_s: float
+    planner_ended: bool = False
 
 
 def extrapolate_goal(
@@ -114,11 +116,13 @@ def make_goal(
     now_ns: int,
     timing: GoalTiming,
     trajectory: SheetTrajectory | None = None,
+    planner_ended: bool = False,
 ) -> Goal:
     """Convert a target to the goal of a command that is sent now.
 
     trajectory: result of `find_trajectory`, if the other arm follows it too; the target is then
         overdue from the trajectory's end.  None: the target is extrapolated by its twist.
+    planner_ended: see `Goal`.
 
     A target contains no rate of the stretch, so the arms follow a changing stretch with a lag.
     """
@@ -132,9 +136,10 @@ def make_goal(
             max(ahead_s - keep_s - brake_s, -ahead_s - MAX_PREDICTION_S),
         )
     overdue_s = (now_ns - received_ns) * 1e-9 - timing.target_period_s
-    return extrapolate_goal(
+    goal = extrapolate_goal(
         motion, ahead_s, overdue_s, max_extrapolation_s=timing.max_extrapolation_s
     )
+    return replace(goal, planner_ended=planner_ended)
 
 
 def compute_sync_factor(

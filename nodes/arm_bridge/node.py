@@ -47,6 +47,7 @@ class ArmBridge(Node):
     """Send one arm's joints over its network, and publish the arm's measured state."""
 
     opens_devices: ClassVar[bool] = True
+    watched_inputs: ClassVar[frozenset[str]] = frozenset({"sheet_target", "other_arm"})
     parameters: ArmBridgeParameters
     scene: Input[Scene]
     sheet_target: Input[SheetTarget]
@@ -186,7 +187,9 @@ class ArmBridge(Node):
         control, last = self._control, self._last
         clock_problem = self.sheet_target.clock_problem or self.other_arm.clock_problem
         target = self.sheet_target.message
-        trajectory = None if target is None else find_trajectory(target)
+        trajectory = None
+        if target is not None and not self.sheet_target.has_ended:
+            trajectory = find_trajectory(target)
         goal = self._read_goal(trajectory if other is not None and other.agrees else None)
         command = control.step(geometry, goal, other, step_s, clock_problem)
         if result := self._path_checker.poll(control.pending_check):
@@ -264,6 +267,7 @@ class ArmBridge(Node):
             now_ns=self.clock.now_ns(),
             timing=replace(self._timing, servo_lag_s=self._lag.lag_s),
             trajectory=trajectory,
+            planner_ended=self.sheet_target.has_ended,
         )
 
     def _read_other(self) -> OtherArm | None:
@@ -276,4 +280,5 @@ class ArmBridge(Node):
             self.other_arm.age_s(),
             target_source_ns=0 if header is None else header.source_ns,
             now_ns=self.clock.now_ns(),
+            ended=self.other_arm.has_ended,
         )

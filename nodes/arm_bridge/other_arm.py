@@ -33,6 +33,7 @@ class OtherArm:
     ready: whether the other arm may move.  estop_engaged: whether its node has latched an e-stop.
     agrees: whether the other arm may follow the trajectory of the same or an adjacent target.  The
         age is then counted from the end of that trajectory.
+    ended: whether the other arm's bridge has ended since this state; it then does not agree.
     """
 
     joints_rad: Floats
@@ -44,10 +45,17 @@ class OtherArm:
     ready: bool
     estop_engaged: bool
     agrees: bool = False
+    ended: bool = False
 
     @classmethod
     def from_state(
-        cls, state: ArmState, age_s: float, *, target_source_ns: int = 0, now_ns: int = 0
+        cls,
+        state: ArmState,
+        age_s: float,
+        *,
+        target_source_ns: int = 0,
+        now_ns: int = 0,
+        ended: bool = False,
     ) -> OtherArm:
         """Convert a message from the other arm's node, which is `age_s` old.
 
@@ -57,6 +65,7 @@ class OtherArm:
         ends_ns = min(state.trajectory_ends_ns, other_ns + MAX_TRAJECTORY_END_NS)
         is_adjacent = bool(
             state.trajectory_ends_ns
+            and not ended
             and abs(other_ns - target_source_ns) <= MAX_TARGET_DIFFERENCE_NS
         )
         if is_adjacent:
@@ -71,6 +80,7 @@ class OtherArm:
             state.ready,
             state.estop_engaged,
             is_adjacent,
+            ended,
         )
 
     @cached_property

@@ -54,6 +54,8 @@ class Camera(Node):
     role: ClassVar[NodeRole | None] = NodeRole.CAMERA
     opens_devices: ClassVar[bool] = True
 
+    watched_inputs: ClassVar[frozenset[str]] = frozenset({"twin__stereo"})
+    ends_with_inputs: ClassVar[bool] = True
     live_parameters: ClassVar[frozenset[str]] = frozenset({"max_skew_s"})
     parameters: CameraParameters
     scene: Input[Scene]

@@ -16,12 +16,10 @@ from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.types import Bookmark, Display, EStop, FingerPath, Recording, Skin
 from flexsheet.messages.wire import WireError
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.console.access_control import AccessControl, read_token, start_server
 from flexsheet.nodes.console.controller import ConsoleController, ConsoleFiles
 from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.latest_messages import LatestMessages
-from flexsheet.nodes.console.operator import Operator
 from flexsheet.nodes.node import Node, NodeParameters, Output, further_port, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
 
@@ -111,6 +109,10 @@ class Console(Node):
         return [topic.name for topic in written if topic.name in TOPICS_READ]
 
     async def setup(self) -> None:
+        # Imported late: the libraries of the page take a second, and the launcher needs none.
+        from flexsheet.nodes.console.access_control import AccessControl, read_token, start_server
+        from flexsheet.nodes.console.operator import Operator
+
         settings = self.parameters
         token = None if settings.token_file is None else read_token(settings.token_file)
         access = AccessControl(settings.address, token)

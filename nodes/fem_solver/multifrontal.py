@@ -13,8 +13,8 @@ import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
@@ -62,7 +62,7 @@ class Factors:
 
     def solve(self, loads: Floats) -> Floats:
         """Return the displacements of n nodes under loads (3n,) or (3n, k); 0 at fixed nodes."""
-        (trsm,) = get_blas_funcs(("trsm",), dtype=self.diagonal[0].dtype)
+        (trsm,) = scipy.linalg.get_blas_funcs(("trsm",), dtype=self.diagonal[0].dtype)
         work = loads.reshape(len(loads), -1).astype(self.diagonal[0].dtype)
         for front, diagonal_block, off_block in zip(
             self.fronts, self.diagonal, self.off_diagonal, strict=True
@@ -133,8 +133,8 @@ class NestedDissection:
         definite.
         """
         dtype = matrices.dtype
-        trsm, syrk = get_blas_funcs(("trsm", "syrk"), dtype=dtype)
-        (potrf,) = get_lapack_funcs(("potrf",), dtype=dtype)
+        trsm, syrk = scipy.linalg.get_blas_funcs(("trsm", "syrk"), dtype=dtype)
+        (potrf,) = scipy.linalg.get_lapack_funcs(("potrf",), dtype=dtype)
         left: dict[int, Floats] = {}
         diagonal, off_diagonal = [], []
         for number, front in enumerate(self.fronts):

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
+import scipy
 
 from flexsheet.nodes.arrays import Floats
 
@@ -108,7 +108,9 @@ def make_loop_matrices(
         -hand.damping_ns_per_m / hand.mass_kg,
         sheet_stiffness_n_per_m / hand.mass_kg,
     )
-    first, second = expm(flow * loop.period_s * np.array([fraction, 1.0 - fraction])[:, None, None])
+    first, second = scipy.linalg.expm(
+        flow * loop.period_s * np.array([fraction, 1.0 - fraction])[:, None, None]
+    )
 
     # `measure` adds a measurement: it maps the state to one with new filtered depth, offset, rate.
     measure = np.zeros((len(slopes), size + 2, size))

@@ -23,7 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.interpolate import BSpline, PchipInterpolator
+import scipy
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Scene, SheetSpec
@@ -101,7 +101,7 @@ class ObjectCurve:
 
     depths_m: Floats
     forces_n: Floats
-    _curve: PchipInterpolator = field(init=False, repr=False, compare=False)
+    _curve: scipy.interpolate.PchipInterpolator = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Raise UnfitCurveError unless there are two or more finite, ascending points."""
@@ -119,7 +119,7 @@ class ObjectCurve:
             )
         if (np.diff(depths) <= 0.0).any() or (np.diff(forces) < 0.0).any():
             raise UnfitCurveError("force curve: depths must ascend and forces must not fall")
-        object.__setattr__(self, "_curve", PchipInterpolator(depths, forces))
+        object.__setattr__(self, "_curve", scipy.interpolate.PchipInterpolator(depths, forces))
 
     @classmethod
     def from_rows(cls, rows: Floats) -> ObjectCurve:
@@ -334,8 +334,8 @@ class Compliance:
     limits: StretchLimits
     finger_radius_m: float
     _nodes: tuple[Floats, Floats]
-    _indentation: BSpline = field(repr=False)
-    _growth: BSpline = field(repr=False)
+    _indentation: scipy.interpolate.BSpline = field(repr=False)
+    _growth: scipy.interpolate.BSpline = field(repr=False)
 
     @property
     def max_depth_m(self) -> float:
@@ -448,7 +448,7 @@ def fit_compliance(
         for x in xs
         for y in ys
     ]
-    indentation = BSpline(
+    indentation = scipy.interpolate.BSpline(
         depth_m * _KNOTS, np.column_stack([one.indentation_m for one in at_nodes]), 2
     )
     return Compliance(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
+import scipy
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.methods import SheetForceMethod, resolve_method
@@ -56,6 +57,8 @@ class Planner(Node):
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_latency", "force"})
 
+    watched_inputs: ClassVar[frozenset[str]] = frozenset({"fingertip"})
+    ends_with_inputs: ClassVar[bool] = True
     live_parameters: ClassVar[frozenset[str]] = frozenset({"max_age_s"})
     parameters: PlannerParameters
     scene: Input[Scene]
@@ -106,6 +109,8 @@ class Planner(Node):
         mode = self.parameters.choose_compliance(scene)
         bounds = None
         if mode == "force_curve":
+            # SciPy loads its parts on first use, which must not delay a target.
+            _ = scipy.interpolate
             bounds = load_or_compute_bounds(scene.camera.rate_hz, self.parameters.cache_dir)
         self._compliance = ComplianceController(
             scene,

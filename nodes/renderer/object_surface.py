@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 
 from flexsheet.messages.scene import Cylinder, Geometry, Mesh, Plane
 from flexsheet.nodes.arrays import Floats, Singles
@@ -182,7 +181,7 @@ class VertexNormals:
     def __init__(self, triangles: NDArray[np.integer], vertices: int) -> None:
         columns = np.repeat(np.arange(len(triangles)), 3)
         ones = np.ones(3 * len(triangles), np.float32)
-        self._of_vertices = csr_array(
+        self._of_vertices = scipy.sparse.csr_array(
             (ones, (triangles.ravel(), columns)), shape=(vertices, len(triangles))
         )
         self._corners = [np.ascontiguousarray(triangles[:, i]) for i in range(3)]
@@ -252,7 +251,9 @@ class DeformationTransfer:
         return result
 
 
-def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices) -> csr_array:
+def transfer_matrix(
+    points: Floats, skin_vertices: Floats, skin_triangles: Indices
+) -> scipy.sparse.csr_array:
     """Return the matrix (points, skin vertices), float32, that interpolates skin values at points.
 
     Each row has the barycentric weights of the nearest point of the skin. Triangles without area
@@ -268,7 +269,7 @@ def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indic
     corners = skin_vertices[skin_triangles]
     samples, owners = _samples(corners)
     candidates = min(CANDIDATES, len(samples))
-    _, near = cKDTree(samples).query(points, k=candidates)
+    _, near = scipy.spatial.cKDTree(samples).query(points, k=candidates)
     near = owners[near.reshape(len(points), candidates)]
     weights = np.empty((len(points), candidates, 3))
     distances = np.empty((len(points), candidates))
@@ -278,7 +279,7 @@ def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indic
         distances[:, i] = np.linalg.norm(foot - points, axis=1)
     rows, best = np.arange(len(points)), np.argmin(distances, axis=1)
     columns = skin_triangles[near[rows, best]]
-    return csr_array(
+    return scipy.sparse.csr_array(
         (
             weights[rows, best].ravel().astype(np.float32),
             columns.ravel().astype(np.int32),

@@ -8,8 +8,8 @@ from itertools import product
 
 import moderngl
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from flexsheet.messages.methods import SheetShapeMethod
 from flexsheet.messages.scene import Mesh, Scene, require_projector
@@ -124,7 +124,7 @@ class SceneRenderer:
         self._object_from_world = inverse(self._world_from_object)
         # Nearest-point queries of a mesh are ten times as fast if they start at the nearest vertex.
         meshed = isinstance(geometry, Mesh)
-        self._near = cKDTree(self._surface.rest_world_m) if meshed else None
+        self._near = scipy.spatial.cKDTree(self._surface.rest_world_m) if meshed else None
         first_pass = samples
         if first_pass is None:
             first_pass = 0 if is_software(context) else SAMPLES

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy
 
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.arrays import Floats
@@ -366,7 +366,7 @@ class DataAssociation:
                 _association_cost(one, at_ns, marker) for one in all_tracks
             ]
             costs[row, len(all_tracks) + row] = NEW_TRACK_COST
-        columns = linear_sum_assignment(costs)[1].tolist()
+        columns = scipy.optimize.linear_sum_assignment(costs)[1].tolist()
         ambiguous = (
             set[int]() if finger is None else _ambiguous_rows(costs, columns, len(all_tracks) - 1)
         )

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.calibration import StereoCalibration, load_calibration
@@ -68,6 +69,8 @@ class Triangulator(Node):
     """
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame"})
+    watched_inputs: ClassVar[frozenset[str]] = frozenset({"stereo"})
+    ends_with_inputs: ClassVar[bool] = True
     live_parameters: ClassVar[frozenset[str]] = frozenset({"track_timeout_s"})
     parameters: TriangulatorParameters
     scene: Input[Scene]
@@ -86,6 +89,8 @@ class Triangulator(Node):
         return frozenset() if shows_check_marks(scene) else frozenset({"frame"})
 
     async def setup(self) -> None:
+        # SciPy loads its parts on first use, which must not delay an image.
+        _ = scipy.optimize, scipy.special
         if path := self.parameters.calibration:
             self.calibration = load_calibration(path)
         if path := self.parameters.marker_calibration:

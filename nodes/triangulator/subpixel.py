@@ -27,8 +27,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.triangulator.ellipse import integrate_ellipse
@@ -386,7 +386,7 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     inward = (radius - away) * inverse
     edge = np.exp(inward * inward * -0.5)
     edge *= (PEAK_OF_NORMAL / steps) * inverse
-    coverage = np.add.reduce(ndtr(inward), axis=1)
+    coverage = np.add.reduce(scipy.special.ndtr(inward), axis=1)
     coverage /= steps
     np.add.reduce(edge, axis=1, out=slopes[:, RADIUS])
     np.add.reduce(edge * -inward, axis=1, out=slopes[:, BLUR])

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
-from scipy.optimize import brentq
 
 from flexsheet.nodes.arrays import Floats
 
@@ -171,6 +170,8 @@ def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clut
     if share >= 1.0:
         edge = -3.0
     else:
+        from scipy.optimize import brentq  # imported late: it takes half a second
+
         # Find the x = edge beyond which a segment of the unit disc has this area.
         edge = brentq(
             lambda x: (np.arccos(x) - x * np.sqrt(1.0 - x * x)) / np.pi - share, -1.0, 1.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import PathJoin
@@ -164,14 +164,14 @@ class SmoothPath:
 
     times_s: Floats
     points: Floats
-    spline: CubicSpline = field(repr=False)
-    rate: CubicSpline = field(repr=False)
+    spline: scipy.interpolate.CubicSpline = field(repr=False)
+    rate: scipy.interpolate.CubicSpline = field(repr=False)
 
     @staticmethod
     def through(times_s: Floats, points: Floats) -> SmoothPath:
         """Make the path through points (n >= 2, 3) at increasing times (n,) from time 0."""
         times = times_s - times_s[0]
-        spline = CubicSpline(times, points, bc_type="clamped")
+        spline = scipy.interpolate.CubicSpline(times, points, bc_type="clamped")
         return SmoothPath(times, points, spline, spline.derivative())
 
     @property

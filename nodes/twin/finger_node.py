@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+import scipy
 from pydantic import Field
 
 from flexsheet.messages.base import Header
@@ -112,6 +113,8 @@ class TwinFingerNode(Node):
         return "it takes images by its own clock; the bag has the finger's motion as twin/finger"
 
     async def setup(self) -> None:
+        # SciPy loads its parts on first use, which must not delay an image.
+        _ = scipy.interpolate, scipy.special
         self._jitter = np.random.default_rng((self.parameters.seed, JITTER_STREAM))
         self.filming = asyncio.create_task(self._film())
 

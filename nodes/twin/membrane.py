@@ -20,9 +20,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.arrays import Bools, Floats
@@ -246,7 +245,7 @@ class _Mesh:
         total = np.bincount(self.dofs.ravel(), force.ravel(), minlength=positions.size)
         return total - self.load_n.ravel(), blocks.reshape(elements, 27, 27)
 
-    def matrix(self, stiffness: Floats, contact: Floats) -> csc_array:
+    def matrix(self, stiffness: Floats, contact: Floats) -> scipy.sparse.csc_array:
         """Return the sparse stiffness matrix of the nodes that are not clamped.
 
         contact: (nodes, 3, 3) contact stiffness, added to the diagonal blocks.
@@ -258,7 +257,9 @@ class _Mesh:
             if dofs[0] >= 0:
                 keys = dofs[None, :] * self._size + dofs[:, None]
                 values[np.searchsorted(self._unique, keys)] += contact[node]
-        return csc_array((values, self._row_of, self._start_of), shape=(self._size, self._size))
+        return scipy.sparse.csc_array(
+            (values, self._row_of, self._start_of), shape=(self._size, self._size)
+        )
 
 
 def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
@@ -559,7 +560,7 @@ def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, 
         residual = float(np.linalg.norm(downhill))
         if residual < 1e-7 * scale:
             return positions, iteration
-        factor = splu(
+        factor = scipy.sparse.linalg.splu(
             mesh.matrix(stiffness, contact),
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,

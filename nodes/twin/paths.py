@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+import scipy
 
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath
@@ -143,7 +143,8 @@ class Ground:
         headings = np.gradient(points, axis=0)
         grid, _ = _walk(self._shape, points, np.cross(normals, headings), ticks[1])
         self._splines = [
-            RectBivariateSpline(*ticks, grid[:, :, axis].T, s=0.0) for axis in range(3)
+            scipy.interpolate.RectBivariateSpline(*ticks, grid[:, :, axis].T, s=0.0)
+            for axis in range(3)
         ]
 
 

@@ -18,7 +18,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from scipy.special import chndtr
+import scipy
 
 from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.messages.types import Side
@@ -599,7 +599,7 @@ def rasterize_ball(
         du, dv = u - single(x), v - single(y)
         turn = du * single(y) - dv * single(x)
         distance_sq = (du * du + dv * dv + turn * turn) * single(c * c / spread_sq) / ray_sq
-        cover += chndtr(single(radius_m**2 / spread_sq), single(2.0), distance_sq)
+        cover += scipy.special.chndtr(single(radius_m**2 / spread_sq), single(2.0), distance_sq)
     return np.asarray(cover / single(len(centres)), dtype=np.float32)
 
 

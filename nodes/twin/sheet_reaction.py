@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
@@ -144,7 +144,9 @@ def compute_reaction(
     fine_m = np.linspace(0.0, depths_m[-1], DEPTH_STEPS)
 
     def refine(values: Floats) -> Floats:
-        return np.asarray(PchipInterpolator(depths_m, values)(np.maximum(fine_m, depths_m[0])))
+        return np.asarray(
+            scipy.interpolate.PchipInterpolator(depths_m, values)(np.maximum(fine_m, depths_m[0]))
+        )
 
     centre = [push_n(stretch, 0.0, 0.0) for stretch in stretches]
     middle = len(stretches) // 2

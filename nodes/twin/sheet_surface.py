@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import Self
 
 import numpy as np
-from scipy.interpolate import RectBivariateSpline
+import scipy
 
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
@@ -97,7 +97,9 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
     return np.array(factors)
 
 
-def _solve_sag(rubber: TrueRubber, stretch: float, lean: float) -> RectBivariateSpline:
+def _solve_sag(
+    rubber: TrueRubber, stretch: float, lean: float
+) -> scipy.interpolate.RectBivariateSpline:
     """Solve the sag of a tilted sheet over the position between the edges (0..1) and y (m)."""
     cosine = np.sqrt(1.0 - lean**2)
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, cosine, lean], [0.0, -lean, cosine]])
@@ -106,7 +108,7 @@ def _solve_sag(rubber: TrueRubber, stretch: float, lean: float) -> RectBivariate
     local = solve(rubber, *edges, cells=CELLS).positions @ rotation
     middle = local[:, local.shape[1] // 2]
     across = np.linspace(0.0, 1.0, local.shape[1])
-    return RectBivariateSpline(across, middle[:, 1], local[..., 2].T)
+    return scipy.interpolate.RectBivariateSpline(across, middle[:, 1], local[..., 2].T)
 
 
 @lru_cache(maxsize=64)

@@ -9,9 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 
 from flexsheet.messages.scene import Cylinder, Ellipsoid, Geometry, Mesh, Plane, Scene, Sphere
 from flexsheet.nodes.arrays import Floats
@@ -67,7 +66,7 @@ class TrueBody:
                 rest, triangles = _star(_cast_rays(geometry, shape))
         self._rest, self._triangles = apply(world_from_object, rest), triangles
         owners = np.repeat(np.arange(len(triangles)), 3)
-        self._of_vertices = csr_array(
+        self._of_vertices = scipy.sparse.csr_array(
             (np.ones(len(owners)), (triangles.ravel(), owners)), shape=(len(rest), len(triangles))
         )
         self._rest_normals = self._normals(self._rest)
@@ -135,7 +134,9 @@ def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices
     corner = triangles.ravel()[order]
     begin = np.searchsorted(corner, np.arange(len(vertices) + 1))
     used = np.unique(triangles)
-    _, near = cKDTree(vertices[used]).query(points, k=min(NEAREST_VERTICES, len(used)))
+    _, near = scipy.spatial.cKDTree(vertices[used]).query(
+        points, k=min(NEAREST_VERTICES, len(used))
+    )
     best = np.full(len(points), np.inf)
     chosen, weights = np.zeros(len(points), np.intp), np.zeros((len(points), 3))
     for vertex in used[near.reshape(len(points), -1)].T:

@@ -22,9 +22,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
-from scipy.sparse.linalg import splu
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.arrays import Bools, Floats
@@ -235,7 +234,7 @@ class _Grid:
 
     def system(
         self, positions: Floats, added: Floats, free: Bools, damping: float
-    ) -> tuple[Floats, csc_array]:
+    ) -> tuple[Floats, scipy.sparse.csc_array]:
         """Return the energy gradient (3 nodes,) and the stiffness matrix of the free coordinates.
 
         added (nodes, 3, 3): stiffness of the contact. free (3 nodes,): which coordinates are not
@@ -265,7 +264,7 @@ class _Grid:
             values[np.searchsorted(self._keys, at[:, None] + self._size * at)] += added[node]
         keep = free[self._rows] & free[self._columns]
         number = np.cumsum(free) - 1
-        matrix = csc_array(
+        matrix = scipy.sparse.csc_array(
             (values[keep], (number[self._rows[keep]], number[self._columns[keep]])),
             shape=(int(free.sum()),) * 2,
         )
@@ -420,7 +419,7 @@ def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None
         residual = float(np.linalg.norm(downhill))
         if residual < TOLERANCE * grid.force_scale:
             return positions
-        solved = splu(
+        solved = scipy.sparse.linalg.splu(
             matrix,
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy
 
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.sheet.force_models import (
@@ -66,7 +66,7 @@ class TabulatedSheetModel:
         if len(self.depths_m) == 1:
             ratio, slope = np.full(base.force_n.shape, ratios[0]), np.zeros(1)
         else:
-            curve = PchipInterpolator(self.depths_m, ratios)
+            curve = scipy.interpolate.PchipInterpolator(self.depths_m, ratios)
             within = np.clip(depths_m, self.depths_m[0], self.depths_m[-1])
             ratio = curve(within)
             slope = np.where(within == depths_m, curve(within, 1), 0.0)
