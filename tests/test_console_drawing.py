@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.arm_bridge import kinematics
 from flexsheet.nodes.console.arms import PIECES, compute_link_poses, rounded_box
 from flexsheet.nodes.console.creases import split_creases
 from flexsheet.nodes.console.scene_view import (
@@ -34,6 +33,7 @@ from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from tests.arm_states import arm_state
 from tests.console_parts import FixedMessages, cylinder
 from tests.fingertips import fingertip
+from tests.rv_1a import forward
 
 Floats = NDArray[np.float64]
 WIDTH_M = HEIGHT_M = 0.24
@@ -62,7 +62,7 @@ def test_the_drawn_flange_is_where_the_kinematics_have_it(joints: list[float]) -
     base = transform(rotation_from_vector(np.array([0.3, -0.2, 0.5])), (0.1, -0.4, 0.2))
     poses = compute_link_poses(base, np.array(joints))
     assert poses.shape == (7, 4, 4)
-    np.testing.assert_allclose(poses[-1], base @ kinematics.forward(joints), atol=1e-12)
+    np.testing.assert_allclose(poses[-1], base @ forward(np.array(joints)), atol=1e-12)
 
 
 @pytest.mark.parametrize("piece", PIECES)

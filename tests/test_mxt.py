@@ -45,7 +45,11 @@ from flexsheet.nodes.arm_bridge.mxt import (
 )
 from flexsheet.nodes.arm_bridge.node import ArmBridge
 from flexsheet.nodes.arm_bridge.parameters import ArmBridgeParameters
-from flexsheet.nodes.twin.arms import CONTROLLER_CYCLE_S, RANGE_RAD, SPEED_RAD_PER_S, Fault
+from flexsheet.nodes.twin.arms import (
+    CONTROLLER_CYCLE_S,
+    RV_1A_MECHANICS,
+    Fault,
+)
 from flexsheet.nodes.twin.arms_node import joint_torques_nm
 from flexsheet.nodes.twin.mxt_controller import (
     FRICTION_PERCENT,
@@ -55,6 +59,11 @@ from flexsheet.nodes.twin.mxt_controller import (
     MxtServer,
 )
 from tests.examples import examples
+from tests.rv_1a import (
+    RANGE_RAD,
+    SPEED_RAD_PER_S,
+    forward,
+)
 from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
@@ -502,10 +511,12 @@ def test_the_pull_of_the_sheet_follows_from_the_currents_within_its_uncertainty(
         controller = MxtController(
             JOINTS, servo_lag_s=0.02, filter_s=0.0, noise_rad=0.0, timeout_s=1.0, seed=seed
         )
-        controller.load_nm = joint_torques_nm(JOINTS, clamp, 12.0 * towards)
+        controller.load_nm = joint_torques_nm(RV_1A_MECHANICS, JOINTS, clamp, 12.0 * towards)
         currents = decode_answer(answer_with_currents(controller)).currents_percent
         assert currents is not None
-        force_n, deviation_n = estimate_pull_n(calibration, JOINTS, currents, clamp[:3, 3], towards)
+        force_n, deviation_n = estimate_pull_n(
+            calibration, JOINTS, currents, clamp[:3, 3], towards, forward=forward
+        )
         ratios.append((force_n - 12.0) / deviation_n)
     assert np.std(ratios) == pytest.approx(1.0, abs=0.3)
     assert abs(np.mean(ratios)) < 0.4
@@ -520,7 +531,9 @@ def test_a_force_of_a_moving_arm_is_invalid() -> None:
     towards = np.array([1.0, 0.0, 0.0])
 
     def update(at_ms: int, joints: Floats) -> Force | None:
-        return estimator.update(at_ms * 1_000_000, joints, np.zeros(6), np.zeros(3), towards)
+        return estimator.update(
+            at_ms * 1_000_000, joints, np.zeros(6), np.zeros(3), towards, forward=forward
+        )
 
     assert update(0, JOINTS) is None
     assert update(10, JOINTS) is None

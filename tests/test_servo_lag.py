@@ -19,7 +19,10 @@ from flexsheet.nodes.models.servo_lag import (
     ServoLagEstimator,
 )
 from flexsheet.nodes.planner.timing import ActuationDelayEstimator
-from flexsheet.nodes.twin.arms import Floats, Servo
+from flexsheet.nodes.twin.arms import (
+    Floats,
+    Servo,
+)
 
 BOUNDS = LagBounds(0.005, 0.1)
 PERIOD_S = 1.0 / 140.0
