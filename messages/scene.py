@@ -355,13 +355,15 @@ class ClosedFormArm(ArmModel):
             (0.0, 0.0, 0.0),
             (0.0, 0.0, self.flange_m),
         )
-        *origins, flange = (Pose(position_m=one, rpy_rad=(0.0, 0.0, 0.0)) for one in offsets)
+        *origins, flange = ({"position_m": one, "rpy_rad": (0.0, 0.0, 0.0)} for one in offsets)
         z, y = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
         limits = {name: getattr(self, name) for name in ArmModel.model_fields}
-        return JointChain(**limits, origins=origins, axes=(z, y, y, z, y, z), flange=flange)
+        return JointChain.model_validate(
+            {**limits, "origins": origins, "axes": (z, y, y, z, y, z), "flange": flange}
+        )
 
 
-def _radians(*degrees: float) -> tuple[float, ...]:
+def _radians(*degrees: float) -> Any:
     return tuple(math.radians(angle) for angle in degrees)
 
 

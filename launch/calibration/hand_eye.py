@@ -230,7 +230,7 @@ class _LinearizedPose:
 def calibrate_base(
     detections: Sequence[BoardDetection],
     rig: LensRig,
-    model: ClosedFormArm | JointChain = RV_1A,
+    arm: ClosedFormArm | JointChain = RV_1A,
 ) -> BaseFit:
     """Estimate the pose of the arm's base. Raises HandEyeError if the poses do not determine it.
 
@@ -238,7 +238,7 @@ def calibrate_base(
     the same camera measures both.
     """
     _check_count(detections)
-    forward = make_kinematics(model).forward
+    forward = make_kinematics(arm).forward
     flanges = [forward(one.joints_rad) for one in detections]
     _check_rotations(flanges)
     boards = [_fit_board_pose(one, rig) for one in detections]

@@ -55,7 +55,7 @@ def load_arm_models(document: Document) -> None:
     for side in ("left", "right"):
         arm = arms.get(side) if isinstance(arms, dict) else None
         model = arm.get("model") if isinstance(arm, dict) else None
-        if not isinstance(model, dict) or "urdf" not in model:
+        if not (isinstance(arm, dict) and isinstance(model, dict) and "urdf" in model):
             continue
         at = ("arms", side, "model")
         given = validate(UrdfArm, document, at=at)
@@ -115,7 +115,7 @@ def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
 
 def _load_joints(path: Path) -> list[Any]:
     try:
-        import yourdfpy
+        import yourdfpy  # type: ignore[import-untyped,import-not-found,unused-ignore]
     except ImportError as error:
         raise UrdfError(
             "reading a URDF file needs the package yourdfpy; install it by "

@@ -45,13 +45,13 @@ MIN_SINGULAR_VALUE, NEAR_SINGULAR_VALUE = 0.01, 0.05
 """Smallest singular value of the Jacobian below which a pose is refused, and above which paths must
 stay: there a flange speed of 0.25 m/s needs joint speeds of at most 20 rad/s."""
 
-SEEDS = 128
+SEEDS = 256
 """Number of random joints from which `solve_all` starts."""
 
 SEED_STEPS = 40
 
-MIN_DIFFERENCE_RAD = 0.05
-"""Difference of joints above which two solutions are distinct."""
+MIN_DIFFERENCE = 0.02
+"""Sine of half the difference of a joint above which two solutions are distinct."""
 
 
 class SerialChain:
@@ -96,10 +96,10 @@ class SerialChain:
         """Return base_from_flange (..., 4, 4), and the Jacobian (..., 6, 6) in the base frame."""
         *frames, flange = self._frames(joints_rad)
         placed = np.stack(frames, axis=-3)
-        axes = np.einsum("...jik,jk->...ji", placed[..., :3, :3], self._axes)
-        levers = flange[..., None, :3, 3] - placed[..., :3, 3]
-        rows = np.concatenate([np.cross(axes, levers), axes], axis=-1)
-        return flange, np.swapaxes(rows, -1, -2)
+        x, y, z = np.moveaxis((placed[..., :3, :3] @ self._axes[:, :, None])[..., 0], -1, 0)
+        dx, dy, dz = np.moveaxis(flange[..., None, :3, 3] - placed[..., :3, 3], -1, 0)
+        rows = (y * dz - z * dy, z * dx - x * dz, x * dy - y * dx, x, y, z)
+        return flange, np.stack(rows, axis=-2)
 
     def levers_m(self, beyond_flange_m: float) -> Floats:
         """Return upper bounds (6,) of the distances from the joints' axes to a point, m.
@@ -130,18 +130,18 @@ class NumericKinematics:
     def _refine(self, poses: Floats, joints_rad: Floats, steps: int) -> tuple[Floats, Floats]:
         """Return joints (n, 6) after Newton steps towards poses, and their errors (n,)."""
         joints = joints_rad
-        for _ in range(steps):
+        for left in reversed(range(steps + 1)):
             flanges, slopes = self._chain.pose_and_jacobian(joints)
             errors = _pose_errors(poses, flanges)
-            if float(np.abs(errors).max()) <= TOLERANCE:
+            largest = np.abs(errors).max(axis=1)
+            if left == 0 or float(largest.max()) <= TOLERANCE:
                 break
             transposed = np.swapaxes(slopes, 1, 2)
             normal = transposed @ slopes + DAMPING * np.eye(6)
             change = np.linalg.solve(normal, transposed @ errors[..., None])[..., 0]
-            largest = np.abs(change).max(axis=1, keepdims=True)
-            joints = joints + change * np.minimum(1.0, MAX_STEP_RAD / np.maximum(largest, 1e-12))
-        errors = _pose_errors(poses, self._chain.forward(joints))
-        return joints, np.abs(errors).max(axis=1)
+            fastest = np.abs(change).max(axis=1, keepdims=True)
+            joints = joints + change * np.minimum(1.0, MAX_STEP_RAD / np.maximum(fastest, 1e-12))
+        return joints, largest
 
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
         """Return joints (n, 6) on the branch of `joints_rad` (6,), and their errors (n,)."""
@@ -200,7 +200,7 @@ class NumericKinematics:
                 f"{smallest:.2g}, at least {MIN_SINGULAR_VALUE}",
                 "singularity",
             )
-        return found
+        return np.asarray(found)
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
         """Return the distinct solutions (6,) rad within the ranges, the nearest to the start first.
@@ -213,10 +213,13 @@ class NumericKinematics:
         poses = np.broadcast_to(base_from_flange, (len(seeds), 4, 4))
         joints, errors = self._refine(poses, seeds, SEED_STEPS)
         turned = self._start + np.remainder(joints - self._start + pi, 2.0 * pi) - pi
+        turned += 2.0 * pi * (1.0 * (turned < self._lowest) - 1.0 * (turned > self._highest))
         found: list[Floats] = []
-        for one in turned[errors <= MAX_ERROR]:
-            in_range = ((one >= self._lowest) & (one <= self._highest)).all()
-            if in_range and all(np.abs(one - old).max() > MIN_DIFFERENCE_RAD for old in found):
+        for one in turned[np.flatnonzero(np.less_equal(errors, MAX_ERROR))]:
+            in_range = (np.maximum(self._lowest - one, one - self._highest) <= 0.0).all()
+            # Joints that differ by a revolution are the same solution.
+            apart = [np.abs(np.sin(0.5 * (one - old))).max() for old in found]
+            if in_range and min(apart, default=1.0) > MIN_DIFFERENCE:
                 found.append(one)
         return sorted(found, key=lambda one: float(np.abs(one - self._start).max()))
 

@@ -36,7 +36,10 @@ class UnreachableError(FlexsheetError, ValueError):
 class ArmKinematics(Protocol):
     """Kinematics of one arm.  A branch is one of the discrete joint solutions of a pose."""
 
-    model: ArmModel
+    @property
+    def model(self) -> ArmModel:
+        """Return the dimensions and limits of the arm."""
+        ...
 
     def forward(self, joints_rad: Floats) -> Floats:
         """Return the flange's pose base_from_flange (4, 4) at joints (6,) rad."""
