@@ -255,7 +255,7 @@ class NumericKinematics:
         return {"singularity": self._singular_values(joints_rad) - NEAR_SINGULAR_VALUE}
 
     def _singular_values(self, joints_rad: Floats) -> Floats:
-        finite = np.isfinite(joints_rad).all(axis=1)
+        finite = np.asarray(np.isfinite(joints_rad).all(axis=1))
         slopes = self._chain.jacobian(np.where(finite[:, None], joints_rad, self._start))
         slopes[:, :3] /= SINGULAR_LENGTH_M
         smallest = np.linalg.svd(slopes, compute_uv=False)[:, -1]

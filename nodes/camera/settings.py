@@ -163,8 +163,8 @@ def fix_settings(
         warn("rate", f"{camera.rate_hz:g} Hz", f"{rate_hz:g} Hz")
     if backend is None:
         warn("exposure", f"{1e3 * camera.exposure_s:g} ms", "no control that OpenCV supports")
-        got = _describe(capture, device, rate_hz, None)
-        return DeviceSettings(None, rate_hz, tuple(warnings), got)
+        text = _describe(capture, device, rate_hz, None)
+        return DeviceSettings(None, rate_hz, tuple(warnings), text)
 
     if backend.api == cv2.CAP_V4L2:
         # An environment variable can make OpenCV scale all controls to 0..1; this prevents it.

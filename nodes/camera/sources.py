@@ -30,7 +30,7 @@ class OpenCvSource(CameraSource):
     Two cameras without a common trigger expose at different times (`docs/camera.md`).
     """
 
-    kind: Literal["opencv", "live"]
+    kind: Literal["live", "opencv"] = Field(description="opencv is the former name of live")
     left: int | DeviceFile = Field(
         description="left camera, or one with both views side by side: number, path or address; "
         "aravis: name of the camera; realsense: serial number, or empty; gstreamer: pipeline"
