@@ -295,6 +295,9 @@ class ArmModel(Part):
         "shoulder and wrist with which it holds the sheet"
     )
 
+    def __str__(self) -> str:
+        return self.name
+
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
         rows = zip(self.min_rad, self.start_rad, self.max_rad, strict=True)

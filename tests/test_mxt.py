@@ -65,10 +65,10 @@ from tests.rv_1a import (
     forward,
 )
 from tests.waiting import DEADLINE_S
+from website.registers_page import render_packet
 
 Floats = NDArray[np.float64]
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
-DOCUMENT = Path(__file__).parent.parent / "docs" / "mxt.md"
 ME = ("127.0.0.1", 4711)
 
 
@@ -81,7 +81,7 @@ def offsets() -> Iterator[tuple[int, BlockField]]:
 
 
 def test_the_document_has_the_layout_of_the_code() -> None:
-    text = DOCUMENT.read_text()
+    text = render_packet()
     kinds = {"H": "u16", "I": "u32", "i": "i32", "f": "float32", "x": "pad"}
     for at, field in offsets():
         kind = kinds[field.kind] + (f" × {field.count}" if field.count > 1 else "")
@@ -461,7 +461,7 @@ async def test_a_cancellation_is_not_swallowed() -> None:
 
 
 def test_the_document_lists_the_rejections() -> None:
-    text = DOCUMENT.read_text()
+    text = render_packet()
     source = (Path(__file__).parent.parent / "nodes/twin/mxt_controller.py").read_text()
     for words in re.findall(r'MxtError\("([^"]+)"\)', source):
         assert words in text, words
