@@ -228,6 +228,7 @@ class StutteringReader:
     paced = False
     rate_hz: float | None = 60.0
     warnings: tuple[str, ...] = ()
+    opened: tuple[str, ...] = ()
 
     def __init__(self) -> None:
         self.frames = iter([1, 2, 3, 7, 8])
