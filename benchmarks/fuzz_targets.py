@@ -61,7 +61,7 @@ from flexsheet.nodes.arm_bridge.mxt import PACKET_BYTES, decode_answer
 from flexsheet.nodes.arm_bridge.mxt import encode as encode_mxt
 from flexsheet.nodes.models.shapes import MeshError
 from flexsheet.nodes.node import PortCounts
-from flexsheet.nodes.twin.arms import RANGE_RAD, Controller
+from flexsheet.nodes.twin.arms import RV_1A_MECHANICS, Controller
 from flexsheet.nodes.twin.mxt_controller import FILTER_S, MxtController
 
 LAUNCH = Path(flexsheet.launch.__file__).parent
@@ -797,7 +797,7 @@ def run_modbus(data: bytes) -> bool:
 
 
 def in_range(joints_rad: np.ndarray[Any, Any]) -> bool:
-    return bool(((joints_rad >= RANGE_RAD[:, 0]) & (joints_rad <= RANGE_RAD[:, 1])).all())
+    return RV_1A_MECHANICS.is_in_range(joints_rad)
 
 
 # The manufacturer's real-time protocol.

@@ -54,12 +54,9 @@ from flexsheet.nodes.arm_bridge.state_machine import Event
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform, transform_from_rpy
 from flexsheet.nodes.twin.arms import (
-    ACCELERATION_RAD_PER_S2,
-    RANGE_RAD,
-    SPEED_RAD_PER_S,
+    RV_1A_MECHANICS,
     Servo,
     decelerate,
-    forward,
 )
 
 Floats = NDArray[np.float64]
@@ -91,7 +88,10 @@ MAX_UNCHANGED_CYCLES = 7
 """Number of cycles after which unchanged counters count as stalled."""
 HUNTS = 80
 """Number of sequences that hypothesis tries."""
-START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
+START_GUESS_RAD = RV_1A_MECHANICS.start_rad
+RANGE_RAD = RV_1A_MECHANICS.range_rad
+SPEED_RAD_PER_S = RV_1A_MECHANICS.speed_rad_per_s
+ACCELERATION_RAD_PER_S2 = RV_1A_MECHANICS.acceleration_rad_per_s2
 
 
 @dataclass
@@ -213,7 +213,7 @@ class CheckedServos:
         """Undo the step of frozen arms; decelerate stopping ones instead."""
         servo, still, braking = self.servo, moving < 0, moving == 0
         servo.joints_rad[still], servo.velocity_rad_per_s[still] = joints[still], 0.0
-        slower = decelerate(velocity, step_s)
+        slower = decelerate(velocity, step_s, ACCELERATION_RAD_PER_S2)
         servo.velocity_rad_per_s[braking] = slower[braking]
         servo.joints_rad[braking] = (joints + slower * step_s)[braking]
 
@@ -885,7 +885,7 @@ def run(commands: int, seed: int, *, searching: bool = True) -> dict[str, Any]:
     scene, random = load_scene(SCENE_FILE), np.random.default_rng(seed)
     check = random.uniform(-1.0, 1.0, (5, 6))
     for joints, turn, place in zip(check, *compute_flange_poses(check), strict=True):
-        assert np.allclose(forward(joints), transform(turn, place), atol=1e-12)
+        assert np.allclose(RV_1A_MECHANICS.forward(joints), transform(turn, place), atol=1e-12)
     joints_tally, sheets_tally = Tally(), Tally()
     found_sequences = search_sequences(scene) if searching else []
     sheets = int(SHEET_FRACTION * commands)

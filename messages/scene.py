@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from flexsheet.messages.arrays import ColorImage, Transform, Triangles, Vector3, Vertices
 from flexsheet.messages.base import Message, MessagePart
@@ -25,7 +25,11 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Small = Annotated[float, Field(ge=-0.5, le=0.5)]
 """Relative deviation or small angle; a value outside this range indicates a mistake in the file."""
 
+Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 SmallSix = tuple[Small, Small, Small, Small, Small, Small]
+
+MAX_AXIS_ERROR = 1e-6
+"""Maximum difference of the length of a joint's axis from 1."""
 
 
 class Part(MessagePart, LimitedModel):
@@ -277,12 +281,141 @@ class SheetSpec(Part):
     )
 
 
+class ArmModel(Part):
+    """Base class of the models of a 6-axis arm: its name and the limits of its joints."""
+
+    name: str
+    min_rad: Six = Field(description="lower end of each joint's range")
+    max_rad: Six
+    speed_rad_per_s: tuple[Positive, Positive, Positive, Positive, Positive, Positive] = Field(
+        description="maximum speed of each joint"
+    )
+    start_rad: Six = Field(
+        description="joints at which the arm reaches towards the sheet; they select the elbow, "
+        "shoulder and wrist with which it holds the sheet"
+    )
+
+    def __str__(self) -> str:
+        return self.name
+
+    @model_validator(mode="after")
+    def _check_ranges(self) -> Self:
+        rows = zip(self.min_rad, self.start_rad, self.max_rad, strict=True)
+        for number, (low, start, high) in enumerate(rows, start=1):
+            if not low < start < high:
+                raise ValueError(
+                    f"J{number}: start_rad {start:.4g} must be between min_rad {low:.4g} and "
+                    f"max_rad {high:.4g}"
+                )
+        return self
+
+
+class JointChain(ArmModel):
+    """Arm as a chain of six rotary joints, as read from a URDF; its kinematics are numeric."""
+
+    kind: Literal["joint_chain"] = "joint_chain"
+    origins: tuple[Pose, Pose, Pose, Pose, Pose, Pose] = Field(
+        description="pose of each joint's frame in the frame of the previous joint, at angle 0; "
+        "the first one in the base"
+    )
+    axes: tuple[Vector3, Vector3, Vector3, Vector3, Vector3, Vector3] = Field(
+        description="unit vector of each joint's axis in its own frame"
+    )
+    flange: Pose = Field(description="pose of the flange in the frame of the last joint")
+
+    @model_validator(mode="after")
+    def _check_axes(self) -> Self:
+        for number, axis in enumerate(self.axes, start=1):
+            if not abs(math.hypot(*axis) - 1.0) <= MAX_AXIS_ERROR:
+                raise ValueError(f"axes: the axis of J{number} must have length 1, not {axis}")
+        return self
+
+
+class ClosedFormArm(ArmModel):
+    """Arm with the axes z, y, y, z, y, z, of which the last three meet in one point.
+
+    At joint angles of zero the arm is upright, and every frame is parallel to the base.  Its
+    kinematics have a closed form.
+    """
+
+    kind: Literal["closed_form"] = "closed_form"
+    shoulder_height_m: Positive
+    upper_arm_m: Positive
+    elbow_shift_m: Finite = Field(
+        description="distance by which the forearm's axis is behind the elbow; negative: in front"
+    )
+    forearm_m: Positive = Field(description="distance along the forearm's axis to the wrist centre")
+    flange_m: Positive = Field(description="distance from the wrist centre to the flange")
+
+    def chain(self) -> JointChain:
+        """Return the same arm as a chain of joints."""
+        offsets = (
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, self.shoulder_height_m),
+            (0.0, 0.0, self.upper_arm_m),
+            (-self.elbow_shift_m, 0.0, self.forearm_m),
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, self.flange_m),
+        )
+        *origins, flange = ({"position_m": one, "rpy_rad": (0.0, 0.0, 0.0)} for one in offsets)
+        z, y = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)
+        limits = {name: getattr(self, name) for name in ArmModel.model_fields}
+        return JointChain.model_validate(
+            {**limits, "origins": origins, "axes": (z, y, y, z, y, z), "flange": flange}
+        )
+
+
+def _radians(*degrees: float) -> Any:
+    return tuple(math.radians(angle) for angle in degrees)
+
+
+RV_1A = ClosedFormArm(
+    name="rv-1a",
+    shoulder_height_m=0.3,
+    upper_arm_m=0.25,
+    elbow_shift_m=0.09,
+    forearm_m=0.16,
+    flange_m=0.072,
+    min_rad=_radians(-150, -60, 60, -160, -90, -200),
+    max_rad=_radians(150, 120, 155, 160, 90, 200),
+    speed_rad_per_s=_radians(180, 90, 135, 180, 180, 210),
+    start_rad=_radians(0, 25, 119, 0, -54, 0),
+)
+"""Mitsubishi RV-1A, by two public models (Adolphus `mitsubishirv1a.yaml`, ICube `mrv1a.urdf`)."""
+
+RV_2FR = ClosedFormArm(
+    name="rv-2fr",
+    shoulder_height_m=0.295,
+    upper_arm_m=0.23,
+    elbow_shift_m=0.05,
+    forearm_m=0.27,
+    flange_m=0.07,
+    min_rad=_radians(-240, -120, 0, -200, -120, -360),
+    max_rad=_radians(240, 120, 160, 200, 120, 360),
+    speed_rad_per_s=_radians(300, 150, 300, 450, 450, 720),
+    start_rad=_radians(0, 10, 115, 0, -35, 0),
+)
+"""Mitsubishi RV-2FR, by the manufacturer's public model (`melfa_description`).
+
+The elbow's shift is towards the back, as for the RV-1A: only then is the maximum reach of the wrist
+centre the 504 mm of the data sheet."""
+
+ARM_MODELS = {arm.name: arm for arm in (RV_1A, RV_2FR)}
+"""Arms that a scene may name."""
+
+
 class ArmSpec(Part):
-    """RV-1A robot arm: pose of its base, and of its edge of the sheet on its flange.
+    """Robot arm: its model, the pose of its base, and of its edge of the sheet on its flange.
 
     Sheet frame: x from the left edge to the right edge, y along the edges, z towards the user.
     """
 
+    model: Annotated[ClosedFormArm | JointChain, Field(discriminator="kind")] = Field(
+        default=RV_1A,
+        description="name of a known arm (rv-1a, rv-2fr), its dimensions, or in a scene file "
+        "`{urdf: FILE, base: LINK, tip: LINK, start_rad: [...]}`",
+    )
     world_from_base: Pose
     flange_from_edge: Pose = Field(
         description="pose of the clamped edge's centre in the flange frame; axes as the sheet frame"
@@ -296,6 +429,15 @@ class ArmSpec(Part):
         description="displacement of the flange per newton of the sheet's tension, for which the "
         "arm's commands are corrected",
     )
+
+    @field_validator("model", mode="before")
+    @classmethod
+    def _find_model(cls, value: Any) -> Any:
+        if not isinstance(value, str):
+            return value
+        if value not in ARM_MODELS:
+            raise ValueError(f'unknown arm "{value}"; known arms: {", ".join(ARM_MODELS)}')
+        return ARM_MODELS[value]
 
 
 class Arms(Part):

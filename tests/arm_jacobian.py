@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flexsheet.nodes.arm_bridge.kinematics import forward
+from tests.rv_1a import (
+    forward,
+)
 
 STEP_RAD = 1e-5
 

@@ -17,7 +17,10 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, SheetTarget, TwinArms
 from flexsheet.nodes.models.rigid import transform_from_rpy
-from flexsheet.nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S
+from tests.rv_1a import (
+    RANGE_RAD,
+    SPEED_RAD_PER_S,
+)
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]

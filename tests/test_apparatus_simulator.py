@@ -22,7 +22,9 @@ from flexsheet.nodes.models.measured_period import MIN_INTERVALS, MeasuredPeriod
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
-from flexsheet.nodes.twin.arms import Controller
+from flexsheet.nodes.twin.arms import (
+    Controller,
+)
 from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters

@@ -16,7 +16,6 @@ from flexsheet.nodes.arm_bridge import other_arm
 from flexsheet.nodes.arm_bridge.control import ArmControl, Command, Timeouts
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal, compute_sync_factor, extrapolate_goal
-from flexsheet.nodes.arm_bridge.kinematics import forward
 from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS, ArmFault
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
@@ -26,6 +25,9 @@ from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy, vector_fr
 from flexsheet.nodes.models.sheet import edge_poses
 from tests.arm_states import connect_control
 from tests.examples import examples
+from tests.rv_1a import (
+    forward,
+)
 from tests.scenes import load_cylinder
 from tests.twists import twist_between
 

@@ -21,8 +21,18 @@ from flexsheet.messages.types import ArmState, EStop
 from flexsheet.nodes.arm_bridge.link_drivers import make_link
 from flexsheet.nodes.arm_bridge.modbus import MAGIC
 from flexsheet.nodes.twin import arms as twin_arms
-from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S, STATE_FAULT, Fault, Servo, forward
+from flexsheet.nodes.twin.arms import (
+    STATE_FAULT,
+    Fault,
+    Servo,
+)
 from tests.network import TcpRelay
+from tests.rv_1a import (
+    SPEED_RAD_PER_S,
+)
+from tests.rv_1a import (
+    twin_forward as forward,
+)
 from tests.test_arm_loop import (
     AT_FRONT,
     Path3,

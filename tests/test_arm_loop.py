@@ -24,7 +24,10 @@ from flexsheet.nodes.models.rigid import inverse, transform_from_rpy
 from flexsheet.nodes.models.sheet import sheet_from_edges
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
-from flexsheet.nodes.twin.arms import STATE_MOVING, STATE_STOPPED
+from flexsheet.nodes.twin.arms import (
+    STATE_MOVING,
+    STATE_STOPPED,
+)
 from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from tests.fingertips import fingertip
 from tests.scenes import load_cylinder, make_weightless

@@ -18,21 +18,27 @@ from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.control import ArmControl, Command
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal
-from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 from flexsheet.nodes.arm_bridge.limiter import MAX_TRAVEL_STEP_S, JointLimits, bound_step
 from flexsheet.nodes.arm_bridge.link import MAX_UNCHANGED_S, CounterMonitor, Freshness
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.standstill import (
-    JOINT_LEVER_M,
     MAX_RESTART_SHIFT_M,
     STANDSTILL_COUNT,
     StandstillMonitor,
-    bound_edge_shift_m,
 )
 from flexsheet.nodes.models.rigid import transform_from_rpy
-from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S, Servo, forward
+from flexsheet.nodes.twin.arms import (
+    Servo,
+)
 from tests.arm_states import connect_control
 from tests.examples import examples
+from tests.rv_1a import (
+    JOINT_SPEED_RAD_PER_S,
+    SPEED_RAD_PER_S,
+)
+from tests.rv_1a import (
+    twin_forward as forward,
+)
 from tests.test_arm_control import GUESS, HOME, SCENE, STEP_S, TIMEOUTS, on_time, sheet_at
 
 Floats = NDArray[np.float64]
@@ -383,14 +389,14 @@ LIMITS: JointLimits = GEOMETRY.joint_limits
 def test_the_edge_shifts_by_no_more_than_the_bound(joints: Floats, step: tuple[float, ...]) -> None:
     moved = joints + np.array(step)
     shift = np.linalg.norm(GEOMETRY.tool_points(moved) - GEOMETRY.tool_points(joints), axis=1)
-    assert shift.max() <= bound_edge_shift_m(joints, moved) + 1e-12
+    assert shift.max() <= GEOMETRY.bound_edge_shift_m(joints, moved) + 1e-12
 
 
 def test_a_restart_within_its_tolerance_is_slower_than_the_tool_may_be() -> None:
     random = np.random.default_rng(3)
     for _ in range(40):
         arm = ServoArm.holding("left")
-        step = random.choice([-1.0, 1.0], 6) * random.dirichlet(np.ones(6)) / JOINT_LEVER_M
+        step = random.choice([-1.0, 1.0], 6) * random.dirichlet(np.ones(6)) / GEOMETRY._levers_m
         arm.command = Command("move", arm.servo.joints_rad + MAX_RESTART_SHIFT_M * step)
         arm.servo.lag_s = 0.015
         for _ in range(100):

@@ -228,6 +228,7 @@ class StutteringReader:
     paced = False
     rate_hz: float | None = 60.0
     warnings: tuple[str, ...] = ()
+    opened: tuple[str, ...] = ()
 
     def __init__(self) -> None:
         self.frames = iter([1, 2, 3, 7, 8])
@@ -256,6 +257,7 @@ def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
         retry_s=1.0,
         deliver=lambda pictures, count: lost.append(count),
         fail=lambda error: pytest.fail(str(error)),
+        report=lambda text: None,
         warn=pytest.fail,
         finish=lambda pairs: ended.set(),
     )
@@ -288,6 +290,7 @@ def test_an_error_inside_opencv_is_a_device_error_and_tried_again(scene: Scene) 
         retry_s=0.001,
         deliver=lambda pictures, count: pytest.fail("nothing to deliver"),
         fail=fail,
+        report=lambda text: None,
         warn=pytest.fail,
         finish=lambda pairs: pytest.fail("not finished"),
     )

@@ -281,6 +281,7 @@ def test_all_errors_of_a_reader_are_reported() -> None:
         retry_s=0.001,
         deliver=lambda pictures, lost: None,
         fail=tell,
+        report=lambda text: None,
         warn=lambda text: None,
         finish=lambda pairs: None,
     )

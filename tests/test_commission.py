@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from flexsheet.launch import cli
-from flexsheet.launch.calibration.arm_poses import READY_RAD, SimulatedArm, make_lens_rig
+from flexsheet.launch.calibration.arm_poses import SimulatedArm, make_lens_rig
 from flexsheet.launch.calibration.commission import (
     CommissionError,
     Commissioning,
@@ -49,6 +49,7 @@ from flexsheet.nodes.twin import projector as twin_projector
 from flexsheet.nodes.twin.rig import make_true_camera, pixels_of
 from flexsheet.nodes.twin.tolerance_table import sample_apparatus
 from flexsheet.nodes.twin.truth import align_world_to_camera, apply_apparatus
+from tests.rv_1a import CENTRE_RAD
 
 Floats = NDArray[np.float64]
 
@@ -150,13 +151,13 @@ def test_the_arm_of_an_apparatus_is_found_within_the_stated_uncertainty() -> Non
     rig, random = make_lens_rig(SCENE, None), np.random.default_rng(4)
     grid = np.mgrid[:7, :5].T.reshape(-1, 2) * 0.015
     corners = np.concatenate([grid, np.zeros((35, 1))], axis=1)
-    held = arm.place_flange(READY_RAD, exact=True)
+    held = arm.place_flange(CENTRE_RAD, exact=True)
     facing = rig.world_from_left[:3, :3]
     middle = held[:3, 3] + 0.06 * held[:3, 2]
     flange_from_board = inverse(held) @ transform(facing, middle - facing @ corners.mean(axis=0))
     detections = []
     for number in range(14):
-        joints = READY_RAD + random.normal(0.0, 0.15, 6)
+        joints = CENTRE_RAD + random.normal(0.0, 0.15, 6)
         left_from_board = (
             inverse(rig.world_from_left) @ arm.place_flange(joints) @ flange_from_board
         )
@@ -182,7 +183,7 @@ def test_joint_offsets_of_an_apparatus_turn_the_true_flange() -> None:
         SimulatedArm(SCENE, "right", one, seed=1)
         for one in (nominal_apparatus(SCENE), changed("arms", right={"joint_offsets_rad": offsets}))
     ]
-    flanges = [arm.place_flange(READY_RAD, exact=True) for arm in arms]
+    flanges = [arm.place_flange(CENTRE_RAD, exact=True) for arm in arms]
     turned = vector_from_rotation(flanges[0][:3, :3].T @ flanges[1][:3, :3])
     assert np.abs(turned) == pytest.approx([0.0, 0.0, 0.01], abs=1e-9)
 

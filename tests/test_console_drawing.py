@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Scene
-from flexsheet.nodes.arm_bridge import kinematics
-from flexsheet.nodes.console.arms import PIECES, compute_link_poses, rounded_box
+from flexsheet.messages.scene import RV_1A, RV_2FR, ClosedFormArm, JointChain, Scene
+from flexsheet.nodes.arm_bridge.geometry import make_kinematics
+from flexsheet.nodes.console.arms import PIECES, compute_link_poses, make_pieces, rounded_box
 from flexsheet.nodes.console.creases import split_creases
 from flexsheet.nodes.console.scene_view import (
     LINES_LIFT_M,
@@ -57,15 +57,20 @@ def sheet(fingertip: Floats | None = None) -> Floats:
     return points
 
 
-@given(st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6))
-def test_the_drawn_flange_is_where_the_kinematics_have_it(joints: list[float]) -> None:
+@pytest.mark.parametrize("model", [RV_1A, RV_2FR, RV_2FR.chain()])
+@given(joints=st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6))
+def test_the_drawn_flange_is_where_the_kinematics_have_it(
+    model: ClosedFormArm | JointChain, joints: list[float]
+) -> None:
     base = transform(rotation_from_vector(np.array([0.3, -0.2, 0.5])), (0.1, -0.4, 0.2))
-    poses = compute_link_poses(base, np.array(joints))
+    poses = compute_link_poses(base, np.array(joints), model)
     assert poses.shape == (7, 4, 4)
-    np.testing.assert_allclose(poses[-1], base @ kinematics.forward(joints), atol=1e-12)
+    np.testing.assert_allclose(
+        poses[-1], base @ make_kinematics(model).forward(np.array(joints)), atol=1e-12
+    )
 
 
-@pytest.mark.parametrize("piece", PIECES)
+@pytest.mark.parametrize("piece", [*PIECES, *make_pieces(RV_2FR)])
 def test_boxes_are_closed_and_wound_outwards(piece: Any) -> None:
     vertices, triangles = rounded_box(piece.size_m, (0.0, 0.0, 0.0))
     a, b, c = (vertices[triangles[:, i]] for i in range(3))

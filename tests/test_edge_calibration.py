@@ -26,7 +26,6 @@ from flexsheet.messages.scene import ArmSpec, Scene
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
-from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.tolerance_table import sample_apparatus
@@ -112,7 +111,7 @@ def test_the_bridge_measures_the_sheet_that_it_commands(stretch: float) -> None:
         transform(rotation, np.array([0.01, -0.02, 0.015])), np.zeros(6), stretch, 0.0
     )
     arms = [ArmGeometry(scene, side) for side in ("left", "right")]
-    joints = [arm.joints_for_sheet(motion, START_GUESS_RAD) for arm in arms]
+    joints = [arm.joints_for_sheet(motion, arm.start_rad) for arm in arms]
     rigid = [arm.world_from_edge(rad) for arm, rad in zip(arms, joints, strict=True)]
     for arm, own, other in ((arms[0], rigid[0], rigid[1]), (arms[1], rigid[1], rigid[0])):
         between = arm.sheet_between(own, other)

@@ -24,8 +24,10 @@ from flexsheet.nodes.arm_bridge.link import CounterMonitor
 from flexsheet.nodes.arm_bridge.modbus import ModbusStatus, decode_status, encode_command
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from flexsheet.nodes.models.rigid import transform_from_rpy
-from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S
 from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
+from tests.rv_1a import (
+    SPEED_RAD_PER_S,
+)
 from tests.test_arm_loop import paper_scene
 
 Floats = NDArray[np.float64]

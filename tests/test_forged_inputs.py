@@ -30,9 +30,15 @@ from flexsheet.nodes.arm_bridge.path_check import (
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
-from flexsheet.nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S, forward
 from tests.examples import examples
 from tests.fingertips import fingertip
+from tests.rv_1a import (
+    RANGE_RAD,
+    SPEED_RAD_PER_S,
+)
+from tests.rv_1a import (
+    twin_forward as forward,
+)
 from tests.test_arm_loop import paper_scene
 from tests.test_faults_storm import MAX_LENGTH_M, SIDES, Bench
 

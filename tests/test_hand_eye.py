@@ -48,11 +48,13 @@ from flexsheet.nodes.models.rigid import (
     transform,
     vector_from_rotation,
 )
-from flexsheet.nodes.twin.arms import forward as twin_forward
-from flexsheet.nodes.twin.arms import solve_inverse_kinematics
 from flexsheet.nodes.twin.board import TwinBoard
 from flexsheet.nodes.twin.rig import pixels_of
 from tests.examples import examples
+from tests.rv_1a import (
+    solve_inverse_kinematics,
+    twin_forward,
+)
 
 Floats = NDArray[np.float64]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -10,39 +12,56 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flexsheet.nodes.arm_bridge.kinematics import (
+from flexsheet.nodes.arm_bridge.closed_form import (
     BRANCHES,
+    MAX_FIXED_ERROR_RATIO,
+    MAX_FREE_ROTATION_RAD,
+    SHOULDER_FIXED_M,
+    SHOULDER_NEAR_M,
+    WRIST_FIXED_RAD,
+    WRIST_NEAR_RAD,
+    Branch,
+)
+from flexsheet.nodes.arm_bridge.kinematics import (
+    UnreachableError,
+)
+from flexsheet.nodes.models.rigid import rotation_from_rpy, rotation_from_vector, transform
+from tests.arm_jacobian import jacobian
+from tests.examples import examples
+from tests.rv_1a import (
+    ARM,
     CENTRE_RAD,
     ELBOW_ANGLE_RAD,
     FLANGE_M,
     JOINT_MAX_RAD,
     JOINT_MIN_RAD,
-    MAX_FIXED_ERROR_RATIO,
-    MAX_FREE_ROTATION_RAD,
     MAX_WRIST_M,
-    SHOULDER_FIXED_M,
-    WRIST_FIXED_RAD,
-    WRIST_NEAR_RAD,
-    Branch,
-    UnreachableError,
     branches,
     find_branch,
     forward,
     inverse_kinematics,
-    singularities,
     solve_joints_on_branch,
     solve_next_joints,
+    twin_forward,
 )
-from flexsheet.nodes.models.rigid import rotation_from_rpy, rotation_from_vector, transform
-from flexsheet.nodes.twin.arms import forward as twin_forward
-from tests.arm_jacobian import jacobian
-from tests.examples import examples
 
 Floats = NDArray[np.float64]
 
 in_range = arrays(np.float64, 6, elements=st.floats(1e-6, 1.0 - 1e-6)).map(
     lambda share: JOINT_MIN_RAD + share * (JOINT_MAX_RAD - JOINT_MIN_RAD)
 )
+
+
+def singularities(joints_rad: Floats) -> SimpleNamespace:
+    """Return the distances (...) of joints (..., 6) from the three singularities."""
+    margins = ARM.singularity_margins(joints_rad)
+    return SimpleNamespace(
+        shoulder_m=margins["shoulder singularity"] + SHOULDER_NEAR_M,
+        elbow_rad=margins["elbow singularity"] + WRIST_NEAR_RAD,
+        wrist_rad=margins["wrist singularity"] + WRIST_NEAR_RAD,
+    )
+
+
 any_turn = arrays(np.float64, 6, elements=st.floats(-np.pi, np.pi))
 
 

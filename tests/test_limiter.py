@@ -10,12 +10,6 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from benchmarks.limiter import run
-from flexsheet.nodes.arm_bridge.kinematics import (
-    JOINT_MAX_RAD,
-    JOINT_MIN_RAD,
-    JOINT_SPEED_RAD_PER_S,
-    forward,
-)
 from flexsheet.nodes.arm_bridge.limiter import (
     MAX_TRAVEL_STEP_S,
     JointLimits,
@@ -30,6 +24,12 @@ from flexsheet.nodes.arm_bridge.limiter import (
 )
 from flexsheet.nodes.models.rigid import transform, transform_from_rpy
 from tests.examples import examples
+from tests.rv_1a import (
+    JOINT_MAX_RAD,
+    JOINT_MIN_RAD,
+    JOINT_SPEED_RAD_PER_S,
+    forward,
+)
 
 Floats = NDArray[np.float64]
 

@@ -33,7 +33,11 @@ from flexsheet.nodes.arm_bridge.modbus import (
     encode_command,
 )
 from flexsheet.nodes.twin import arms as twin_arms
-from flexsheet.nodes.twin.arms import ArmServer, Controller, Fault
+from flexsheet.nodes.twin.arms import (
+    ArmServer,
+    Controller,
+    Fault,
+)
 from tests.examples import examples
 from tests.network import TcpRelay
 from tests.waiting import DEADLINE_S

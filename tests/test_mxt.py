@@ -45,7 +45,11 @@ from flexsheet.nodes.arm_bridge.mxt import (
 )
 from flexsheet.nodes.arm_bridge.node import ArmBridge
 from flexsheet.nodes.arm_bridge.parameters import ArmBridgeParameters
-from flexsheet.nodes.twin.arms import CONTROLLER_CYCLE_S, RANGE_RAD, SPEED_RAD_PER_S, Fault
+from flexsheet.nodes.twin.arms import (
+    CONTROLLER_CYCLE_S,
+    RV_1A_MECHANICS,
+    Fault,
+)
 from flexsheet.nodes.twin.arms_node import joint_torques_nm
 from flexsheet.nodes.twin.mxt_controller import (
     FRICTION_PERCENT,
@@ -55,11 +59,16 @@ from flexsheet.nodes.twin.mxt_controller import (
     MxtServer,
 )
 from tests.examples import examples
+from tests.rv_1a import (
+    RANGE_RAD,
+    SPEED_RAD_PER_S,
+    forward,
+)
 from tests.waiting import DEADLINE_S
+from website.registers_page import render_packet
 
 Floats = NDArray[np.float64]
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
-DOCUMENT = Path(__file__).parent.parent / "docs" / "mxt.md"
 ME = ("127.0.0.1", 4711)
 
 
@@ -72,7 +81,7 @@ def offsets() -> Iterator[tuple[int, BlockField]]:
 
 
 def test_the_document_has_the_layout_of_the_code() -> None:
-    text = DOCUMENT.read_text()
+    text = render_packet()
     kinds = {"H": "u16", "I": "u32", "i": "i32", "f": "float32", "x": "pad"}
     for at, field in offsets():
         kind = kinds[field.kind] + (f" × {field.count}" if field.count > 1 else "")
@@ -452,7 +461,7 @@ async def test_a_cancellation_is_not_swallowed() -> None:
 
 
 def test_the_document_lists_the_rejections() -> None:
-    text = DOCUMENT.read_text()
+    text = render_packet()
     source = (Path(__file__).parent.parent / "nodes/twin/mxt_controller.py").read_text()
     for words in re.findall(r'MxtError\("([^"]+)"\)', source):
         assert words in text, words
@@ -502,10 +511,12 @@ def test_the_pull_of_the_sheet_follows_from_the_currents_within_its_uncertainty(
         controller = MxtController(
             JOINTS, servo_lag_s=0.02, filter_s=0.0, noise_rad=0.0, timeout_s=1.0, seed=seed
         )
-        controller.load_nm = joint_torques_nm(JOINTS, clamp, 12.0 * towards)
+        controller.load_nm = joint_torques_nm(RV_1A_MECHANICS, JOINTS, clamp, 12.0 * towards)
         currents = decode_answer(answer_with_currents(controller)).currents_percent
         assert currents is not None
-        force_n, deviation_n = estimate_pull_n(calibration, JOINTS, currents, clamp[:3, 3], towards)
+        force_n, deviation_n = estimate_pull_n(
+            calibration, JOINTS, currents, clamp[:3, 3], towards, forward=forward
+        )
         ratios.append((force_n - 12.0) / deviation_n)
     assert np.std(ratios) == pytest.approx(1.0, abs=0.3)
     assert abs(np.mean(ratios)) < 0.4
@@ -520,7 +531,9 @@ def test_a_force_of_a_moving_arm_is_invalid() -> None:
     towards = np.array([1.0, 0.0, 0.0])
 
     def update(at_ms: int, joints: Floats) -> Force | None:
-        return estimator.update(at_ms * 1_000_000, joints, np.zeros(6), np.zeros(3), towards)
+        return estimator.update(
+            at_ms * 1_000_000, joints, np.zeros(6), np.zeros(3), towards, forward=forward
+        )
 
     assert update(0, JOINTS) is None
     assert update(10, JOINTS) is None

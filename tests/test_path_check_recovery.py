@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.arm_bridge.control import ArmControl
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
+from flexsheet.nodes.arm_bridge.kinematics import (
+    UnreachableError,
+)
 from flexsheet.nodes.arm_bridge.path_check import Alignment, PathCheckRequest, check_path, rehearse
 from flexsheet.nodes.arm_bridge.reach import PathError, plan_path_through
 from flexsheet.nodes.arm_bridge.standstill import SETTLED_COUNT

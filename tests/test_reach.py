@@ -26,13 +26,10 @@ from flexsheet.launch.health.layout import (
 )
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_cylinder
-from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.kinematics import (
-    CENTRE_RAD,
+from flexsheet.nodes.arm_bridge.closed_form import (
     WRIST_NEAR_RAD,
-    find_branch,
-    solve_next_joints,
 )
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.reach import (
     LIMITS,
     MAX_STEP_RAD,
@@ -46,8 +43,13 @@ from flexsheet.nodes.arm_bridge.reach import (
 )
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy
-from flexsheet.nodes.twin.arms import forward as twin_forward
 from tests.arm_jacobian import jacobian
+from tests.rv_1a import (
+    CENTRE_RAD,
+    find_branch,
+    solve_next_joints,
+    twin_forward,
+)
 
 Floats = NDArray[np.float64]
 

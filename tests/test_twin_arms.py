@@ -19,25 +19,29 @@ from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import TwinArms
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.twin.arms import (
-    ACCELERATION_RAD_PER_S2,
     CONTROLLER_CYCLE_S,
     FAULT_FINITE,
     FAULT_RANGE,
     FAULT_STEP,
     FAULT_WATCHDOG,
-    RANGE_RAD,
-    SPEED_RAD_PER_S,
     STATE_FAULT,
     STATE_HOLDING,
     STATE_IDLE,
     STATE_MOVING,
     Controller,
     Servo,
-    forward,
-    solve_inverse_kinematics,
 )
 from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from flexsheet.nodes.twin.mxt_controller import MxtServer
+from tests.rv_1a import (
+    ACCELERATION_RAD_PER_S2,
+    RANGE_RAD,
+    SPEED_RAD_PER_S,
+    solve_inverse_kinematics,
+)
+from tests.rv_1a import (
+    twin_forward as forward,
+)
 from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]

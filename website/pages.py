@@ -46,6 +46,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "errors": errors_page.render,
     "message-header": messages_page.render_header,
     "message-types": messages_page.render_types,
+    "mxt-packet": registers_page.render_packet,
     "parameters": parameters_page.render,
     "registers": registers_page.render,
     "scene-keys": scene_page.render,

@@ -1,4 +1,4 @@
-"""Generate the register map of the Modbus driver."""
+"""Generate the register map of the Modbus driver, and the packet of the MXT driver."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from flexsheet.nodes.arm_bridge.modbus import (
     STATUS_ADDRESS,
     count_registers,
 )
+from flexsheet.nodes.arm_bridge.mxt import PACKET
 
-KINDS = {"H": "u16", "I": "u32", "i": "i32", "f": "float32"}
+KINDS = {"H": "u16", "I": "u32", "i": "i32", "f": "float32", "x": "pad"}
 
 
 def render() -> str:
@@ -28,6 +29,16 @@ def render() -> str:
         "\n".join(bits) + "\n",
     ]
     return "\n".join(blocks)
+
+
+def render_packet() -> str:
+    """Return the table of the packet of an MXT controller."""
+    lines, at = ["| byte | field | type | meaning |", "|---|---|---|---|"], 0
+    for field in PACKET:
+        kind = KINDS[field.kind] + (f" × {field.count}" if field.count > 1 else "")
+        lines.append(f"| {at} | `{field.name}` | {kind} | {field.about} |")
+        at += field.count * struct.calcsize(f"<{field.kind}")
+    return "\n".join(lines) + "\n"
 
 
 def _block(title: str, address: int, block: Sequence[BlockField]) -> str:

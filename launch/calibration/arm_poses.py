@@ -45,8 +45,7 @@ from flexsheet.nodes.models.rigid import (
     transform_from_rpy,
     vector_from_rotation,
 )
-from flexsheet.nodes.twin.arms import RANGE_RAD, solve_inverse_kinematics
-from flexsheet.nodes.twin.arms import forward as twin_forward
+from flexsheet.nodes.twin.arms import ArmMechanics
 from flexsheet.nodes.twin.board import TwinBoard
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.truth import apply_apparatus
@@ -326,6 +325,7 @@ class SimulatedArm:
 
     def __init__(self, scene: Scene, side: Side, apparatus: Apparatus | None, *, seed: int) -> None:
         self._random = np.random.default_rng([seed, side == "left", 2])
+        self.mechanics = ArmMechanics(getattr(scene.arms, side).model)
         if apparatus is None:
             self.world_from_base = draw_true_base(scene, side, seed=seed)
             self._offsets_rad, self._backlash_rad = np.zeros(6), None
@@ -350,13 +350,8 @@ class SimulatedArm:
         else:
             errors = 0.5 * self._backlash_rad * self._random.uniform(-1.0, 1.0, 6)
         true_rad = joints_rad + self._offsets_rad + errors
-        return self.world_from_base @ twin_forward(
-            np.clip(true_rad, RANGE_RAD[:, 0], RANGE_RAD[:, 1])
-        )
-
-
-READY_RAD = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
-"""Joint angles at which the simulated arm reaches forward."""
+        in_range = np.clip(true_rad, *self.mechanics.range_rad.T)
+        return self.world_from_base @ self.mechanics.forward(in_range)
 
 
 def simulate_poses(
@@ -383,7 +378,8 @@ def simulate_poses(
     world_from_left = transform_from_rpy(camera_pose.position_m, camera_pose.rpy_rad)
     middle = 0.5 * board.square_m * np.array([board.columns - 1.0, board.rows - 1.0, 0.0])
     # Put the board 60 mm in front of the flange; it faces the camera while the arm reaches forward.
-    flange = base @ twin_forward(READY_RAD)
+    ready_rad = arm.mechanics.start_rad
+    flange = base @ arm.mechanics.forward(ready_rad)
     position = flange[:3, 3] + 0.06 * flange[:3, 2]
     facing = transform(world_from_left[:3, :3], position - world_from_left[:3, :3] @ middle)
     flange_from_board = inverse(flange) @ facing
@@ -393,8 +389,8 @@ def simulate_poses(
         centre = position + random.uniform(-0.06, 0.06, 3)
         board_pose = transform(rotation, centre - rotation @ middle)
         try:
-            joints = solve_inverse_kinematics(
-                inverse(base) @ board_pose @ inverse(flange_from_board), READY_RAD
+            joints = arm.mechanics.solve_inverse_kinematics(
+                inverse(base) @ board_pose @ inverse(flange_from_board), ready_rad
             )
         except ValueError:
             continue  # The pose is out of reach: try another random one.

@@ -24,7 +24,7 @@ from scipy.optimize import least_squares
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import ArmSpec, Pose, Scene, SheetSpec
 from flexsheet.messages.types import Side
-from flexsheet.nodes.arm_bridge.kinematics import forward
+from flexsheet.nodes.arm_bridge.geometry import make_kinematics
 from flexsheet.nodes.models.rigid import (
     apply,
     rotation_from_vector,
@@ -154,6 +154,7 @@ class _ArmModel:
 
     def __init__(self, arm: ArmSpec, rows: Sequence[_Row]) -> None:
         self._rows = rows
+        self._kinematics = make_kinematics(arm.model)
         self._base, self._clamp = _matrix(arm.world_from_base), _matrix(arm.flange_from_edge)
         self.prior = np.zeros(19)
         self.prior[JOINTS] = arm.joint_offsets_rad
@@ -168,7 +169,10 @@ class _ArmModel:
         """Return the positions (n, 3) of the marks in the world."""
         base, clamp = self.transforms(unknowns)
         found = [
-            apply(base @ forward(row.joints_rad + unknowns[JOINTS]) @ clamp, row.mark_edge_m)
+            apply(
+                base @ self._kinematics.forward(row.joints_rad + unknowns[JOINTS]) @ clamp,
+                row.mark_edge_m,
+            )
             + unknowns[COMPLIANCE] * row.force_n
             for row in self._rows
         ]

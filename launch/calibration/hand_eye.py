@@ -28,7 +28,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.nodes.arm_bridge.kinematics import forward
+from flexsheet.messages.scene import RV_1A, ClosedFormArm, JointChain
+from flexsheet.nodes.arm_bridge.geometry import make_kinematics
 from flexsheet.nodes.models.camera import project
 from flexsheet.nodes.models.rigid import (
     apply,
@@ -226,13 +227,18 @@ class _LinearizedPose:
     rms_px: float
 
 
-def calibrate_base(detections: Sequence[BoardDetection], rig: LensRig) -> BaseFit:
+def calibrate_base(
+    detections: Sequence[BoardDetection],
+    rig: LensRig,
+    arm: ClosedFormArm | JointChain = RV_1A,
+) -> BaseFit:
     """Estimate the pose of the arm's base. Raises HandEyeError if the poses do not determine it.
 
     The stereo camera is assumed exact: its errors shift the base and the fingertip equally, since
     the same camera measures both.
     """
     _check_count(detections)
+    forward = make_kinematics(arm).forward
     flanges = [forward(one.joints_rad) for one in detections]
     _check_rotations(flanges)
     boards = [_fit_board_pose(one, rig) for one in detections]

@@ -85,7 +85,7 @@ def stereo(
         typer.Option(
             metavar="SOURCE",
             help="Camera for live capture, in the format of a camera node's parameter source, such "
-            "as '{kind: opencv, left: 0, right: 1}'.",
+            "as '{kind: live, left: 0, right: 1}'.",
         ),
     ] = None,
     scene_file: Annotated[

@@ -353,7 +353,7 @@ def fit_folder(
         with _progress(f"{side} arm: detecting the board") as progress:
             detections, blind = read_detections(folder, board, rig, size, progress)
         with words.status(f"{side} arm: fitting"):
-            return calibrate_base(detections, rig), blind
+            return calibrate_base(detections, rig, getattr(scene.arms, side).model), blind
     except HandEyeError as error:
         raise CommandError(f"{side} arm, {folder}: {error}") from error
 
@@ -430,13 +430,15 @@ def _true_errors(
     """Return the errors of a simulated arm's flange at the world origin, without backlash."""
     import numpy as np
 
-    from flexsheet.launch.calibration.arm_poses import READY_RAD, SimulatedArm
-    from flexsheet.nodes.arm_bridge.kinematics import forward
+    from flexsheet.launch.calibration.arm_poses import SimulatedArm
+    from flexsheet.nodes.arm_bridge.geometry import make_kinematics
     from flexsheet.nodes.models.rigid import inverse, vector_from_rotation
 
     arm = SimulatedArm(scene, side, apparatus, seed=seed)
-    true = arm.place_flange(READY_RAD, exact=True)
-    error = true @ inverse(fit.world_from_base @ forward(READY_RAD))
+    model = getattr(scene.arms, side).model
+    ready_rad = np.array(model.start_rad)
+    true = arm.place_flange(ready_rad, exact=True)
+    error = true @ inverse(fit.world_from_base @ make_kinematics(model).forward(ready_rad))
     return {
         "true_error_m": float(np.linalg.norm(error[:3, 3])),
         "true_error_rad": float(np.linalg.norm(vector_from_rotation(error[:3, :3]))),

@@ -49,7 +49,7 @@ def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
             problem = "; ".join(f"{where}: {what}" for where, what in mistakes)
         raise CommandError(
             f"--device-source {source}: {problem}; use the format of a camera node's parameter "
-            "source, such as '{kind: opencv, left: 0, right: 1}'"
+            "source, such as '{kind: live, left: 0, right: 1}'"
         ) from error
     if described.kind == "twin":
         raise CommandError(

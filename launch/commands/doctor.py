@@ -118,6 +118,14 @@ def check_scene(
         raise typer.Exit(FAILED)
 
 
+def _describe_branch(branch: dict[str, Any]) -> str:
+    """Return the names of a branch, or for arms without names the joints to which it leads."""
+    if "seed_rad" not in branch:
+        return ", ".join(branch.values())
+    degrees = (f"{math.degrees(angle):.0f}" for angle in branch["seed_rad"])
+    return f"joints near ({', '.join(degrees)}) degrees"
+
+
 def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
     arms = result["arms"]
     print_fields(
@@ -129,7 +137,7 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
                 f"{100 * result['fraction']:.1f} % of {result['samples']}, "
                 + ", ".join(f"{side} {100 * one['fraction']:.1f} %" for side, one in arms.items()),
             ),
-            *((f"{side} branch", ", ".join(one["branch"].values())) for side, one in arms.items()),
+            *((f"{side} branch", _describe_branch(one["branch"])) for side, one in arms.items()),
             (
                 "speed",
                 f"{1e3 * required_m_per_s:.0f} mm/s required; possible at all samples: "

@@ -52,12 +52,6 @@ from flexsheet.nodes.models.rigid import (
     transform,
 )
 from flexsheet.nodes.models.shapes import make_shape
-from flexsheet.nodes.twin.arms import (
-    ACCELERATION_RAD_PER_S2,
-    RANGE_RAD,
-    SPEED_RAD_PER_S,
-)
-from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
 from flexsheet.nodes.twin.finger import validate_path
 from flexsheet.nodes.twin.paths import map_to_surface
 from flexsheet.nodes.twin.truth import apply_apparatus
@@ -261,7 +255,8 @@ class FollowedContact:
         joints = np.full((len(sheets), 4, 2, 6), np.nan)
         ends = np.full((len(sheets), 4, 2, 2, 3), np.nan)
         half_m = 0.5 * self._scene.sheet.height_m
-        guesses = [START_GUESS_RAD, START_GUESS_RAD]
+        mechanics = [arm.mechanics for arm in self._arms]
+        guesses = [one.start_rad for one in mechanics]
         for number, sheet in enumerate(sheets):
             try:
                 for case, pose in enumerate(self._deviated(sheet)):
@@ -288,13 +283,15 @@ class FollowedContact:
             slopes=slopes.transpose(0, 2, 1),
             max_rate=np.concatenate(
                 [
-                    np.tile(SPEED_RAD_PER_S, 2),
+                    *(one.speed_rad_per_s for one in mechanics),
                     np.full(count, self._scene.arms.max_tool_speed_m_per_s),
                 ]
             ),
-            max_acceleration=np.concatenate([np.tile(ACCELERATION_RAD_PER_S2, 2), free]),
-            low=np.concatenate([np.tile(RANGE_RAD[:, 0], 2), -free]),
-            high=np.concatenate([np.tile(RANGE_RAD[:, 1], 2), free]),
+            max_acceleration=np.concatenate(
+                [*(one.acceleration_rad_per_s2 for one in mechanics), free]
+            ),
+            low=np.concatenate([*(one.range_rad[:, 0] for one in mechanics), -free]),
+            high=np.concatenate([*(one.range_rad[:, 1] for one in mechanics), free]),
         )
 
     def _deviated(self, sheet: RolledSheet) -> list[Floats]:

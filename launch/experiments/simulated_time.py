@@ -50,8 +50,7 @@ from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
-from flexsheet.nodes.twin.arms import Servo, forward
-from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
+from flexsheet.nodes.twin.arms import ArmMechanics, Servo
 from flexsheet.nodes.twin.finger import validate_path
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, VoluntaryPath
 from flexsheet.nodes.twin.sheet_pull import SheetPull
@@ -131,11 +130,12 @@ class SimulatedArm:
         self._geometry = ArmGeometry(scene, side)
         self._truth, self._sheet = truth, sheet
         self._goal_rad = self._commanded_rad = self._acting_rad = self._geometry.joints_for_sheet(
-            sheet, START_GUESS_RAD
+            sheet, self._geometry.start_rad
         )
         self._velocity = np.zeros(6)
         lag_s = SERVO_LAG_S if truth.servo_lag_s is None else truth.servo_lag_s
-        self._servo = Servo(self._commanded_rad.copy(), lag_s, truth.backlash_rad or 0.0)
+        mechanics = ArmMechanics(getattr(scene.arms, side).model)
+        self._servo = Servo(self._commanded_rad.copy(), lag_s, truth.backlash_rad or 0.0, mechanics)
         self._lag = ServoLagEstimator(SERVO_LAG_S, LagBounds(0.002, MAX_LAG_S))
         self._known_lag_s: float | None = None
         if lag_known:
@@ -216,7 +216,7 @@ class SimulatedSheet:
     def record(self, now_s: float) -> None:
         """Advance the servos to a time, and record the true edges of the sheet."""
         flanges = [
-            model.world_from_base @ forward(arm.advance(now_s))
+            model.world_from_base @ model.mechanics.forward(arm.advance(now_s))
             for model, arm in zip(self._models, self.arms, strict=True)
         ]
         clamps = [model.flange_from_edge for model in self._models]

@@ -15,8 +15,7 @@ from flexsheet.messages.scene import ArmSpec, Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
 from flexsheet.nodes.models.sheet import edge_force_n
-from flexsheet.nodes.twin.arms import forward, solve_inverse_kinematics
-from flexsheet.nodes.twin.arms_node import START_GUESS_RAD
+from flexsheet.nodes.twin.arms import ArmMechanics
 from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -33,19 +32,24 @@ def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Fl
 
 @dataclass(frozen=True, slots=True)
 class ArmModel:
-    """Geometry of one arm: pose of its base, and pose of the clamped edge on its flange, (4, 4)."""
+    """Geometry of one arm: its mechanics, and the poses (4, 4) of its base and its clamped edge."""
 
+    mechanics: ArmMechanics
     world_from_base: Floats
     flange_from_edge: Floats
 
     @classmethod
     def of(cls, arm: ArmSpec) -> Self:
-        return cls(pose_matrix(arm.world_from_base), pose_matrix(arm.flange_from_edge))
+        return cls(
+            ArmMechanics(arm.model),
+            pose_matrix(arm.world_from_base),
+            pose_matrix(arm.flange_from_edge),
+        )
 
     def solve_joints(self, world_from_edge: Floats, guess_rad: Floats) -> Floats:
         """Return the joint angles (6,), rad, for a pose of the edge; ValueError if out of reach."""
         flange = inverse(self.world_from_base) @ world_from_edge @ inverse(self.flange_from_edge)
-        return solve_inverse_kinematics(flange, guess_rad)
+        return self.mechanics.solve_inverse_kinematics(flange, guess_rad)
 
 
 class ArmPair:
@@ -62,7 +66,7 @@ class ArmPair:
             np.array(apparatus.arms.right.joint_offsets_rad),
         )
         self._pull = SheetPull.of(true_scene.sheet, apparatus)
-        self._guesses = [START_GUESS_RAD, START_GUESS_RAD]
+        self._guesses = [arm.mechanics.start_rad for arm in self._believed]
 
     def solve_joints(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
         """Return the commanded joint angles (6,) of both arms, rad, for poses `edges` (4, 4).
@@ -97,7 +101,8 @@ class ArmPair:
             true_rad = joints_rad + self._offsets_rad[side]
             if play_rad is not None:
                 true_rad = true_rad + play_rad[side]
-            flanges.append(self._true[side].world_from_base @ forward(true_rad))
+            true = self._true[side]
+            flanges.append(true.world_from_base @ true.mechanics.forward(true_rad))
         left, right = flanges
         clamps = [arm.flange_from_edge for arm in self._true]
         if self._pull is not None:

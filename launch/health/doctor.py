@@ -47,6 +47,7 @@ def check_all() -> Iterator[Finding]:
         check_python,
         check_libraries,
         check_opencv,
+        check_cameras,
         check_opengl,
         check_cores,
         check_disk,
@@ -123,6 +124,14 @@ def check_opencv() -> Finding:
     registry = cv2.videoio_registry
     names = dict.fromkeys(registry.getBackendName(one) for one in registry.getBackends())
     return Finding("opencv", "ok", f"{cv2.__version__}, cameras and files by {', '.join(names)}")
+
+
+def check_cameras() -> Finding:
+    """List the cameras that V4L2, Aravis and RealSense find."""
+    from flexsheet.nodes.camera.captures import list_devices
+
+    found = list_devices()
+    return Finding("cameras", "ok", "; ".join(found) or "none found by v4l2, aravis or realsense")
 
 
 def check_opengl() -> Finding:

@@ -37,7 +37,7 @@ from flexsheet.messages.security import SecurityError, derive_public_key, read_s
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import HostStatus, PortStatus
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.arm_bridge.link_drivers import Driver
+from flexsheet.nodes.arm_bridge.link_drivers import TCP_DRIVERS
 
 State = Literal["ok", "warning", "failed", "not asked"]
 RATE_TOLERANCE_RATIO = 0.1
@@ -45,9 +45,6 @@ RATE_TOLERANCE_RATIO = 0.1
 
 MIN_FREE_MEMORY_BYTES = 256 << 20
 CONTROLLER_S = 2.0
-TCP_DRIVERS: frozenset[Driver] = frozenset({"modbus"})
-"""Drivers of arms whose controllers accept TCP connections."""
-
 MAX_NAMES_SHOWN = 3
 
 

@@ -453,6 +453,7 @@ def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, flo
         "shoulder singularity": (("shoulder singularity",), "m"),
         "elbow singularity": (("elbow singularity",), "rad"),
         "wrist singularity": (("wrist singularity",), "rad"),
+        "singularity": (("singularity",), "ratio"),
         "workspace": (("workspace",), "m"),
         "flange distance": (("flange distance",), "m"),
         "edge force": (("edge force",), "N"),

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
+from flexsheet.launch.objects.arm_models import load_arm_models
 from flexsheet.launch.objects.textures import load_image
 from flexsheet.launch.plans.documents import BadInputError, Document, Key, did_you_mean, validate
 from flexsheet.messages.limits import LimitedModel
@@ -81,6 +82,7 @@ def make_scene(document: Document) -> Scene:
             raise BadInputError([problem]) from error
         document.values["object"]["geometry"] = dict(mesh)
     load_image(document)
+    load_arm_models(document)
     return validate(Scene, document)
 
 

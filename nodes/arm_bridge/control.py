@@ -24,7 +24,7 @@ from flexsheet.nodes.arm_bridge.goal import (
     compute_sync_factor,
     scale_speeds,
 )
-from flexsheet.nodes.arm_bridge.kinematics import JOINT_MAX_RAD, JOINT_MIN_RAD, UnreachableError
+from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
 from flexsheet.nodes.arm_bridge.limiter import (
     SheetLimits,
     bound_step,
@@ -48,7 +48,6 @@ from flexsheet.nodes.arm_bridge.path_check import (
 from flexsheet.nodes.arm_bridge.standstill import (
     MAX_RESTART_SHIFT_M,
     StandstillMonitor,
-    bound_edge_shift_m,
 )
 from flexsheet.nodes.arm_bridge.state_machine import (
     CHECKING_STATES,
@@ -588,9 +587,9 @@ class ArmControl:
 
         The other arm's bridge checks the same path.  No arm moves before both checks have passed.
         """
-        if not self._stands_still(measured):
+        if not self._stands_still(measured, geometry):
             return self._decelerate("waits for the arm to stand still", geometry, step_s)
-        if (refusal := self._restart_refusal(measured)) is not None:
+        if (refusal := self._restart_refusal(measured, geometry)) is not None:
             return self._decelerate(refusal, geometry, step_s)
         sheet = geometry.sheet_between(
             geometry.world_from_edge(measured),
@@ -599,7 +598,7 @@ class ArmControl:
         if self._clear_path is not None:
             request, alignment = self._clear_path
             if request.leads_to(goal.motion) and request.begins_at(measured, other.joints_rad):
-                self._restart_at(measured)
+                self._restart_at(measured, geometry)
                 return self._start_motion(sheet, alignment, geometry, other, step_s)
         reason = "checks the path to the target"
         if self._blocked is not None:
@@ -745,10 +744,10 @@ class ArmControl:
         if between.stretch_ratio > IMPLAUSIBLE_LENGTH_RATIO * limits.max_length_m / limits.width_m:
             text = f"{reason}; the measured length is not possible"
             return self._decelerate(text, geometry, step_s)
-        if starts and not self._stands_still(measured):
+        if starts and not self._stands_still(measured, geometry):
             return self._decelerate(reason, geometry, step_s)
         refusal = (
-            self._restart_refusal(measured)
+            self._restart_refusal(measured, geometry)
             if starts
             else check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
         )
@@ -757,7 +756,7 @@ class ArmControl:
             self.handle(Event.RELAX_ENDED)
             return self._decelerate(f"{reason}; {refusal}", geometry, step_s)
         if starts or self._sheet is None or self._relax_from is None:
-            self._restart_at(measured)
+            self._restart_at(measured, geometry)
             self._sheet, self._relax_from = between, between.stretch_ratio
         # Half of a change of stretch falls to each arm.  The other arm rests, so this arm commands
         # twice the change: from a stretch ratio s to 2 - s instead of to 1.
@@ -859,25 +858,25 @@ class ArmControl:
         self._standstill.on_command(bounded, velocity, step_s)
         return Command(mode, bounded)
 
-    def _is_at_command(self, measured: Floats) -> bool:
+    def _is_at_command(self, measured: Floats, geometry: ArmGeometry) -> bool:
         """Return whether measured joints are so near the last command that it may restart there."""
-        return bound_edge_shift_m(self.commanded_rad, measured) <= MAX_RESTART_SHIFT_M
+        shift_m = geometry.bound_edge_shift_m(self.commanded_rad, measured)
+        return shift_m <= MAX_RESTART_SHIFT_M
 
-    def _stands_still(self, measured: Floats) -> bool:
-        return self._standstill.is_standing(at_command=self._is_at_command(measured))
+    def _stands_still(self, measured: Floats, geometry: ArmGeometry) -> bool:
+        return self._standstill.is_standing(at_command=self._is_at_command(measured, geometry))
 
-    def _restart_refusal(self, measured: Floats) -> str | None:
+    def _restart_refusal(self, measured: Floats, geometry: ArmGeometry) -> str | None:
         """Return why a motion must not restart from the measured joints, or None.
 
         The arm must be at rest.  At its last commanded position it may restart.  At another one,
         either the arm has not followed, or the measurement is wrong and would make the arm jump.
         """
-        beyond = max(
-            float((JOINT_MIN_RAD - measured).max()), float((measured - JOINT_MAX_RAD).max())
-        )
+        lowest, highest = geometry.range_rad
+        beyond = max(float((lowest - measured).max()), float((measured - highest).max()))
         if beyond > MAX_BEYOND_RANGE_RAD:
             return f"measured joints are {np.degrees(beyond):.1f} degrees beyond their range"
-        if self._is_at_command(measured):
+        if self._is_at_command(measured, geometry):
             return None
         monitor = self._standstill
         if monitor.is_alive and not monitor.has_jumped:
@@ -889,12 +888,15 @@ class ArmControl:
             f"{defect}: check the arm, then restart its bridge"
         )
 
-    def _restart_at(self, measured: Floats) -> None:
+    def _restart_at(self, measured: Floats, geometry: ArmGeometry) -> None:
         """Replace the last commanded joints by the measured ones.
 
         Latch a fault instead if the arm does not stand still.
         """
-        if not self._stands_still(measured) or self._restart_refusal(measured) is not None:
+        if (
+            not self._stands_still(measured, geometry)
+            or self._restart_refusal(measured, geometry) is not None
+        ):
             self.faults = self.faults or ("commanded: a start before the arm stands still",)
             self._inhibit(self.faults[0], Event.FAULT)
             return

@@ -8,15 +8,11 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import ArmModel, ClosedFormArm, JointChain, Scene
 from flexsheet.messages.types import Side
-from flexsheet.nodes.arm_bridge.kinematics import (
-    JOINT_MAX_RAD,
-    JOINT_MIN_RAD,
-    JOINT_SPEED_RAD_PER_S,
-    forward,
-    solve_next_joints,
-)
+from flexsheet.nodes.arm_bridge.closed_form import ClosedFormKinematics
+from flexsheet.nodes.arm_bridge.joint_chain import NumericKinematics, SerialChain
+from flexsheet.nodes.arm_bridge.kinematics import ArmKinematics
 from flexsheet.nodes.arm_bridge.limiter import TOOL_SPEED_FRACTION, JointLimits, SheetLimits
 from flexsheet.nodes.models.motion import EdgeBound, SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
@@ -30,12 +26,13 @@ EDGE_SPEED_FRACTION = 0.95
 """Fraction of the limiter's tool speed that the sheet's motion may use."""
 
 
-@lru_cache(maxsize=16)
-def _base_from_flange(joints_rad: tuple[float, ...]) -> Floats:
-    """Return the flange pose at joints (6,) rad; it is cached and read-only."""
-    pose = forward(joints_rad)
-    pose.flags.writeable = False
-    return pose
+def make_kinematics(model: ClosedFormArm | JointChain) -> ArmKinematics:
+    """Make the kinematics of an arm by its model."""
+    return (
+        ClosedFormKinematics(model)
+        if isinstance(model, ClosedFormArm)
+        else NumericKinematics(model)
+    )
 
 
 class ArmGeometry:
@@ -47,6 +44,9 @@ class ArmGeometry:
         arm, other = scene.arms.left, scene.arms.right
         if not self.left:
             arm, other = other, arm
+        self.model: ArmModel = arm.model
+        self.kinematics = make_kinematics(arm.model)
+        self._cached_flange = lru_cache(maxsize=16)(self._solve_flange)
         self.world_from_base = pose_matrix(arm.world_from_base)
         self.base_from_world = inverse(self.world_from_base)
         self.flange_from_edge = pose_matrix(arm.flange_from_edge)
@@ -63,11 +63,17 @@ class ArmGeometry:
             np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]]),
         )
         self._tool_points = np.vstack([self.edge_points_flange, np.zeros(3)])
+        chain = arm.model.chain() if isinstance(arm.model, ClosedFormArm) else arm.model
+        edge_end_m = float(np.linalg.norm(self.edge_points_flange, axis=1).max())
+        self._levers_m = SerialChain(chain).levers_m(edge_end_m)
+        self.start_rad = np.array(arm.model.start_rad)
+        self.range_rad = np.array([arm.model.min_rad, arm.model.max_rad])
+        speeds = np.array(arm.model.speed_rad_per_s)
         self.joint_limits = JointLimits(
-            JOINT_MIN_RAD + RANGE_MARGIN_RAD,
-            JOINT_MAX_RAD - RANGE_MARGIN_RAD,
-            0.95 * JOINT_SPEED_RAD_PER_S,
-            6.0 * JOINT_SPEED_RAD_PER_S,
+            self.range_rad[0] + RANGE_MARGIN_RAD,
+            self.range_rad[1] - RANGE_MARGIN_RAD,
+            0.95 * speeds,
+            6.0 * speeds,
         )
         self.sheet_limits = SheetLimits(
             width_m=sheet.width_m,
@@ -84,7 +90,17 @@ class ArmGeometry:
         )
 
     def _base_from_flange(self, joints_rad: Floats) -> Floats:
-        return _base_from_flange(tuple((joints_rad + self._joint_offsets_rad).tolist()))
+        return self._cached_flange(tuple((joints_rad + self._joint_offsets_rad).tolist()))
+
+    def _solve_flange(self, joints_rad: tuple[float, ...]) -> Floats:
+        """Return the read-only flange pose (4, 4) at true joint angles (6,) rad."""
+        pose = self.kinematics.forward(np.array(joints_rad))
+        pose.flags.writeable = False
+        return pose
+
+    def bound_edge_shift_m(self, joints_rad: Floats, other_rad: Floats) -> float:
+        """Return an upper bound of the edge's displacement (m) between two sets of joints (6,)."""
+        return float(self._levers_m @ np.abs(joints_rad - other_rad))
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
         """Return the world pose (4, 4) of the flange, without the compliance of the arm.
@@ -127,8 +143,8 @@ class ArmGeometry:
         """
         offsets_rad = self._joint_offsets_rad
         base_from_flange = self.base_from_world @ world_from_flange
-        joints_rad = solve_next_joints(base_from_flange, near_rad + offsets_rad) - offsets_rad
-        return np.asarray(joints_rad)
+        joints_rad = self.kinematics.solve_next_joints(base_from_flange, near_rad + offsets_rad)
+        return np.asarray(joints_rad - offsets_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
         """Return the sheet at rest between this arm's edge and the other one.

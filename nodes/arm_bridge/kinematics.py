@@ -1,106 +1,28 @@
-"""Compute the forward and inverse kinematics of the Mitsubishi RV-1A arm.
+"""Define the interface of an arm's kinematics, which bridge, limiter and checks of the reach use.
 
-Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.  A branch is one of up to eight
-joint solutions of a pose.
-
-The chain follows two independent public models (Adolphus `mitsubishirv1a.yaml`, ICube
-`mrv1a.urdf`).  At zero the arm is upright, and every frame is parallel to the base.  J1, J4, J6
-rotate about z; J2, J3, J5 about y.  Shoulder height 300 mm, upper arm 250 mm, elbow shift 90 mm
-backwards, forearm 160 mm, flange 72 mm beyond the wrist centre.
+Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.  `closed_form` and `joint_chain`
+implement the interface, and `geometry.make_kinematics` selects one by the arm's model.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import acos, atan2, copysign, cos, degrees, hypot, inf, pi, remainder, sin
-from typing import Literal, NamedTuple, get_args
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.scene import ArmModel
 
 Floats = NDArray[np.float64]
-
-SHOULDER_HEIGHT_M = 0.3
-UPPER_ARM_M = 0.25
-ELBOW_SHIFT_M = 0.09
-FOREARM_M = 0.16
-FLANGE_M = 0.072
-
-JOINT_MIN_RAD = np.radians([-150.0, -60.0, 60.0, -160.0, -90.0, -200.0])
-JOINT_MAX_RAD = np.radians([150.0, 120.0, 155.0, 160.0, 90.0, 200.0])
-JOINT_SPEED_RAD_PER_S = np.radians([180.0, 90.0, 135.0, 180.0, 180.0, 210.0])
-
-WRIST_SINGULAR = 1e-7
-"""|sin J5| below which the axes of J4 and J6 count as coincident; J4 then stays constant."""
-
-SHOULDER_SINGULAR_M = 1e-7
-"""Distance of the wrist centre from the axis of J1 below which J1 stays constant."""
-
-WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
-"""|J5| up to which `solve_next_joints` keeps J4 constant, and from which it solves J4 exactly."""
-
-SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
-"""Distance of the wrist centre from J1's axis up to which `solve_next_joints` keeps J1 constant,
-and from which it solves J1 exactly."""
-
-MAX_FIXED_ERROR_RATIO = 1.4
-"""Maximum error between both bounds, as a multiple of the first bound: 1.05 degrees or 1 mm."""
-
-MAX_FREE_ROTATION_RAD = 0.01
-"""Maximum rotation of J4 or J1 in one step to reduce the error near a singularity.  At 140 steps
-per second it is half the maximum speed of these joints."""
-
-_ELBOW_TO_WRIST_M = hypot(ELBOW_SHIFT_M, FOREARM_M)
-ELBOW_ANGLE_RAD = atan2(ELBOW_SHIFT_M, FOREARM_M)
-"""J3 with shoulder, elbow and wrist centre in line: 29.4 degrees, 30 degrees out of its range."""
-
-_LOWEST = tuple(float(angle) for angle in JOINT_MIN_RAD)
-_HIGHEST = tuple(float(angle) for angle in JOINT_MAX_RAD)
-
-MAX_WRIST_M = float(
-    np.sqrt(
-        UPPER_ARM_M**2
-        + _ELBOW_TO_WRIST_M**2
-        + 2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M * np.cos(_LOWEST[2] - ELBOW_ANGLE_RAD)
-    )
-)
-"""Maximum distance of the wrist centre from the shoulder (0.4185 m), with J3 at its minimum."""
-
-
-Shoulder = Literal["front", "back"]
-Elbow = Literal["up", "down"]
-Wrist = Literal["plain", "flipped"]
-
-
-class Branch(NamedTuple):
-    """One of the eight joint solutions for a flange pose.
-
-    shoulder: whether the wrist centre is in front of the plane through the axes of J1 and J2, or
-        behind it.
-    elbow: "up" if J3 is above `ELBOW_ANGLE_RAD`, as in its whole range, otherwise "down".
-    wrist: "flipped" if J5 is negative.
-    """
-
-    shoulder: Shoulder
-    elbow: Elbow
-    wrist: Wrist
-
-
-BRANCHES = tuple(
-    Branch(shoulder, elbow, wrist)
-    for shoulder in get_args(Shoulder)
-    for elbow in get_args(Elbow)
-    for wrist in get_args(Wrist)
-)
-"""All branches, in the order in which `branches` returns their joints."""
 
 
 class UnreachableError(FlexsheetError, ValueError):
     """A flange pose for which no joint solution is within the joint ranges.
 
-    limit: "reach", or the joint ("J1" to "J6") that is out of range in the nearest solution.
+    limit: "reach", "singularity", or the joint ("J1" to "J6") that is out of range in the nearest
+        solution.
     """
 
     code = "unreachable"
@@ -111,324 +33,60 @@ class UnreachableError(FlexsheetError, ValueError):
         self.limit = limit
 
 
-def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
-    """Return the rotation (3, 3) of the forearm: about z by J1, then about y by J2 + J3."""
-    c1, s1, c23, s23 = cos(joint_1), sin(joint_1), cos(joints_23), sin(joints_23)
-    return np.array([[c1 * c23, -s1, c1 * s23], [s1 * c23, c1, s1 * s23], [-s23, 0.0, c23]])
+class ArmKinematics(Protocol):
+    """Kinematics of one arm.  A branch is one of the discrete joint solutions of a pose."""
+
+    @property
+    def model(self) -> ArmModel:
+        """Return the dimensions and limits of the arm."""
+        ...
+
+    def forward(self, joints_rad: Floats) -> Floats:
+        """Return the flange's pose base_from_flange (4, 4) at joints (6,) rad."""
+        ...
+
+    def jacobian(self, joints_rad: Floats) -> Floats:
+        """Return d(velocity, angular velocity of the flange) / d(joint speeds), base frame.
+
+        joints_rad: (n, 6); the result is (n, 6, 6).
+        """
+        ...
+
+    def solve_next_joints(self, base_from_flange: Floats, present_rad: Floats) -> Floats:
+        """Return joints (6,) rad near the present ones, within their ranges.
+
+        The work is bounded, since a bridge calls this in each cycle.  Raises UnreachableError.
+        """
+        ...
+
+    def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
+        """Return the joints (6,) rad on all branches, in or out of the joint ranges."""
+        ...
+
+    def find_branch(self, joints_rad: Floats) -> Any:
+        """Return the branch of joints (6,) rad, a named tuple."""
+        ...
+
+    def list_branches(self, base_from_flange: Floats) -> Sequence[Any]:
+        """Return the branches on which the arm may reach poses (n, 4, 4)."""
+        ...
+
+    def solve_joints_on_branch(
+        self, base_from_flange: Floats, branch: Any, near_rad: Floats
+    ) -> Floats:
+        """Return joints (n, 6) rad for poses (n, 4, 4) on one branch; NaN where out of reach."""
+        ...
+
+    def reach_margins_m(self, base_from_flange: Floats) -> Floats:
+        """Return how far (n,) poses (n, 4, 4) are within the arm's largest distance."""
+        ...
+
+    def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
+        """Return by limit the distances (n,) of joints (n, 6) from being too near a singularity."""
+        ...
 
 
-def forward(joints_rad: ArrayLike) -> Floats:
-    """Return the flange's pose base_from_flange (4, 4) at joints (6,) rad."""
-    q1, q2, q3, q4, q5, q6 = np.asarray(joints_rad, dtype=np.float64).tolist()
-    s2, c2, s23, c23 = sin(q2), cos(q2), sin(q2 + q3), cos(q2 + q3)
-    out = UPPER_ARM_M * s2 - ELBOW_SHIFT_M * c23 + FOREARM_M * s23
-    up = SHOULDER_HEIGHT_M + UPPER_ARM_M * c2 + ELBOW_SHIFT_M * s23 + FOREARM_M * c23
-    s1, c1, s4, c4 = sin(q1), cos(q1), sin(q4), cos(q4)
-    s5, c5, s6, c6 = sin(q5), cos(q5), sin(q6), cos(q6)
-    rows = []
-    # The flange's axes in the forearm's frame, rotated about y by J2 + J3, then about z by J1.
-    for x, y, z in (
-        (c4 * c5 * c6 - s4 * s6, s4 * c5 * c6 + c4 * s6, -s5 * c6),
-        (-c4 * c5 * s6 - s4 * c6, -s4 * c5 * s6 + c4 * c6, s5 * s6),
-        (c4 * s5, s4 * s5, c5),
-    ):
-        ahead = c23 * x + s23 * z
-        rows.append((c1 * ahead - s1 * y, s1 * ahead + c1 * y, c23 * z - s23 * x, 0.0))
-    x, y, z, _ = rows[2]
-    rows.append((out * c1 + FLANGE_M * x, out * s1 + FLANGE_M * y, up + FLANGE_M * z, 1.0))
-    return np.array(rows).T
+class SeedBranch(NamedTuple):
+    """Branch of an arm without closed form: the solutions that continue from some joints."""
 
-
-def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
-    """Return every joint solution of a flange pose, up to 8, in or out of the joint ranges.
-
-    The order is that of `BRANCHES`.  A joint that is undefined at a singularity keeps its value in
-    `present_rad` (6,).  Other angles are less than a revolution from zero.  The list is empty if
-    the wrist centre is too far from the shoulder or too near to it.
-    """
-    present = np.asarray(present_rad, dtype=np.float64).tolist()
-    rotation = base_from_flange[:3, :3]
-    x, y, z = (base_from_flange[:3, 3] - FLANGE_M * rotation[:, 2]).tolist()
-    radius, height = hypot(x, y), z - SHOULDER_HEIGHT_M
-    bend = _bend(radius, height)
-    if bend is None:
-        return []
-    azimuth = atan2(y, x) if radius > SHOULDER_SINGULAR_M else present[0]
-    found: list[tuple[float, ...]] = []
-    for q1, out in ((azimuth, radius), (azimuth - pi if azimuth > 0 else azimuth + pi, -radius)):
-        for q3 in (ELBOW_ANGLE_RAD + bend, ELBOW_ANGLE_RAD - bend):
-            q2 = _solve_shoulder(out, height, q3)
-            wrist = (_arm_rotation(q1, q2 + q3).T @ rotation).tolist()
-            sine = hypot(wrist[0][2], wrist[1][2])
-            q5 = atan2(sine, wrist[2][2])
-            if sine > WRIST_SINGULAR:
-                q4 = atan2(wrist[1][2], wrist[0][2])
-                q6 = atan2(wrist[2][1], -wrist[2][0])
-            elif wrist[2][2] > 0:
-                q4 = present[3]
-                q6 = _wrap(atan2(wrist[1][0], wrist[0][0]) - q4)
-            else:
-                q4 = present[3]
-                q6 = _wrap(q4 - atan2(-wrist[1][0], -wrist[0][0]))
-            found.append((q1, q2, q3, q4, q5, q6))
-            found.append((q1, q2, q3, _wrap(q4 + pi), -q5, _wrap(q6 + pi)))
-    return found
-
-
-def inverse_kinematics(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-    """Return joints (6,) within the ranges for a flange pose, nearest to the present joints.
-
-    The nearest solution is the one whose largest joint change is the smallest.  Since J6 has a
-    range of 400 degrees, one revolution more and less is also tried.  Raises UnreachableError if no
-    branch is within the ranges.
-    """
-    present = np.asarray(present_rad, dtype=np.float64).tolist()
-    nearest, least = None, inf
-    solutions = branches(base_from_flange, present)
-    for solution in solutions:
-        joints = [
-            _nearest_revolution(angle, near, low, high)
-            for angle, near, low, high in zip(solution, present, _LOWEST, _HIGHEST, strict=True)
-        ]
-        change = max(abs(angle - near) for angle, near in zip(joints, present, strict=True))
-        if change < least:
-            nearest, least = joints, change
-    if nearest is None or least == inf:
-        raise _unreachable(base_from_flange, solutions)
-    return np.array(nearest)
-
-
-def solve_next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-    """Return joints (6,) rad for the next step of a motion, on the present branch without jumps.
-
-    The result is exact except near two singularities.  Near J5 = 0, the exact J4 is the direction
-    of a vector of length sin(J5).  It rotates arbitrarily fast when the vector passes close to
-    zero, so J4 may lag there.  J5 then follows the component of the vector along J4, which may be
-    negative.  The other component is ignored.  This causes an orientation error of the flange of at
-    most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
-
-    J1 is treated in the same way when the wrist centre is near its axis.  A path that passes a
-    singularity closely (WRIST_FIXED_RAD, SHOULDER_FIXED_M) therefore hardly moves J4 or J1.
-    Further away they rotate as in the exact solution, and the caller bounds their speeds.
-
-    If the solution is out of a joint's range, `inverse_kinematics` selects another branch.  It
-    raises UnreachableError if there is none.
-    """
-    present = np.asarray(present_rad, dtype=np.float64).tolist()
-    rotation = base_from_flange[:3, :3]
-    x, y, z = (base_from_flange[:3, 3] - FLANGE_M * rotation[:, 2]).tolist()
-    q1 = present[0] + _limited_rotation(
-        x * cos(present[0]) + y * sin(present[0]),
-        y * cos(present[0]) - x * sin(present[0]),
-        fixed=SHOULDER_FIXED_M,
-        near=SHOULDER_NEAR_M,
-    )
-    out, height = x * cos(q1) + y * sin(q1), z - SHOULDER_HEIGHT_M
-    bend = _bend(out, height)
-    if bend is None:
-        raise _unreachable(base_from_flange, [])
-    q3 = ELBOW_ANGLE_RAD + copysign(bend, present[2] - ELBOW_ANGLE_RAD)
-    q2 = _solve_shoulder(out, height, q3)
-    wrist = (_arm_rotation(q1, q2 + q3).T @ rotation).tolist()
-    c4, s4 = cos(present[3]), sin(present[3])
-    q4 = present[3] + _limited_rotation(
-        c4 * wrist[0][2] + s4 * wrist[1][2],
-        c4 * wrist[1][2] - s4 * wrist[0][2],
-        fixed=WRIST_FIXED_RAD,
-        near=WRIST_NEAR_RAD,
-    )
-    c4, s4 = cos(q4), sin(q4)
-    q5 = atan2(c4 * wrist[0][2] + s4 * wrist[1][2], wrist[2][2])
-    q6 = _solve_last_joint(wrist, q4, q5)
-    joints = [
-        near + remainder(angle - near, 2.0 * pi)
-        for angle, near in zip((q1, q2, q3, q4, q5, q6), present, strict=True)
-    ]
-    if all(low <= q <= high for q, low, high in zip(joints, _LOWEST, _HIGHEST, strict=True)):
-        return np.array(joints)
-    return inverse_kinematics(base_from_flange, present)
-
-
-def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
-    """Return the rotation (rad) of an axis towards a vector, or towards its opposite if nearer.
-
-    along, across: components of the vector along the axis, and 90 degrees further.
-    fixed, near: lengths of the vector up to which there is no rotation, and from which it is full.
-
-    In between, the axis may deviate from the vector by an angle that falls from 90 degrees to zero.
-    A deviation within this tolerance is reduced by at most MAX_FREE_ROTATION_RAD per step.
-    """
-    length = hypot(along, across)
-    if length == 0.0:
-        return 0.0
-    turn = atan2(across, along) if along >= 0.0 else atan2(-across, -along)
-    if length >= near:
-        return turn
-    slack = 0.5 * pi * min(1.0, fixed / length) * min(1.0, (near - length) / (near - fixed))
-    full_angle = abs(turn)
-    free = min(MAX_FREE_ROTATION_RAD * min(1.0, length / fixed), full_angle, slack)
-    return copysign(max(full_angle - slack, 0.0) + free, turn)
-
-
-def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
-    """Return J6 (rad) such that the rotation by J4, J5 and J6 is nearest to `wrist` (3, 3)."""
-    s4, c4, s5, c5 = sin(q4), cos(q4), sin(q5), cos(q5)
-    first = (c4 * c5, s4 * c5, -s5)
-    second = (-s4, c4, 0.0)
-    xx, xy = (sum(row[k] * first[i] for i, row in enumerate(wrist)) for k in (0, 1))
-    yx, yy = (sum(row[k] * second[i] for i, row in enumerate(wrist)) for k in (0, 1))
-    return atan2(yx - xy, xx + yy)
-
-
-def _bend(out: float, height: float) -> float | None:
-    """Return the angle (0..pi) between upper arm and elbow-wrist line, or None if out of reach.
-
-    out, height: position of the wrist centre in the arm's plane, relative to the shoulder, m.
-    """
-    cosine = (out * out + height * height - UPPER_ARM_M**2 - _ELBOW_TO_WRIST_M**2) / (
-        2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M
-    )
-    if not abs(cosine) <= 1.0 + 1e-12:
-        return None
-    return acos(min(1.0, max(-1.0, cosine)))
-
-
-def _solve_shoulder(out: float, height: float, q3: float) -> float:
-    """Return J2 (rad) at which the wrist centre is at a point of the arm's plane, as in `_bend`."""
-    along = FOREARM_M * sin(q3) - ELBOW_SHIFT_M * cos(q3)
-    up = UPPER_ARM_M + ELBOW_SHIFT_M * sin(q3) + FOREARM_M * cos(q3)
-    return _wrap(atan2(out, height) - atan2(along, up))
-
-
-def _unreachable(base_from_flange: Floats, solutions: list[tuple[float, ...]]) -> UnreachableError:
-    """Make the error for a pose whose `solutions` are all out of the joint ranges."""
-    # Adding zero removes the sign of a negative zero.
-    x, y, z = np.round(base_from_flange[:3, 3] * 1e3) + 0.0
-    where = f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base"
-    if not solutions:
-        wrist = base_from_flange[:3, 3] - FLANGE_M * base_from_flange[:3, 2]
-        away = float(np.linalg.norm(wrist - [0.0, 0.0, SHOULDER_HEIGHT_M]))
-        return UnreachableError(
-            f"{where}: out of the arm's reach, the wrist would be {1e3 * away:.0f} mm from the "
-            f"shoulder, at most {1e3 * MAX_WRIST_M:.1f} mm",
-            "reach",
-        )
-    _, joint, angle = min(max(_beyond(solution)) for solution in solutions)
-    return UnreachableError(
-        f"{where}: no branch is within the joint ranges; the nearest has J{joint + 1} at "
-        f"{degrees(angle):.1f} degrees, its range is {degrees(_LOWEST[joint]):.0f} to "
-        f"{degrees(_HIGHEST[joint]):.0f}",
-        f"J{joint + 1}",
-    )
-
-
-def _beyond(solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
-    """Return for each joint how far (rad) it is out of range, its index and its angle."""
-    found = []
-    for joint, (angle, low, high) in enumerate(zip(solution, _LOWEST, _HIGHEST, strict=True)):
-        middle = 0.5 * (low + high)
-        rotated = middle + remainder(angle - middle, 2.0 * pi)
-        found.append((max(low - rotated, rotated - high), joint, rotated))
-    return found
-
-
-def _wrap(angle: float) -> float:
-    """Return the equivalent angle from -pi to pi."""
-    return atan2(sin(angle), cos(angle))
-
-
-def _nearest_revolution(angle: float, near: float, low: float, high: float) -> float:
-    """Return the angle plus revolutions, in [low, high] and nearest to `near`; infinite if none."""
-    best = inf
-    for rotated in (angle, angle - 2.0 * pi, angle + 2.0 * pi):
-        if low <= rotated <= high and abs(rotated - near) < abs(best - near):
-            best = rotated
-    return best
-
-
-def find_branch(joints_rad: ArrayLike) -> Branch:
-    """Return the branch of joints (6,) rad; at a singularity, the first one that applies."""
-    joints = np.asarray(joints_rad, dtype=np.float64)
-    return Branch(
-        "front" if _out(joints) >= 0.0 else "back",
-        "up" if sin(joints[2] - ELBOW_ANGLE_RAD) >= 0.0 else "down",
-        "plain" if sin(joints[4]) >= 0.0 else "flipped",
-    )
-
-
-def solve_joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLike) -> Floats:
-    """Return joints (n, 6) rad for flange poses (n, 4, 4) on one branch, in or out of range.
-
-    Joints are NaN where the wrist centre is out of reach.  Of the equivalent angles of J4 and J6,
-    one within the range is preferred, then the nearest to `near_rad` (6,).
-    At a singularity the undefined joint is 0.
-    """
-    poses = np.asarray(base_from_flange, dtype=np.float64)
-    wrist = poses[:, :3, 3] - FLANGE_M * poses[:, :3, 2]
-    radius, height = np.hypot(wrist[:, 0], wrist[:, 1]), wrist[:, 2] - SHOULDER_HEIGHT_M
-    q1, out = np.arctan2(wrist[:, 1], wrist[:, 0]), radius
-    if branch.shoulder == "back":
-        q1, out = q1 + pi, -radius
-    cosine = (radius**2 + height**2 - UPPER_ARM_M**2 - _ELBOW_TO_WRIST_M**2) / (
-        2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M
-    )
-    inside = np.abs(cosine) <= 1.0 + 1e-12
-    bend = np.arccos(np.where(inside, np.clip(cosine, -1.0, 1.0), np.nan))
-    q3 = ELBOW_ANGLE_RAD + (bend if branch.elbow == "up" else -bend)
-    along = FOREARM_M * np.sin(q3) - ELBOW_SHIFT_M * np.cos(q3)
-    up = UPPER_ARM_M + ELBOW_SHIFT_M * np.sin(q3) + FOREARM_M * np.cos(q3)
-    q2 = np.arctan2(out, height) - np.arctan2(along, up)
-    c1, s1, c23, s23 = np.cos(q1), np.sin(q1), np.cos(q2 + q3), np.sin(q2 + q3)
-    ahead = np.stack([c1 * c23, s1 * c23, -s23], axis=1)
-    aside = np.stack([-s1, c1, np.zeros_like(c1)], axis=1)
-    onward = np.stack([c1 * s23, s1 * s23, c23], axis=1)
-    u, v, w = (np.einsum("ni,nij->nj", axis, poses[:, :3, :3]) for axis in (ahead, aside, onward))
-    flip = 1.0 if branch.wrist == "plain" else -1.0
-    q4 = np.arctan2(flip * v[:, 2], flip * u[:, 2])
-    q5 = np.arctan2(flip * np.hypot(u[:, 2], v[:, 2]), w[:, 2])
-    c4, s4 = np.cos(q4), np.sin(q4)
-    q6 = np.arctan2(c4 * v[:, 0] - s4 * u[:, 0], c4 * v[:, 1] - s4 * u[:, 1])
-    near = np.asarray(near_rad, dtype=np.float64)
-    joints = np.stack([q1, q2, q3, q4, q5, q6], axis=1)
-    joints = near + np.remainder(joints - near + pi, 2.0 * pi) - pi
-    for joint in (3, 5):
-        angle = joints[:, joint]
-        for rotated in (angle - 2.0 * pi, angle + 2.0 * pi):
-            better = (rotated >= _LOWEST[joint]) & (rotated <= _HIGHEST[joint])
-            better &= (angle < _LOWEST[joint]) | (angle > _HIGHEST[joint])
-            joints[:, joint] = np.where(better, rotated, joints[:, joint])
-    return joints
-
-
-@dataclass(frozen=True, slots=True)
-class Singularities:
-    """Distances of joints (..., 6) from the arm's three singularities.
-
-    shoulder_m: distance of the wrist centre from the axis of J1.
-    elbow_rad: difference of J3 from the nearest angle with shoulder, elbow and wrist in line.
-    wrist_rad: absolute value of J5.
-    """
-
-    shoulder_m: Floats
-    elbow_rad: Floats
-    wrist_rad: Floats
-
-
-def singularities(joints_rad: ArrayLike) -> Singularities:
-    """Return the distances (...) of joints (..., 6) from the arm's singularities."""
-    joints = np.asarray(joints_rad, dtype=np.float64)
-    elbow = np.remainder(joints[..., 2] - ELBOW_ANGLE_RAD + 0.5 * pi, pi) - 0.5 * pi
-    wrist = np.remainder(joints[..., 4] + 0.5 * pi, pi) - 0.5 * pi
-    return Singularities(np.abs(_out(joints)), np.abs(elbow), np.abs(wrist))
-
-
-def _out(joints: Floats) -> Floats:
-    """Return how far (m) the wrist centre is in front of the axis of J1; negative behind it."""
-    q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
-    return np.asarray(
-        UPPER_ARM_M * np.sin(q2) - ELBOW_SHIFT_M * np.cos(q23) + FOREARM_M * np.sin(q23)
-    )
-
-
-CENTRE_RAD = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
-"""Joints of an arm that reaches forward, far from all singularities and range limits."""
+    seed_rad: tuple[float, ...]

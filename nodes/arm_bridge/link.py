@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import math
-from dataclasses import dataclass, field
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum, auto
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,9 +86,9 @@ class Freshness(StrEnum):
     FRESH = "fresh"
     """The counters have advanced, so the joints are measured again."""
     REPEATED = "repeated"
-    """The counters equal those of the previous answer, for at most MAX_UNCHANGED_S so far."""
+    """The counters equal those of the previous answer, for a short time so far."""
     STALLED = "stalled"
-    """The counters have not advanced for longer than MAX_UNCHANGED_S."""
+    """The counters have not advanced for too long (`max_unchanged_s`)."""
     REVERSED = "reversed"
     """A counter runs backwards, so the joints are older than the previous ones."""
 
@@ -100,7 +101,8 @@ class Freshness(StrEnum):
 class CounterMonitor:
     """Monitor of a controller's 32-bit counters, which detects measurements that are not new."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_unchanged_s: float = MAX_UNCHANGED_S) -> None:
+        self._max_unchanged_s = max_unchanged_s
         self._last: tuple[int, ...] = ()
         self._advanced_ns: list[int] = []
 
@@ -127,7 +129,7 @@ class CounterMonitor:
             if step > 0:
                 self._advanced_ns[number] = received_ns
         # The time between two answers is at least that from receiving one to requesting the next.
-        if (sent_ns - min(self._advanced_ns)) * 1e-9 > MAX_UNCHANGED_S:
+        if (sent_ns - min(self._advanced_ns)) * 1e-9 > self._max_unchanged_s:
             return Freshness.STALLED
         return Freshness.FRESH if steps[0] > 0 else Freshness.REPEATED
 
@@ -176,6 +178,102 @@ class ArmLink(Protocol):
     def close(self) -> None:
         """Close the connection; the next exchange opens it again."""
         ...
+
+
+class ConnectedLink(ABC):
+    """Base class of drivers with one connection, on which each command has one answer.
+
+    A driver implements `connected`, `_connect`, `_request` and `_disconnect`.  This class makes an
+    `ArmLink` of it: it opens the connection when it is needed, closes it after a failure, and opens
+    it again at once after a first failure, then after pauses that double up to `max_pause_s`.  It
+    judges by counters whether the measured joints are new.
+    """
+
+    period_s: ClassVar[float] = 0.0071
+    """Period in which the controller measures its joints; repeated answers are allowed for seven
+    periods, or MAX_UNCHANGED_S if that is longer."""
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        timeout_s: float,
+        min_pause_s: float = 0.05,
+        max_pause_s: float = 1.0,
+    ) -> None:
+        self.host, self.port = host, port
+        self.connections = 0
+        self._timeout_s = timeout_s
+        self._min_pause_s, self._max_pause_s = min_pause_s, max_pause_s
+        self._pause_s = 0.0
+        self._try_again_ns = 0
+        self._counters = CounterMonitor(max(MAX_UNCHANGED_S, 7.0 * self.period_s))
+
+    @property
+    @abstractmethod
+    def connected(self) -> bool:
+        """Return whether the connection is open."""
+
+    @abstractmethod
+    async def _connect(self) -> None:
+        """Open the connection; raises ArmSilentError."""
+
+    @abstractmethod
+    async def _request(
+        self, mode: str, joints_rad: Floats, now_ns: int
+    ) -> tuple[ArmStatus, tuple[int, ...]]:
+        """Send one command, wait for its answer, and return the status and its counters.
+
+        mode, joints_rad: see `ArmLink`.  now_ns: time of the command.  The counters are 32-bit
+        numbers of the controller, of which the first counts its measurements.  Raises
+        ArmSilentError, ArmRefusedError or ArmAnswerError.
+        """
+
+    @abstractmethod
+    def _disconnect(self) -> None:
+        """Close the connection, if any."""
+
+    def due(self, now_ns: int) -> bool:
+        """Return whether a connection is open, or the pause before the next attempt is over."""
+        return self.connected or now_ns >= self._try_again_ns
+
+    async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:
+        """Send one command and return the status that answers it; raises ArmLinkError."""
+        loop = asyncio.get_running_loop()
+        start_s = loop.time()
+        try:
+            if not self.connected:
+                self.close()
+                await self._connect()
+                self.connections += 1
+            status, counters = await self._request(mode, joints_rad, now_ns)
+        except ArmRefusedError:
+            raise
+        except ArmLinkError:
+            self.close()
+            self._try_again_ns = now_ns + int(self._pause_s * 1e9)
+            doubled_s = max(2.0 * self._pause_s, self._min_pause_s)
+            self._pause_s = min(doubled_s, self._max_pause_s)
+            raise
+        except asyncio.CancelledError:
+            # The answer can still arrive, and the next request would receive it.
+            self.close()
+            raise
+        finally:
+            propagate_cancellation()
+        self._pause_s = 0.0
+        freshness = self._counters.classify(
+            counters,
+            sent_ns=now_ns,
+            received_ns=now_ns + round((loop.time() - start_s) * 1e9),
+            may_restart=mode == "idle",
+        )
+        return replace(status, freshness=freshness)
+
+    def close(self) -> None:
+        """Close the connection; the next exchange opens it again."""
+        self._disconnect()
 
 
 def validate_joints(joints_rad: Floats) -> tuple[float, ...]:

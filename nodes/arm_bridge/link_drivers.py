@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
+from flexsheet.nodes.arm_bridge.lines import LineLink
 from flexsheet.nodes.arm_bridge.link import ArmLink
 from flexsheet.nodes.arm_bridge.modbus import ModbusLink
 from flexsheet.nodes.arm_bridge.mxt import MxtLink
 
-Driver = Literal["modbus", "mxt"]
+Driver = Literal["modbus", "mxt", "lines"]
+
+TCP_DRIVERS: frozenset[Driver] = frozenset({"modbus", "lines"})
+"""Drivers whose controllers listen for TCP connections, which `flexsheet doctor` tries."""
+
+_LINKS: dict[Driver, Any] = {"modbus": ModbusLink, "mxt": MxtLink, "lines": LineLink}
 
 
 def make_link(
@@ -18,7 +24,8 @@ def make_link(
 
     with_currents: whether to request the motor currents, which only MXT reports.
     """
-    options = {} if timeout_s is None else {"timeout_s": timeout_s}
-    if driver == "modbus":
-        return ModbusLink(host, port, **options)
-    return MxtLink(host, port, with_currents=with_currents, **options)
+    options: dict[str, Any] = {} if timeout_s is None else {"timeout_s": timeout_s}
+    if with_currents:
+        options["with_currents"] = True
+    link: ArmLink = _LINKS[driver](host, port, **options)
+    return link

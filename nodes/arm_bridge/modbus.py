@@ -8,13 +8,12 @@ docs/modbus.md from them.  Numbers of 32 bits occupy two registers, the high one
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +25,11 @@ from pymodbus.pdu import DecodePDU, ModbusPDU
 from flexsheet.nodes.arm_bridge.link import (
     ArmAnswerError,
     ArmFault,
-    ArmLinkError,
     ArmRefusedError,
     ArmSilentError,
     ArmStatus,
     BlockField,
-    CounterMonitor,
-    propagate_cancellation,
+    ConnectedLink,
     validate_joints,
 )
 
@@ -188,78 +185,25 @@ class _Framer(FramerSocket):
             return len(data), None
 
 
-class ModbusLink:
-    """`ArmLink` by one Modbus TCP connection to one arm.
+class ModbusLink(ConnectedLink):
+    """Driver for one arm by one Modbus TCP connection.
 
     Any failure after which an answer can still arrive closes the connection, because pymodbus
     3.16.1 can return a late answer to the next request.  Other false answers are detected by their
-    sequence and CRC.  The connection reopens at once after a first failure, then after pauses that
-    double up to `max_pause_s`.
+    sequence and CRC.
     """
 
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        timeout_s: float = 0.03,
-        min_pause_s: float = 0.05,
-        max_pause_s: float = 1.0,
-    ) -> None:
-        self.host, self.port = host, port
-        self._timeout_s = timeout_s
-        self._min_pause_s, self._max_pause_s = min_pause_s, max_pause_s
-        self._pause_s = 0.0
-        self._try_again_ns = 0
+    def __init__(self, host: str, port: int, *, timeout_s: float = 0.03, **pauses: float) -> None:
+        super().__init__(host, port, timeout_s=timeout_s, **pauses)
         self._client: AsyncModbusTcpClient | None = None
         self._framer: _Framer | None = None
         self._sequence = 0
-        self._counters = CounterMonitor()
-        self.connections = 0
 
     @property
     def connected(self) -> bool:
         return self._client is not None and self._client.connected
 
-    def due(self, now_ns: int) -> bool:
-        """Return whether a connection is open, or the pause before the next attempt is over."""
-        return self.connected or now_ns >= self._try_again_ns
-
-    async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ModbusStatus:
-        """Send one command and return the status that answers it; raises ArmLinkError."""
-        loop = asyncio.get_running_loop()
-        start_s = loop.time()
-        try:
-            client = await self._open()
-            self._sequence = (self._sequence + 1) & 0xFFFFFFFF
-            status = await self._request(client, mode, joints_rad, now_ns)
-        except ArmRefusedError:
-            raise
-        except ArmLinkError:
-            self.close()
-            self._try_again_ns = now_ns + int(self._pause_s * 1e9)
-            doubled_s = max(2.0 * self._pause_s, self._min_pause_s)
-            self._pause_s = min(doubled_s, self._max_pause_s)
-            raise
-        except asyncio.CancelledError:
-            # The answer can still arrive, and the next request would receive it.
-            self.close()
-            raise
-        finally:
-            propagate_cancellation()
-        self._pause_s = 0.0
-        freshness = self._counters.classify(
-            (status.time_us, status.cycle),
-            sent_ns=now_ns,
-            received_ns=now_ns + round((loop.time() - start_s) * 1e9),
-            may_restart=mode == "idle",
-        )
-        return replace(status, freshness=freshness)
-
-    async def _open(self) -> AsyncModbusTcpClient:
-        if self._client is not None and self._client.connected:
-            return self._client
-        self.close()
+    async def _connect(self) -> None:
         client = AsyncModbusTcpClient(
             self.host, port=self.port, timeout=self._timeout_s, retries=0, reconnect_delay=0
         )
@@ -269,17 +213,17 @@ class ModbusLink:
             client.close()
             raise ArmSilentError(f"no connection to {self.host}:{self.port}")
         self._client = client
-        self.connections += 1
-        return client
 
     async def _request(
-        self, client: AsyncModbusTcpClient, mode: str, joints_rad: Floats, now_ns: int
-    ) -> ModbusStatus:
+        self, mode: str, joints_rad: Floats, now_ns: int
+    ) -> tuple[ModbusStatus, tuple[int, ...]]:
+        assert self._client is not None
+        self._sequence = (self._sequence + 1) & 0xFFFFFFFF
         values = encode_command(
             sequence=self._sequence, time_us=now_ns // 1000, mode=mode, joints_rad=joints_rad
         )
         try:
-            answer = await client.readwrite_registers(
+            answer = await self._client.readwrite_registers(
                 read_address=STATUS_ADDRESS,
                 read_count=_STATUS_REGISTERS,
                 write_address=COMMAND_ADDRESS,
@@ -299,10 +243,9 @@ class ModbusLink:
             raise ArmAnswerError(
                 f"expected the answer to command {self._sequence}, found {status.accepted}"
             )
-        return status
+        return status, (status.time_us, status.cycle)
 
-    def close(self) -> None:
-        """Close the connection, if any."""
+    def _disconnect(self) -> None:
         if self._client is not None:
             self._client.close()
             self._client = None

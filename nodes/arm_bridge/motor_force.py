@@ -8,6 +8,8 @@ enough to calibrate the sheet.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
@@ -15,7 +17,6 @@ from pydantic import ConfigDict, Field
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Finite, Positive
 from flexsheet.messages.types import Force, Side
-from flexsheet.nodes.arm_bridge.kinematics import forward
 
 Floats = NDArray[np.float64]
 SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
@@ -51,9 +52,12 @@ def estimate_pull_n(
     currents_percent: Floats,
     edge_flange_m: Floats,
     towards_base: Floats,
+    *,
+    forward: Callable[[Floats], Floats],
 ) -> tuple[float, float]:
     """Return the pull on the edge towards the base, and its standard deviation, N.
 
+    forward: function from joints (6,) rad to the flange's pose in the base (4, 4).
     joints_rad, currents_percent: (6,). edge_flange_m: centre (3,) of the edge in the flange frame.
     towards_base: direction of the pull, a unit vector (3,). The fit over the joints is by weighted
     least squares.
@@ -86,6 +90,8 @@ class MotorForceEstimator:
         currents_percent: Floats,
         edge_flange_m: Floats,
         towards_base: Floats,
+        *,
+        forward: Callable[[Floats], Floats],
     ) -> Force | None:
         """Return the estimated force at a time; None if the last estimate is too recent."""
         before_ns, before_rad = self._last_ns, self._last_rad
@@ -97,7 +103,12 @@ class MotorForceEstimator:
         speed = np.abs(joints_rad - before_rad).max() / (1e-9 * (at_ns - before_ns))
         resting = bool(speed <= MAX_SPEED_RAD_PER_S)
         force_n, deviation_n = estimate_pull_n(
-            self._calibration, joints_rad, currents_percent, edge_flange_m, towards_base
+            self._calibration,
+            joints_rad,
+            currents_percent,
+            edge_flange_m,
+            towards_base,
+            forward=forward,
         )
         return Force(
             source="motor_currents",

@@ -230,6 +230,7 @@ class ArmBridge(Node):
             status.currents_percent,
             geometry.flange_from_edge[:3, 3],
             towards / np.linalg.norm(towards),
+            forward=geometry.kinematics.forward,
         )
         if force is not None:
             self.force.publish(force, source_ns=self._last.measured_ns)

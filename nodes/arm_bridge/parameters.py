@@ -71,11 +71,11 @@ class ArmBridgeParameters(NodeParameters):
     motor_force: MotorForceCalibration | None = Field(
         default=None,
         description="publish the sheet's pull, estimated from the motor currents, as topic force; "
-        "only with an mxt driver; null: the currents are not requested",
+        "only with driver mxt; null: the currents are not requested",
     )
 
     @model_validator(mode="after")
     def _check_motor_force(self) -> Self:
-        if self.motor_force is not None and self.driver == "modbus":
-            raise ValueError("motor_force requires driver mxt or mxt_pose: modbus has no currents")
+        if self.motor_force is not None and self.driver != "mxt":
+            raise ValueError(f"motor_force requires driver mxt: {self.driver} has no currents")
         return self

@@ -29,7 +29,6 @@ from flexsheet.nodes.arm_bridge.reach import (
     plan_path_through,
     solve_step,
 )
-from flexsheet.nodes.arm_bridge.standstill import bound_edge_shift_m
 from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, follow_sheet
 from flexsheet.nodes.models.rigid import is_rigid, vector_from_rotation
@@ -185,7 +184,7 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
             blocked = fraction + error.fraction * (1.0 - fraction)
             continue
         to_rad = there.left_rad if arm.left else there.right_rad
-        return Alignment(sheet, own_rad, to_rad, _find_duration_s(begin, there))
+        return Alignment(sheet, own_rad, to_rad, _find_duration_s(left, right, begin, there))
     assert first is not None
     return f"{NodeNote.NO_PATH.phrase} {first}"
 
@@ -225,14 +224,16 @@ def _check_alignment(
                 )
 
 
-def _find_duration_s(begin: PathStep, there: PathStep) -> float:
+def _find_duration_s(
+    left: ArmGeometry, right: ArmGeometry, begin: PathStep, there: PathStep
+) -> float:
     """Return the duration (s) of an alignment at its maximum speeds."""
     duration_s = 0.0
-    for start, end in (
-        (begin.left_rad, there.left_rad),
-        (begin.right_rad, there.right_rad),
+    for arm, start, end in (
+        (left, begin.left_rad, there.left_rad),
+        (right, begin.right_rad, there.right_rad),
     ):
-        travel_m = bound_edge_shift_m(start, end)
+        travel_m = arm.bound_edge_shift_m(start, end)
         change_rad = float(np.abs(end - start).max())
         duration_s = max(
             duration_s, travel_m / ALIGN_SPEED_M_PER_S, change_rad / ALIGN_SPEED_RAD_PER_S

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,21 +19,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.kinematics import (
-    BRANCHES,
-    CENTRE_RAD,
-    FLANGE_M,
-    MAX_WRIST_M,
-    SHOULDER_HEIGHT_M,
-    SHOULDER_NEAR_M,
-    WRIST_NEAR_RAD,
-    Branch,
-    UnreachableError,
-    branches,
-    find_branch,
-    singularities,
-    solve_joints_on_branch,
-)
+from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import (
     apply,
@@ -54,6 +41,7 @@ POSE_LIMITS = (
     "shoulder singularity",
     "elbow singularity",
     "wrist singularity",
+    "singularity",
     "workspace",
     "flange distance",
     "edge force",
@@ -64,13 +52,11 @@ SPEED_LIMITS = (*SPEEDS, "tool speed")
 LIMITS = (*POSE_LIMITS, *SPEED_LIMITS)
 """All limits.  The first violated one in this order is reported (`ArmReach.binding`)."""
 
-ELBOW_NEAR_RAD = WRIST_NEAR_RAD
-
 BRANCH_SAMPLES = 500
 """Approximate number of poses from which `find_best_reach` selects the branch."""
 
-SPEED_STEP_S = 1e-4
-"""Time step of the central differences that give joint speeds."""
+SPEED_DAMPING = 1e-12
+"""Damping of the joint speeds, which bounds them at a singularity."""
 
 MAX_STEP_RAD = 0.05
 """Maximum change of a joint between two samples of a path; at a jump, any sampling exceeds it."""
@@ -123,10 +109,10 @@ class ArmReach:
 
     joints_rad: (n, 6), NaN for poses out of reach.
     margins: margins (n,) by limit, for each of `LIMITS`.  Those that depend on joints are NaN for
-        poses out of reach.
+        poses out of reach.  Those of singularities that the arm does not have are infinite.
     """
 
-    branch: Branch
+    branch: Any
     joints_rad: Floats
     margins: Mapping[str, Floats]
 
@@ -159,15 +145,15 @@ def compute_flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
 
 
 def compute_reach(
-    geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses, branch: Branch
+    geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses, branch: Any
 ) -> ArmReach:
     """Compute joints and margins of an arm for poses on one branch; other: the other arm."""
     flanges = compute_flange_poses(geometry, places)
-    joints = solve_joints_on_branch(geometry.base_from_world @ flanges, branch, CENTRE_RAD)
-    others = compute_flange_poses(other, places)
-    margins = _margins(
-        geometry, branch, joints=joints, flanges=flanges, others=others, places=places
+    joints = geometry.kinematics.solve_joints_on_branch(
+        geometry.base_from_world @ flanges, branch, geometry.start_rad
     )
+    others = compute_flange_poses(other, places)
+    margins = _margins(geometry, joints=joints, flanges=flanges, others=others, places=places)
     return ArmReach(branch, joints, margins)
 
 
@@ -180,18 +166,19 @@ def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPose
         np.arange(0, len(places), max(1, len(places) // BRANCH_SAMPLES))
     )
 
-    def merit(branch: Branch) -> tuple[float, float]:
+    def merit(branch: Any) -> tuple[float, float]:
         reach = compute_reach(geometry, other, still, branch)
         ranges = np.stack([reach.margins[limit] for limit in RANGES])
         margin = np.where(np.isfinite(ranges), ranges, -np.pi).min(axis=0)
         return float(reach.reachable.sum()), float(np.minimum(margin, 0.2).sum())
 
-    return compute_reach(geometry, other, places, max(BRANCHES, key=merit))
+    flanges = geometry.base_from_world @ compute_flange_poses(geometry, still)
+    branches = geometry.kinematics.list_branches(flanges)
+    return compute_reach(geometry, other, places, max(branches, key=merit))
 
 
 def _margins(
     geometry: ArmGeometry,
-    branch: Branch,
     *,
     joints: Floats,
     flanges: Floats,
@@ -200,29 +187,26 @@ def _margins(
 ) -> dict[str, Floats]:
     """Return the margins (n,) of all limits for n poses of the sheet.
 
-    branch: branch of the joints, on which joint speeds are evaluated.
     joints: (n, 6).  flanges, others: world poses (n, 4, 4) of this arm's and the other's flange.
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
-    away = singularities(joints)
+    without = np.full(len(joints), np.inf)
+    singular = dict.fromkeys((limit for limit in POSE_LIMITS if "singularity" in limit), without)
     position = flanges[:, :3, 3]
     inside = np.minimum(position - limits.workspace_min_m, limits.workspace_max_m - position)
     apart = np.linalg.norm(position - others[:, :3, 3], axis=1)
     force = np.array([edge_force_n(stretch, limits) for stretch in places.stretch_ratio.tolist()])
     margin = np.minimum(joints - joint_limits.min_rad, joint_limits.max_rad - joints)
-    base_from_flange = geometry.base_from_world @ flanges
-    wrist = base_from_flange[:, :3, 3] - FLANGE_M * base_from_flange[:, :3, 2]
-    reach = MAX_WRIST_M - np.linalg.norm(wrist - [0.0, 0.0, SHOULDER_HEIGHT_M], axis=1)
+    reach = geometry.kinematics.reach_margins_m(geometry.base_from_world @ flanges)
     # Slightly beyond the reach there are still joint solutions, with J3 out of its range.
     reachable = np.isfinite(joints).all(axis=1)
-    speeds, tool_speed = _speeds(geometry, branch, joints, flanges, places)
+    speeds, tool_speed = _speeds(geometry, joints, flanges, places)
     spare = 1.0 - speeds / joint_limits.speed_rad_per_s
     return {
         "reach": np.where(reachable, np.maximum(reach, 0.0), np.minimum(-np.abs(reach), -1e-9)),
         **{name: margin[:, joint] for joint, name in enumerate(RANGES)},
-        "shoulder singularity": away.shoulder_m - SHOULDER_NEAR_M,
-        "elbow singularity": away.elbow_rad - ELBOW_NEAR_RAD,
-        "wrist singularity": away.wrist_rad - WRIST_NEAR_RAD,
+        **singular,
+        **geometry.kinematics.singularity_margins(joints),
         "workspace": inside.min(axis=1),
         "flange distance": apart - limits.min_flange_distance_m,
         "edge force": limits.max_edge_force_n - force,
@@ -232,7 +216,7 @@ def _margins(
 
 
 def _speeds(
-    geometry: ArmGeometry, branch: Branch, joints: Floats, flanges: Floats, places: SheetPoses
+    geometry: ArmGeometry, joints: Floats, flanges: Floats, places: SheetPoses
 ) -> tuple[Floats, Floats]:
     """Return the largest joint speeds (n, 6) and tool speeds (n,) over all twists."""
     fastest, tool = np.zeros_like(joints), np.zeros(len(joints))
@@ -240,15 +224,19 @@ def _speeds(
     points = _tool_points(geometry, flanges)
     fastest[~np.isfinite(joints)] = np.nan
     reachable = np.isfinite(joints).all(axis=1)
+    slopes = geometry.kinematics.jacobian(joints[reachable])
+    transposed = np.swapaxes(slopes, 1, 2)
+    normal = transposed @ slopes + SPEED_DAMPING * np.eye(6)
+    to_base = geometry.base_from_world[:3, :3].T
     for motion in range(places.twists_world.shape[1]):
         linear, angular = np.split(places.twists_world[:, motion], 2, axis=1)
         arms = points - centre[:, None]
         velocity = linear[:, None] + np.cross(angular[:, None], arms)
         tool = np.maximum(tool, np.linalg.norm(velocity, axis=2).max(axis=1))
-        rates = _joint_rates(
-            geometry, branch, flanges=flanges, linear=linear, angular=angular, centre=centre
-        )
-        fastest[reachable] = np.fmax(fastest[reachable], np.abs(rates[reachable]))
+        at_flange = np.concatenate([velocity[:, -1] @ to_base, angular @ to_base], axis=1)
+        wanted = transposed @ at_flange[reachable, :, None]
+        rates = np.linalg.solve(normal, wanted)[..., 0]
+        fastest[reachable] = np.fmax(fastest[reachable], np.abs(rates))
     return fastest, tool
 
 
@@ -260,39 +248,6 @@ def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
     )
     points = np.einsum("nij,pj->npi", flanges[:, :3, :3], np.vstack([edge, np.zeros(3)]))
     return np.asarray(points + flanges[:, None, :3, 3])
-
-
-def _joint_rates(
-    geometry: ArmGeometry,
-    branch: Branch,
-    *,
-    flanges: Floats,
-    linear: Floats,
-    angular: Floats,
-    centre: Floats,
-) -> Floats:
-    """Return joint speeds (n, 6), as central differences of the inverse kinematics.
-
-    linear, angular: velocities (n, 3) of the sheet at its centre (n, 3).
-    """
-    found = []
-    for time_s in (-SPEED_STEP_S, SPEED_STEP_S):
-        rotation_step = _small_rotations(angular * time_s)
-        moved = flanges.copy()
-        moved[:, :3, :3] = rotation_step @ flanges[:, :3, :3]
-        arm = flanges[:, :3, 3] - centre
-        moved[:, :3, 3] = centre + linear * time_s + np.einsum("nij,nj->ni", rotation_step, arm)
-        found.append(solve_joints_on_branch(geometry.base_from_world @ moved, branch, CENTRE_RAD))
-    change = found[1] - found[0]
-    return np.asarray((change - 2.0 * np.pi * np.rint(change / (2.0 * np.pi))) / (2 * SPEED_STEP_S))
-
-
-def _small_rotations(vectors: Floats) -> Floats:
-    """Return matrices (n, 3, 3) of rotation vectors (n, 3) below 1 mrad, to second order."""
-    x, y, z = vectors.T
-    none = np.zeros_like(x)
-    cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
-    return np.asarray(np.eye(3) + cross + 0.5 * cross @ cross)
 
 
 @dataclass(frozen=True, slots=True)
@@ -452,7 +407,7 @@ def _explain_jump(
     fraction: float,
 ) -> PathError:
     """Return the error for joints that would jump from `before_rad` (6,) to reach the next pose."""
-    reach = compute_reach(arm, other, _make_poses([there]), find_branch(before_rad))
+    reach = compute_reach(arm, other, _make_poses([there]), arm.kinematics.find_branch(before_rad))
     binding = int(reach.binding[0])
     limit = "jump" if binding < 0 else LIMITS[binding]
     why = "its joints would jump" if binding < 0 else f"its branch ends: {limit}"
@@ -473,14 +428,14 @@ def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[
     revolutions = np.array([0.0, 2.0 * np.pi, -2.0 * np.pi])
     lowest, highest = arm.joint_limits.min_rad, arm.joint_limits.max_rad
     found: list[tuple[float, Floats]] = []
-    for solution in branches(pose, CENTRE_RAD):
-        rotated = np.array(solution)[:, None] + revolutions
+    for solution in arm.kinematics.solve_all(pose):
+        rotated = solution[:, None] + revolutions
         margin = np.minimum(rotated - lowest[:, None], highest[:, None] - rotated)
         joints = rotated[np.arange(6), margin.argmax(axis=1)]
         found.append((float(margin.max(axis=1).min()), joints))
     found.sort(key=lambda one: -one[0])
     in_range = [joints for margin, joints in found if margin >= 0.0]
-    return in_range or [_solve_joints(arm, start, CENTRE_RAD, fraction=0.0)]
+    return in_range or [_solve_joints(arm, start, arm.start_rad, fraction=0.0)]
 
 
 def _solve_joints(
@@ -490,7 +445,7 @@ def _solve_joints(
         pose = compute_flange_poses(arm, _make_poses([place]))[0]
         return arm.solve_joints(pose, near_rad)
     except UnreachableError as error:
-        limit = error.limit if error.limit == "reach" else f"{error.limit} range"
+        limit = f"{error.limit} range" if f"{error.limit} range" in RANGES else error.limit
         raise PathError(
             str(error),
             side=arm.side,
@@ -518,7 +473,6 @@ def solve_step(
     for number, (arm, joints) in enumerate(((left, step.left_rad), (right, step.right_rad))):
         margins = _margins(
             arm,
-            find_branch(joints),
             joints=joints[None],
             flanges=flanges[number],
             others=flanges[1 - number],
@@ -572,11 +526,9 @@ def _check_limits(
     flanges = [compute_flange_poses(arm, places) for arm in (left, right)]
     times = np.zeros(len(track))
     for index, arm in enumerate((left, right)):
-        branch = find_branch(joints[index][0])
+        branch = arm.kinematics.find_branch(joints[index][0])
         own, other = flanges[index], flanges[1 - index]
-        margins = _margins(
-            arm, branch, joints=joints[index], flanges=own, others=other, places=places
-        )
+        margins = _margins(arm, joints=joints[index], flanges=own, others=other, places=places)
         for margin in margins.values():
             if margin[0] < 0.0:
                 margin[:-1] -= margin[0] - ROUNDING

@@ -19,9 +19,6 @@ that lag by 0.7 s."""
 STANDSTILL_RAD = 1e-3
 """Maximum difference of measurements that count as unchanged, 200 times the encoder noise."""
 
-JOINT_LEVER_M = np.array([0.6, 0.6, 0.4, 0.2, 0.2, 0.15])
-"""Upper bound of the distance from each joint's axis to the arm's edge of the sheet."""
-
 MAX_RESTART_SHIFT_M = 0.005
 """Maximum distance between commanded and measured edge at which the arm may restart from the
 measurement.  Joint servos with a lag of 15 ms or more cover it with less than 0.25 m/s."""
@@ -39,11 +36,6 @@ MEMORY_S = 0.1
 
 ON_PATH_RAD = 0.005
 """Distance from the recently commanded joints within which any measurement is plausible."""
-
-
-def bound_edge_shift_m(joints_rad: Floats, other_rad: Floats) -> float:
-    """Return an upper bound of the edge's displacement (m) between two sets of joints (6,) rad."""
-    return float(JOINT_LEVER_M @ np.abs(joints_rad - other_rad))
 
 
 class StandstillMonitor:

@@ -48,6 +48,7 @@ class ReaderThread(threading.Thread):
     deliver(images, lost): called for each pair, with the total number of lost frames.
     fail(error): called for each DeviceError.  The source is then opened again after a delay, which
         doubles from `retry_s` to MAX_RETRY_S until images arrive.
+    report(text): called after each opening for every device, with its format and settings.
     warn(text): called after each opening for every setting that the device did not accept.
     finish(pairs): called at the end of the source, with the number of pairs.
     regions: sensor regions to deliver; None for the full images.
@@ -66,6 +67,7 @@ class ReaderThread(threading.Thread):
         retry_s: float,
         deliver: Callable[[ImagePair, int], None],
         fail: Callable[[DeviceError], None],
+        report: Callable[[str], None],
         warn: Callable[[str], None],
         finish: Callable[[int], None],
     ) -> None:
@@ -73,6 +75,7 @@ class ReaderThread(threading.Thread):
         self._open, self._camera, self._regions = open_source, camera, regions
         self._now, self._retry_s = now, retry_s
         self._deliver, self._fail, self._warn, self._finish = deliver, fail, warn, finish
+        self._report = report
         self._stopping = threading.Event()
         self._reader: Reader | None = None
         self._pairs = self._lost = 0
@@ -90,6 +93,8 @@ class ReaderThread(threading.Thread):
             try:
                 reader = self._reader = self._open()
                 try:
+                    for text in reader.opened:
+                        self._report(text)
                     for text in reader.warnings:
                         self._warn(text)
                     self._read(reader)

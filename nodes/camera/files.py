@@ -82,6 +82,7 @@ class VideoReader:
     paced = True
     rate_hz: float | None = None
     warnings: tuple[str, ...] = ()
+    opened: tuple[str, ...] = ()
 
     def __init__(self, source: VideoSource, camera_rate_hz: float) -> None:
         self._source, self._camera_rate_hz = source, camera_rate_hz
@@ -228,6 +229,7 @@ class ImagesReader:
     paced = True
     rate_hz: float | None = None
     warnings: tuple[str, ...] = ()
+    opened: tuple[str, ...] = ()
 
     def __init__(self, source: ImagesSource, camera: StereoCamera) -> None:
         left, right = sorted(glob(str(source.left))), sorted(glob(str(source.right)))

@@ -85,11 +85,13 @@ class Reader(Protocol):
         time of each pair.
     rate_hz: frame rate of a device, to count lost frames; None for files.
     warnings: texts about settings that the device did not accept.
+    opened: texts about the format and settings that each device has; empty for files.
     """
 
     paced: bool
     rate_hz: float | None
     warnings: tuple[str, ...]
+    opened: tuple[str, ...]
 
     def read(self) -> ImagePair | None:
         """Wait for the next pair and return it; None at the end.  Raises DeviceError."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 import threading
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 
 from flexsheet.messages.scene import StereoCamera
+from flexsheet.nodes.camera.captures import CAPTURES
 from flexsheet.nodes.camera.image_pair import (
     DeviceError,
     Image,
@@ -19,7 +21,13 @@ from flexsheet.nodes.camera.image_pair import (
     convert_to_gray,
     split_side_by_side,
 )
-from flexsheet.nodes.camera.settings import choose_backend, fix_settings, set_format, set_region
+from flexsheet.nodes.camera.settings import (
+    Backend,
+    choose_backend,
+    fix_settings,
+    set_format,
+    set_region,
+)
 from flexsheet.nodes.camera.sources import OpenCvSource
 from flexsheet.nodes.camera.stamps import Pairing, StampCheck
 
@@ -28,6 +36,9 @@ MAX_WAITING_FRAMES = 4
 FIRST_FRAME_S = 5.0
 """Minimum timeout for the first frame, because the sensors need time to start."""
 RELEASE_S = 0.5
+
+RATE_FRAMES = 61
+"""Number of pairs over which the true rate is measured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +63,13 @@ def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
             f"{device!r}: cannot be opened: it does not exist, is in use, or is no camera or video"
         )
     return capture
+
+
+def open_device(device: int | str, api: str | None, backend: Backend | None) -> Any:
+    """Open a camera with the interface of cv2.VideoCapture; raises DeviceError."""
+    if api in CAPTURES:
+        return CAPTURES[api](str(device))
+    return open_capture(device, backend.api if backend else cv2.CAP_ANY)
 
 
 class Stream(threading.Thread):
@@ -85,20 +103,21 @@ class Stream(threading.Thread):
         self._now, self._changed = now, changed
         self._stopping = threading.Event()
         backend = choose_backend(device, source.api)
-        self._capture = open_capture(device, backend.api if backend else cv2.CAP_ANY)
+        self._capture = open_device(device, source.api, backend)
         try:
             set_format(self._capture, backend, camera, views, source.pixel_format or "")
             self.region = requested and set_region(self._capture, backend, requested, camera)
             self.settings = fix_settings(self._capture, backend, camera, device)
-        except cv2.error:
+        except (DeviceError, cv2.error):
             self._capture.release()
             raise
         self.exposure_s = self.settings.exposure_s or camera.exposure_s
         self._stamp_check = StampCheck() if backend is not None and backend.clock else None
-        to_stamp_s, to_grab_s = (
-            0.5 * self.exposure_s if delay_s is None else delay_s
-            for delay_s in (source.exposure_to_stamp_s, source.exposure_to_grab_s)
-        )
+        to_stamp_s, to_grab_s = source.exposure_to_stamp_s, source.exposure_to_grab_s
+        if to_stamp_s is None:
+            to_stamp_s = (backend.stamp_fraction if backend else 0.5) * self.exposure_s
+        if to_grab_s is None:
+            to_grab_s = 0.5 * self.exposure_s
         self._to_stamp_ns, self._to_grab_ns = round(1e9 * to_stamp_s), round(1e9 * to_grab_s)
 
     @property
@@ -184,6 +203,8 @@ class CameraReader:
             raise
         settings = [stream.settings for stream in self._streams]
         self.warnings: tuple[str, ...] = tuple(text for each in settings for text in each.warnings)
+        self.opened: tuple[str, ...] = tuple(each.got for each in settings)
+        self._exposures_ns: deque[int] = deque(maxlen=RATE_FRAMES)
         rate_hz = min(each.rate_hz for each in settings)
         self.rate_hz: float | None = rate_hz
         self._pairing = Pairing(1.0 / rate_hz)
@@ -240,6 +261,10 @@ class CameraReader:
     def _make_pair(self, frames: tuple[CapturedFrame, ...]) -> ImagePair:
         exposures_ns = [self._exposure_ns(frame) for frame in frames]
         notes = ["stamped by the driver" if self._by_stamp() else "stamped on arrival"]
+        self._exposures_ns.append(exposures_ns[0])
+        if len(self._exposures_ns) == RATE_FRAMES:
+            duration_ns = self._exposures_ns[-1] - self._exposures_ns[0]
+            notes.append(f"{1e9 * (RATE_FRAMES - 1) / max(duration_ns, 1):.1f} Hz measured")
         if len(frames) == 1:
             left, right = split_side_by_side(frames[0].image, self._source.left)
         else:

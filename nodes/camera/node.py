@@ -67,6 +67,7 @@ class Camera(Node):
     regions: Regions | None = None
     reader: ReaderThread | None = None
     newest: tuple[ImagePair, int] | None = None
+    opened: tuple[str, ...] = ()
     warned: tuple[str, ...] = ()
     superseded = rejected = 0
 
@@ -84,7 +85,7 @@ class Camera(Node):
 
     async def on_scene(self, scene: Scene, header: Header) -> None:
         await self._stop_reading()
-        self.camera, self.warned = None, ()
+        self.camera, self.opened, self.warned = None, (), ()
         regions = self.regions = resolve_regions(self.parameters.region, scene)
         camera = self.camera = scene.camera
         if self.parameters.source.kind == "twin":
@@ -109,6 +110,7 @@ class Camera(Node):
             retry_s=self.parameters.retry_s,
             deliver=deliver,
             fail=lambda error: later(self._report_failure, error),
+            report=lambda text: later(self._report_opened, text),
             warn=lambda text: later(self._report_warning, text),
             finish=lambda pairs: later(setattr, self, "note", f"ended after {pairs} pairs"),
         )
@@ -117,6 +119,11 @@ class Camera(Node):
     def _report_failure(self, error: DeviceError) -> None:
         self.report_error("source", error)
         self.note = f"no images: {error}"
+
+    def _report_opened(self, text: str) -> None:
+        if text not in self.opened:
+            self.opened = (*self.opened, text)
+            self.log.info("camera opened", device=text)
 
     def _report_warning(self, text: str) -> None:
         """Report a warning only once per scene, even if the device is opened several times."""
@@ -152,7 +159,13 @@ class Camera(Node):
             return
         pair = make_stereo_message(images, device, exposure_s, lost + self.rejected)
         self.stereo.publish(pair, source_ns=images.exposure_ns)
-        parts = (device, f"{pair.dropped_frames} frames lost", *images.notes, *self.warned)
+        parts = (
+            device,
+            f"{pair.dropped_frames} frames lost",
+            *images.notes,
+            *self.opened,
+            *self.warned,
+        )
         self.note = "; ".join(parts)
 
     async def _stop_reading(self) -> None:

@@ -37,6 +37,7 @@ class Backend:
     autos: names and properties of further automatic functions, which the value 0 switches off.
     offsets: properties for first column and row of the sensor region; None if OpenCV has none.
     buffers: number of frame buffers to request from the driver.
+    stamp_fraction: time from the middle of the exposure to the driver's timestamp, in exposures.
     clock: whether CAP_PROP_POS_MSEC after a grab is the driver's timestamp of that frame.
     """
 
@@ -48,6 +49,7 @@ class Backend:
     offsets: tuple[int, int] | None = None
     buffers: int | None = None
     clock: bool = False
+    stamp_fraction: float = 0.5
 
 
 BACKENDS = {
@@ -73,11 +75,28 @@ BACKENDS = {
         autos=(("auto white balance", cv2.CAP_PROP_XI_AUTO_WB),),
         offsets=(cv2.CAP_PROP_XI_OFFSET_X, cv2.CAP_PROP_XI_OFFSET_Y),
     ),
+    # The next three are opened by `captures`, not by OpenCV.
     "aravis": Backend(
-        api=cv2.CAP_ARAVIS,
+        api=cv2.CAP_ANY,
+        exposure_unit_s=1e-6,
+        whole_units=False,
+        auto_exposure=(cv2.CAP_PROP_AUTO_EXPOSURE, 0.0),
+        clock=True,
+    ),
+    "realsense": Backend(
+        api=cv2.CAP_ANY,
+        exposure_unit_s=1e-6,
+        whole_units=True,
+        auto_exposure=(cv2.CAP_PROP_AUTO_EXPOSURE, 0.0),
+        clock=True,
+        stamp_fraction=0.0,
+    ),
+    "gstreamer": Backend(
+        api=cv2.CAP_ANY,
         exposure_unit_s=1.0,
         whole_units=False,
         auto_exposure=(cv2.CAP_PROP_AUTO_EXPOSURE, 0.0),
+        clock=True,
     ),
 }
 
@@ -86,12 +105,14 @@ BACKENDS = {
 class DeviceSettings:
     """Actual settings of a device.
 
-    exposure_s: None if unknown.  warnings: texts about settings that the device did not accept.
+    exposure_s: None if unknown.  got: format and settings, for the log and the node's status.
+    warnings: texts about settings that the device did not accept.
     """
 
     exposure_s: float | None
     rate_hz: float
     warnings: tuple[str, ...]
+    got: str = ""
 
 
 def choose_backend(device: int | str, api: str | None) -> Backend | None:
@@ -142,7 +163,8 @@ def fix_settings(
         warn("rate", f"{camera.rate_hz:g} Hz", f"{rate_hz:g} Hz")
     if backend is None:
         warn("exposure", f"{1e3 * camera.exposure_s:g} ms", "no control that OpenCV supports")
-        return DeviceSettings(None, rate_hz, tuple(warnings))
+        text = _describe(capture, device, rate_hz, None)
+        return DeviceSettings(None, rate_hz, tuple(warnings), text)
 
     if backend.api == cv2.CAP_V4L2:
         # An environment variable can make OpenCV scale all controls to 0..1; this prevents it.
@@ -173,8 +195,28 @@ def fix_settings(
         if abs(gain - camera.gain) > 0.5:
             warn("gain", f"{camera.gain:g}", f"{gain:g}")
     is_known = is_manual and got > 0.0
-    return DeviceSettings(
-        got * backend.exposure_unit_s if is_known else None, rate_hz, tuple(warnings)
+    exposure_s = got * backend.exposure_unit_s if is_known else None
+    text = _describe(capture, device, rate_hz, exposure_s)
+    return DeviceSettings(exposure_s, rate_hz, tuple(warnings), text)
+
+
+def _describe(capture: Device, device: object, rate_hz: float, exposure_s: float | None) -> str:
+    """Return the device's actual size, pixel format, rate, exposure and gain."""
+    width, height, code, gain = (
+        capture.get(one)
+        for one in (
+            cv2.CAP_PROP_FRAME_WIDTH,
+            cv2.CAP_PROP_FRAME_HEIGHT,
+            cv2.CAP_PROP_FOURCC,
+            cv2.CAP_PROP_GAIN,
+        )
+    )
+    letters = bytes(int(code) >> shift & 0xFF for shift in (0, 8, 16, 24)) if code > 0 else b""
+    pixel_format = f" {letters.decode('ascii')}" if letters.isalnum() else ""
+    exposure = "unknown" if exposure_s is None else f"{1e3 * exposure_s:g} ms"
+    return (
+        f"{device}: {width:.0f}x{height:.0f} px{pixel_format} at {rate_hz:g} Hz, "
+        f"exposure {exposure}, gain {gain:g}"
     )
 
 

@@ -25,21 +25,23 @@ class TwinSource(CameraSource):
 
 
 class OpenCvSource(CameraSource):
-    """Cameras that OpenCV opens by number, by device path, or by the address of a stream.
+    """Cameras by number, device path or address of a stream, by serial number or by pipeline.
 
     Two cameras without a common trigger expose at different times (`docs/camera.md`).
     """
 
-    kind: Literal["opencv"]
+    kind: Literal["live", "opencv"] = Field(description="opencv is the former name of live")
     left: int | DeviceFile = Field(
-        description="left camera, or a camera with both views side by side: number, path or address"
+        description="left camera, or one with both views side by side: number, path or address; "
+        "aravis: name of the camera; realsense: serial number, or empty; gstreamer: pipeline"
     )
     right: int | DeviceFile | None = Field(
         default=None, description="right camera; null: `left` has both views side by side"
     )
-    api: Literal["v4l2", "ximea", "aravis", "any"] | None = Field(
+    api: Literal["v4l2", "ximea", "aravis", "realsense", "gstreamer", "any"] | None = Field(
         default=None,
-        description="OpenCV backend; null: v4l2 for numbers and for paths under /dev, else any",
+        description="library that opens the camera; null: v4l2 for numbers and for paths under "
+        "/dev, else any",
     )
     pixel_format: Annotated[str, Field(min_length=4, max_length=4)] | None = Field(
         default=None,

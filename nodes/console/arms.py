@@ -1,8 +1,7 @@
 """Define the arms that the page draws: boxes for each link, and the poses of the links.
 
-The lengths are those of the RV-1A: base to shoulder, upper arm, elbow, forearm, flange. The
-thicknesses are approximate. The origin of a link's frame is on its joint axis. With all joint
-angles zero, every frame is parallel to the base.
+The lengths are those of the arm's model in the scene. The thicknesses are approximate. The origin
+of a link's frame is on its joint axis.
 """
 
 from __future__ import annotations
@@ -13,18 +12,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from flexsheet.messages.scene import RV_1A, ClosedFormArm, JointChain
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import rotation_from_vector, transform
-
-JOINTS = (
-    ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    ((0.0, 0.0, 0.3), (0.0, 1.0, 0.0)),
-    ((0.0, 0.0, 0.25), (0.0, 1.0, 0.0)),
-    ((-0.09, 0.0, 0.16), (0.0, 0.0, 1.0)),
-    ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
-    ((0.0, 0.0, 0.072), (0.0, 0.0, 1.0)),
-)
-"""Position of each joint in the frame of the previous link (m), and the joint's axis."""
+from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, transform
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +39,10 @@ PIECES = (
     Piece(5, (0.05, 0.05, 0.062), (0.0, 0.0, 0.035)),
     Piece(6, (0.044, 0.044, 0.012), (0.0, 0.0, -0.006), dark=True),
 )
+"""Boxes of an RV-1A."""
+
+LINK_WIDTH_M = 0.07
+"""Width of the boxes of other arms."""
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 """Corners of a box, (8, 3)."""
@@ -60,13 +54,30 @@ CLAMP_SIZE_M = (0.012, 1.04, 0.012)
 """Size of the bar that clamps the sheet: across, along (longer than the edge), thickness."""
 
 
-def compute_link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
+def compute_link_poses(
+    world_from_base: Floats, joints_rad: Floats, model: ClosedFormArm | JointChain
+) -> Floats:
     """Compute world_from_link (7, 4, 4) of the base and the six links; the last is the flange."""
+    chain = model.chain() if isinstance(model, ClosedFormArm) else model
     poses = [world_from_base]
-    for (offset_m, axis), angle_rad in zip(JOINTS, joints_rad.tolist(), strict=True):
-        rotation = rotation_from_vector(angle_rad * np.array(axis))
-        poses.append(poses[-1] @ transform(rotation, offset_m))
+    for origin, axis, angle_rad in zip(chain.origins, chain.axes, joints_rad.tolist(), strict=True):
+        turn = transform(rotation_from_vector(angle_rad * np.asarray(axis)), (0.0, 0.0, 0.0))
+        poses.append(poses[-1] @ pose_matrix(origin) @ turn)
+    poses[-1] = poses[-1] @ pose_matrix(chain.flange)
     return np.stack(poses)
+
+
+def make_pieces(model: ClosedFormArm | JointChain) -> tuple[Piece, ...]:
+    """Return the boxes of an arm; those of an unknown one lead from joint to joint."""
+    if model == RV_1A:
+        return PIECES
+    chain = model.chain() if isinstance(model, ClosedFormArm) else model
+    pieces = []
+    for link, origin in enumerate(chain.origins):
+        x, y, z = (float(one) for one in origin.position_m)
+        size_m = (abs(x) + LINK_WIDTH_M, abs(y) + LINK_WIDTH_M, abs(z) + LINK_WIDTH_M)
+        pieces.append(Piece(link, size_m, (0.5 * x, 0.5 * y, 0.5 * z), dark=link % 2 == 0))
+    return (*pieces, Piece(6, (0.05, 0.05, 0.02), (0.0, 0.0, -0.01), dark=True))
 
 
 def rounded_box(

@@ -13,9 +13,9 @@ from flexsheet.messages.scene import ArmSpec, Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.arms import (
     CLAMP_SIZE_M,
-    PIECES,
     make_bracket,
     make_hull,
+    make_pieces,
     rounded_box,
 )
 from flexsheet.nodes.console.creases import split_creases
@@ -220,7 +220,7 @@ class SceneView:
             self._add("Arms", self._scene.add_frame(f"/{side}/{link}", show_axes=False))
             for link in range(7)
         ]
-        for i, piece in enumerate(PIECES):
+        for i, piece in enumerate(make_pieces(arm.model)):
             vertices, triangles = rounded_box(piece.size_m, piece.centre_m)
             self._scene.add_mesh_simple(
                 f"/{side}/{piece.link}/{i}",

@@ -46,7 +46,9 @@ def compute_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
     for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
         state = source.latest(f"arm_{side}", ArmState)
         if state is not None:
-            links[side] = compute_link_poses(pose_matrix(arm.world_from_base), state[0].joints_rad)
+            links[side] = compute_link_poses(
+                pose_matrix(arm.world_from_base), state[0].joints_rad, arm.model
+            )
             edges[side] = state[0].world_from_flange @ pose_matrix(arm.flange_from_edge)
     finger = _message(source.latest("fingertip", Fingertip))
     tip = None if finger is None else finger.position_world_m

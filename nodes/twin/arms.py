@@ -1,6 +1,6 @@
-"""Simulate the arms: Mitsubishi RV-1A manipulators with servo lag behind Modbus TCP servers.
+"""Simulate the arms: manipulators with six joints and servo lag behind Modbus TCP servers.
 
-This module was written from `docs/modbus.md` and the dimensions of the arm only. It shares no code
+This module was written from `docs/modbus.md` and the dimensions of the arms only. It shares no code
 with the bridge (the node that sends commands to an arm), because it serves to test the bridge. The
 forward kinematics is a product of exponentials (Brockett 1984; Lynch and Park, Modern Robotics, ch.
 4). The inverse kinematics is a Gauss-Newton method on it.
@@ -26,7 +26,9 @@ from pymodbus.exceptions import NoSuchIdException
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
+from flexsheet.messages.scene import RV_1A, ClosedFormArm, JointChain
 from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.models.rigid import pose_matrix
 
 Fault = Literal[
     "none",
@@ -76,21 +78,6 @@ def check_loopback(address: str) -> str:
     return address
 
 
-# Axes of the joints at joint angles of zero, in the base frame: direction, and a point on the axis.
-_AXES = np.array(
-    [[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1]], dtype=np.float64
-)
-_POINTS = np.array(
-    [[0, 0, 0], [0, 0, 0.3], [0, 0, 0.55], [-0.09, 0, 0], [-0.09, 0, 0.71], [-0.09, 0, 0]]
-)
-_FLANGE_AT_ZERO = np.array([-0.09, 0.0, 0.782])
-
-RANGE_RAD = np.radians(
-    [[-150, 150], [-60, 120], [60, 155], [-160, 160], [-90, 90], [-200, 200]]
-).astype(np.float64)
-SPEED_RAD_PER_S = np.radians([180.0, 90.0, 135.0, 180.0, 180.0, 210.0])
-ACCELERATION_RAD_PER_S2 = 8.0 * SPEED_RAD_PER_S
-
 _COMMAND = struct.Struct(">HHIIHH6fI")
 _STATUS = struct.Struct(">HHIIIHH6fII")
 _STATUS_AT = 100
@@ -105,59 +92,81 @@ def _skew(axis: Floats) -> Floats:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-# The motion of a joint by an angle q is 1 + sin(q) C + (1 - cos(q)) C C (Rodrigues), where C is the
-# matrix (4, 4) of the twist of its axis. These are C (_CROSS) and C C (_SQUARE) of all joints.
-_CROSS, _SQUARE = np.zeros((6, 4, 4)), np.zeros((6, 4, 4))
-for _joint, (_axis, _point) in enumerate(zip(_AXES, _POINTS, strict=True)):
-    _CROSS[_joint, :3] = np.column_stack([_skew(_axis), -_skew(_axis) @ _point])
-    _SQUARE[_joint, :3] = _skew(_axis) @ _CROSS[_joint, :3]
-_UNIT = np.eye(4)
-_HOME = _UNIT.copy()
-_HOME[:3, 3] = _FLANGE_AT_ZERO
+class ArmMechanics:
+    """Geometry and limits of a simulated arm, from its model in the scene.
 
-
-def forward(joints_rad: Floats) -> Floats:
-    """Compute the forward kinematics: base_from_flange (4, 4) for joint angles (6,).
-
-    It is exp(S1 q1) ... exp(S6 q6) M, with the screw axes S, joint angles q, and the flange pose M
-    at joint angles of zero.
+    range_rad: lower and upper ends of the joints' ranges (6, 2).
+    speed_rad_per_s, acceleration_rad_per_s2: maximum speeds and accelerations of the joints (6,).
+    start_rad: joint angles (6,) from which the inverse kinematics starts.
     """
-    turns = _rotations(joints_rad)
-    one, two, three = turns[::2] @ turns[1::2]
-    return np.asarray(one @ two @ three @ _HOME)
 
+    def __init__(self, model: ClosedFormArm | JointChain) -> None:
+        self.range_rad = np.column_stack([model.min_rad, model.max_rad])
+        self.speed_rad_per_s = np.array(model.speed_rad_per_s)
+        self.acceleration_rad_per_s2 = 8.0 * self.speed_rad_per_s
+        self.start_rad = np.array(model.start_rad)
+        chain = model.chain() if isinstance(model, ClosedFormArm) else model
+        self._axes, self._points = np.zeros((6, 3)), np.zeros((6, 3))
+        # The motion of a joint by an angle q is 1 + sin(q) C + (1 - cos(q)) C C (Rodrigues), where
+        # C is the matrix (4, 4) of the twist of its axis at angles of zero.
+        self._cross, self._square = np.zeros((6, 4, 4)), np.zeros((6, 4, 4))
+        frame = np.eye(4)
+        for joint, (origin, axis) in enumerate(zip(chain.origins, chain.axes, strict=True)):
+            frame = frame @ pose_matrix(origin)
+            self._axes[joint], self._points[joint] = frame[:3, :3] @ axis, frame[:3, 3]
+            skew = _skew(self._axes[joint])
+            self._cross[joint, :3] = np.column_stack([skew, -skew @ self._points[joint]])
+            self._square[joint, :3] = skew @ self._cross[joint, :3]
+        self._home = frame @ pose_matrix(chain.flange)
 
-def _rotations(joints_rad: Floats) -> Floats:
-    """Return the motions exp(S q) (6, 4, 4) of all joints about their axes at zero angles."""
-    angles = joints_rad[:, None, None]
-    return np.asarray(_UNIT + np.sin(angles) * _CROSS + (1.0 - np.cos(angles)) * _SQUARE)
+    def is_in_range(self, joints_rad: Floats) -> bool:
+        """Return whether joint angles (6,) are finite and within the range of the arm."""
+        low, high = self.range_rad.T
+        return bool(((joints_rad >= low) & (joints_rad <= high)).all())
 
+    def forward(self, joints_rad: Floats) -> Floats:
+        """Compute the forward kinematics: base_from_flange (4, 4) for joint angles (6,).
 
-def solve_inverse_kinematics(base_from_flange: Floats, guess_rad: Floats) -> Floats:
-    """Solve the joint angles (6,), within their ranges, for a flange pose (4, 4).
+        It is exp(S1 q1) ... exp(S6 q6) M, with the screw axes S, joint angles q, and the flange
+        pose M at joint angles of zero.
+        """
+        turns = self._rotations(joints_rad)
+        one, two, three = turns[::2] @ turns[1::2]
+        return np.asarray(one @ two @ three @ self._home)
 
-    The method is damped Gauss-Newton from `guess_rad`. Raises ValueError unless it converges to a
-    micrometre and a microradian.
-    """
-    joints = guess_rad.copy()
-    for _ in range(200):
-        *ahead, last = accumulate((np.eye(4), *_rotations(joints)), np.matmul)
-        pose = last @ _HOME
-        error = _pose_error(base_from_flange, pose)
-        if np.abs(error).max() < 1e-10:
-            break
-        frames = np.array(ahead)
-        axes = np.einsum("nij,nj->ni", frames[:, :3, :3], _AXES)
-        places = np.einsum("nij,nj->ni", frames[:, :3, :3], _POINTS) + frames[:, :3, 3]
-        slope = np.vstack([np.cross(axes, pose[:3, 3] - places).T, axes.T])
-        step = np.linalg.solve(slope.T @ slope + 1e-8 * np.eye(6), slope.T @ error)
-        joints = np.clip(joints + np.clip(step, -0.3, 0.3), RANGE_RAD[:, 0], RANGE_RAD[:, 1])
-    if not np.abs(_pose_error(base_from_flange, forward(joints))).max() <= 1e-6:
-        raise ValueError(
-            f"the arm cannot reach the flange pose at {base_from_flange[:3, 3]} m (base frame); "
-            "move the base or the flange"
+    def _rotations(self, joints_rad: Floats) -> Floats:
+        """Return the motions exp(S q) (6, 4, 4) of all joints about their axes at zero angles."""
+        angles = joints_rad[:, None, None]
+        return np.asarray(
+            np.eye(4) + np.sin(angles) * self._cross + (1.0 - np.cos(angles)) * self._square
         )
-    return joints
+
+    def solve_inverse_kinematics(self, base_from_flange: Floats, guess_rad: Floats) -> Floats:
+        """Solve the joint angles (6,), within their ranges, for a flange pose (4, 4).
+
+        The method is damped Gauss-Newton from `guess_rad`. Raises ValueError unless it converges to
+        a micrometre and a microradian.
+        """
+        joints = guess_rad.copy()
+        low, high = self.range_rad.T
+        for _ in range(200):
+            *ahead, last = accumulate((np.eye(4), *self._rotations(joints)), np.matmul)
+            pose = last @ self._home
+            error = _pose_error(base_from_flange, pose)
+            if np.abs(error).max() < 1e-10:
+                break
+            frames = np.array(ahead)
+            axes = np.einsum("nij,nj->ni", frames[:, :3, :3], self._axes)
+            places = np.einsum("nij,nj->ni", frames[:, :3, :3], self._points) + frames[:, :3, 3]
+            slope = np.vstack([np.cross(axes, pose[:3, 3] - places).T, axes.T])
+            step = np.linalg.solve(slope.T @ slope + 1e-8 * np.eye(6), slope.T @ error)
+            joints = np.clip(joints + np.clip(step, -0.3, 0.3), low, high)
+        if not np.abs(_pose_error(base_from_flange, self.forward(joints))).max() <= 1e-6:
+            raise ValueError(
+                f"the arm cannot reach the flange pose at {base_from_flange[:3, 3]} m (base "
+                "frame); move the base or the flange"
+            )
+        return joints
 
 
 def _pose_error(wanted: Floats, present: Floats) -> Floats:
@@ -169,16 +178,22 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
     return np.concatenate([wanted[:3, 3] - present[:3, 3], spin])
 
 
+RV_1A_MECHANICS = ArmMechanics(RV_1A)
+"""Mechanics of the arm that a scene has unless it names another one."""
+
+
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
     return np.minimum(np.maximum(values, lowest), highest)
 
 
-def decelerate(velocity_rad_per_s: Floats, duration_s: float) -> Floats:
+def decelerate(
+    velocity_rad_per_s: Floats, duration_s: float, acceleration_rad_per_s2: Floats
+) -> Floats:
     """Return the joint velocities (..., 6) after braking for a duration.
 
     All joints are slowed by the same factor, so that the arm stays on its path.
     """
-    stopping_s = (np.abs(velocity_rad_per_s) / ACCELERATION_RAD_PER_S2).max(axis=-1, keepdims=True)
+    stopping_s = (np.abs(velocity_rad_per_s) / acceleration_rad_per_s2).max(axis=-1, keepdims=True)
     left = np.maximum(stopping_s - duration_s, 0.0) / np.maximum(stopping_s, 1e-12)
     return np.asarray(velocity_rad_per_s * left)
 
@@ -196,6 +211,7 @@ class Servo:
     joints_rad: Floats
     lag_s: float
     backlash_rad: float = 0.0
+    mechanics: ArmMechanics = RV_1A_MECHANICS
     velocity_rad_per_s: Floats = field(default_factory=lambda: np.zeros(6))
     driven_rad: Floats = field(init=False)
 
@@ -212,16 +228,17 @@ class Servo:
         steps = max(1, int(np.ceil(duration_s / 1e-3)))
         step_s = duration_s / steps
         natural = 2.0 / self.lag_s
+        max_pull, max_speed = self.mechanics.acceleration_rad_per_s2, self.mechanics.speed_rad_per_s
         for _ in range(steps):
             if braking:
-                speed = decelerate(self.velocity_rad_per_s, step_s)
+                speed = decelerate(self.velocity_rad_per_s, step_s, max_pull)
             else:
                 pull = natural * (
                     natural * (wanted_rad - self.joints_rad) - 2.0 * self.velocity_rad_per_s
                 )
-                pull = _between(pull, -ACCELERATION_RAD_PER_S2, ACCELERATION_RAD_PER_S2)
+                pull = _between(pull, -max_pull, max_pull)
                 speed = self.velocity_rad_per_s + pull * step_s
-            self.velocity_rad_per_s = _between(speed, -SPEED_RAD_PER_S, SPEED_RAD_PER_S)
+            self.velocity_rad_per_s = _between(speed, -max_speed, max_speed)
             self.joints_rad = self.joints_rad + self.velocity_rad_per_s * step_s
         play = 0.5 * self.backlash_rad
         self.driven_rad = _between(self.driven_rad, self.joints_rad - play, self.joints_rad + play)
@@ -253,9 +270,12 @@ class Controller:
         cycle_jitter_s: float = 0.0,
         latency_s: float = 0.0,
         max_step_rad: float = 0.15,
+        mechanics: ArmMechanics = RV_1A_MECHANICS,
         seed: int = 0,
     ) -> None:
-        self.servo = Servo(np.array(joints_rad, dtype=np.float64), servo_lag_s, backlash_rad)
+        self.servo = Servo(
+            np.array(joints_rad, dtype=np.float64), servo_lag_s, backlash_rad, mechanics
+        )
         self.state = STATE_IDLE
         self.faults = 0
         self.refused = 0
@@ -321,7 +341,7 @@ class Controller:
         before = self.wanted_rad if self.state == STATE_MOVING else self.servo.joints_rad
         if not np.isfinite(joints).all():
             self._fail(FAULT_FINITE)
-        elif (joints < RANGE_RAD[:, 0]).any() or (joints > RANGE_RAD[:, 1]).any():
+        elif not self.servo.mechanics.is_in_range(joints):
             self._fail(FAULT_RANGE)
         elif np.abs(joints - before).max() > self._max_step_rad:
             self._fail(FAULT_STEP)

@@ -23,21 +23,17 @@ from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
 from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
-    RANGE_RAD,
+    ArmMechanics,
     ArmServer,
     Controller,
     Fault,
     check_loopback,
-    forward,
-    solve_inverse_kinematics,
 )
 from flexsheet.nodes.twin.mxt_controller import FILTER_S, MxtController, MxtServer
 from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 Loopback = Annotated[str, AfterValidator(check_loopback)]
-
-START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 
 class TwinArmsParameters(SimulatorParameters):
@@ -94,17 +90,16 @@ def open_joints_file(path: str | None) -> dict[str, Floats]:
     return {"left": rows[0], "right": rows[1]}
 
 
-def is_valid_position(joints_rad: Floats) -> bool:
-    """Return whether the joint angles (6,) are finite and within the range of the arm."""
-    return bool(((joints_rad >= RANGE_RAD[:, 0]) & (joints_rad <= RANGE_RAD[:, 1])).all())
-
-
-def joint_torques_nm(joints_rad: Floats, flange_from_edge: Floats, force_n: Floats) -> Floats:
+def joint_torques_nm(
+    mechanics: ArmMechanics, joints_rad: Floats, flange_from_edge: Floats, force_n: Floats
+) -> Floats:
     """Return the joint torques (6,) that a force (3,) on the edge, in the base frame, causes."""
     step_rad = 1e-4
     torques = np.zeros(6)
     for joint, turn in enumerate(step_rad * np.eye(6)):
-        ahead, behind = ((forward(joints_rad + s * turn) @ flange_from_edge) for s in (1, -1))
+        ahead, behind = (
+            mechanics.forward(joints_rad + sign * turn) @ flange_from_edge for sign in (1, -1)
+        )
         torques[joint] = (ahead[:3, 3] - behind[:3, 3]) @ force_n / (2.0 * step_rad)
     return torques
 
@@ -124,6 +119,7 @@ class TwinArmsNode(Node):
 
     async def setup(self) -> None:
         self.servers: dict[str, ArmServer | MxtServer] = {}
+        self._mechanics: dict[str, ArmMechanics] = {}
         self._world_from_base: dict[str, Floats] = {}
         self._flange_from_edge: dict[str, Floats] = {}
         self._pull: SheetPull | None = None
@@ -142,6 +138,7 @@ class TwinArmsNode(Node):
         arms = {"left": scene.arms.left, "right": scene.arms.right}
         for side, spec in arms.items():
             base, clamp = spec.world_from_base, spec.flange_from_edge
+            self._mechanics[side] = ArmMechanics(spec.model)
             self._world_from_base[side] = pose_matrix(base)
             self._flange_from_edge[side] = pose_matrix(clamp)
         self._pull = SheetPull.of(scene.sheet, truth)
@@ -154,7 +151,7 @@ class TwinArmsNode(Node):
             port = self.parameters.left_port if side == "left" else self.parameters.right_port
             self._moved_ns[side] = self._started_ns
             joints_rad = self._stored_joints[side]
-            if not is_valid_position(joints_rad):
+            if not self._mechanics[side].is_in_range(joints_rad):
                 joints_rad = self._start_joints(side, spec, scene)
             server = self._server(side, joints_rad, port, number)
             await server.start()
@@ -178,6 +175,7 @@ class TwinArmsNode(Node):
                 cycle_s=CONTROLLER_CYCLE_S if period_s is None else period_s,
                 cycle_jitter_s=truth.controller_jitter_s,
                 latency_s=truth.command_latency_s,
+                mechanics=self._mechanics[side],
                 seed=seed,
             )
             return MxtServer(mxt, host=given.host, port=port, before=before)
@@ -190,6 +188,7 @@ class TwinArmsNode(Node):
             cycle_s=given.cycle_s if period_s is None else period_s,
             cycle_jitter_s=truth.controller_jitter_s,
             latency_s=truth.command_latency_s,
+            mechanics=self._mechanics[side],
             seed=seed,
         )
         return ArmServer(controller, host=given.host, port=port, before=before)
@@ -213,8 +212,9 @@ class TwinArmsNode(Node):
         half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
         edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
         flange = edge @ inverse(pose_matrix(spec.flange_from_edge))
-        joints_rad = solve_inverse_kinematics(
-            inverse(self._world_from_base[side]) @ flange, START_GUESS_RAD
+        mechanics = self._mechanics[side]
+        joints_rad = mechanics.solve_inverse_kinematics(
+            inverse(self._world_from_base[side]) @ flange, mechanics.start_rad
         )
         return np.asarray(joints_rad - np.array(self._truth(side).joint_offsets_rad))
 
@@ -239,7 +239,7 @@ class TwinArmsNode(Node):
             if isinstance(controller, MxtController):
                 force_n = sign * self._world_from_base[side][:3, :3].T @ pull_n
                 controller.load_nm = joint_torques_nm(
-                    joints[side], self._flange_from_edge[side], force_n
+                    self._mechanics[side], joints[side], self._flange_from_edge[side], force_n
                 )
 
     @periodic("rate_hz")
@@ -256,7 +256,10 @@ class TwinArmsNode(Node):
             side: self._true_joints(side, server.controller.servo.driven_rad)
             for side, server in self.servers.items()
         }
-        left, right = (self._world_from_base[side] @ forward(joints[side]) for side in joints)
+        left, right = (
+            self._world_from_base[side] @ self._mechanics[side].forward(joints[side])
+            for side in joints
+        )
         if self._pull is not None:
             clamps = self._flange_from_edge
             left, right = self._pull.displace(

@@ -22,8 +22,8 @@ from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
     JITTER_STREAM,
     LATE_S,
-    RANGE_RAD,
-    SPEED_RAD_PER_S,
+    RV_1A_MECHANICS,
+    ArmMechanics,
     Fault,
     Servo,
 )
@@ -96,9 +96,12 @@ class MxtController:
         cycle_s: float = CONTROLLER_CYCLE_S,
         cycle_jitter_s: float = 0.0,
         latency_s: float = 0.0,
+        mechanics: ArmMechanics = RV_1A_MECHANICS,
         seed: int = 0,
     ) -> None:
-        self.servo = Servo(np.array(joints_rad, dtype=np.float64), servo_lag_s, backlash_rad)
+        self.servo = Servo(
+            np.array(joints_rad, dtype=np.float64), servo_lag_s, backlash_rad, mechanics
+        )
         self.fault: Fault = "none"
         self.error = ""
         self.load_nm = np.zeros(6)
@@ -112,7 +115,9 @@ class MxtController:
         self._jitter = np.random.default_rng((seed, JITTER_STREAM))
         self._filter_share = 1.0 - math.exp(-cycle_s / filter_s) if filter_s else 1.0
         # Clients send at the period of the protocol, even if the controller's cycle is shorter.
-        self._max_step_rad = STEP_CYCLES * SPEED_RAD_PER_S * max(cycle_s, CONTROLLER_CYCLE_S)
+        self._max_step_rad = (
+            STEP_CYCLES * mechanics.speed_rad_per_s * max(cycle_s, CONTROLLER_CYCLE_S)
+        )
         self._timeout_cycles = round(timeout_s / cycle_s)
         self._restart_cycles = restart_after_s / cycle_s
         self._noise_rad = noise_rad
@@ -233,13 +238,23 @@ class MxtController:
         if self._master is None:
             raise MxtError("move command ahead of the first packet that only requests the state")
         before = self.wanted_rad if self._moved else self.servo.joints_rad
-        joints = _set_point(send_type, data)
+        joints = self._set_point(send_type, data)
         step = np.abs(joints - before)
         if not self._moved and step.max() > FIRST_STEP_RAD:
             raise MxtError("first set-point away from the measured joint angles")
         if (step > self._max_step_rad).any():
             raise MxtError("set-point too far from the previous one")
         self._moved, self.wanted_rad = True, joints
+
+    def _set_point(self, send_type: int, data: Floats) -> Floats:
+        """Decode the joints (6,) of a packet; raise MxtError if it contains no valid set-point."""
+        if send_type != _JOINTS[0]:
+            raise MxtError(f"set-point of unknown type {send_type}")
+        if not np.isfinite(data).all():
+            raise MxtError("set-point not finite")
+        if not self.servo.mechanics.is_in_range(data[:6]):
+            raise MxtError("set-point with joints out of range")
+        return data[:6]
 
     def _fail(self, why: str) -> None:
         self.error, self._failed_at = why, self._cycles
@@ -278,18 +293,6 @@ class MxtController:
         """Return joints (6,): 0: the set-point; 1: the filtered set-point; 2: the measurement."""
         noise = self._noise_rad * self._random.standard_normal(6)
         return (self.wanted_rad, self._filtered_rad, self.servo.joints_rad + noise)[what]
-
-
-def _set_point(send_type: int, data: Floats) -> Floats:
-    """Decode the joints (6,) of a packet; raise MxtError if it contains no valid set-point."""
-    if send_type != _JOINTS[0]:
-        raise MxtError(f"set-point of unknown type {send_type}")
-    if not np.isfinite(data).all():
-        raise MxtError("set-point not finite")
-    joints = data[:6]
-    if (joints < RANGE_RAD[:, 0]).any() or (joints > RANGE_RAD[:, 1]).any():
-        raise MxtError("set-point with joints out of range")
-    return joints
 
 
 class MxtServer:

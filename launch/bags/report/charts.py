@@ -13,7 +13,6 @@ from flexsheet.launch.bags.report.series import Grid, Spread, States
 from flexsheet.launch.bags.report.session import Session
 from flexsheet.launch.experiments.stroke import ARM_EVENTS, LatencyEvent
 from flexsheet.launch.methods.svg import COLOURS, INK, page_style, render_svg
-from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -328,7 +327,7 @@ def draw_joint_speeds(session: Session) -> Chart | None:
     texts = []
     for axes, (side, arm) in zip(grid[:, 0], arms.items(), strict=True):
         for i, (range_, limit) in enumerate(
-            zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
+            zip(arm.joint_speed, session.joint_speeds_rad_per_s(side), strict=True)
         ):
             percent = 100.0 * range_.maximum / limit
             axes.plot(seconds, percent, linewidth=1.0, color=COLOURS[i], label=f"J{i + 1}")
@@ -339,7 +338,9 @@ def draw_joint_speeds(session: Session) -> Chart | None:
         _over_time(axes, session)
         percents = [
             100.0 * overall[1] / limit
-            for range_, limit in zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
+            for range_, limit in zip(
+                arm.joint_speed, session.joint_speeds_rad_per_s(side), strict=True
+            )
             if (overall := range_.overall())
         ]
         texts.append(f"{side} arm at most {max(percents):.0f} %")

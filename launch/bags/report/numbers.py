@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ from flexsheet.messages.busy import describe_busy
 from flexsheet.messages.methods import Methods
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
-from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 
 DEGREES = float(np.degrees(1.0))
 
@@ -57,7 +56,11 @@ def compute_numbers(session: Session) -> dict[str, Any]:
         "latency_ms": {event: _spread_ms(spread) for event, spread in session.latencies.items()},
         "phases_s": _states(session.phases),
         "finger": {"states_s": _states(session.finger), "reasons": session.reasons},
-        "arms": {side: _arm(arm) for side, arm in session.arms.items() if arm.modes.state},
+        "arms": {
+            side: _arm(arm, session.joint_speeds_rad_per_s(side))
+            for side, arm in session.arms.items()
+            if arm.modes.state
+        },
         "sheet": {
             "contact": {
                 "delta_d_mm": session.errors.contact["d"].summary(1e3),
@@ -156,13 +159,13 @@ def _topics(session: Session) -> dict[str, Any]:
     return found
 
 
-def _arm(arm: Arm) -> dict[str, Any]:
+def _arm(arm: Arm, limits_rad_per_s: Sequence[float]) -> dict[str, Any]:
     peaks = [one.overall() for one in arm.joint_speed]
     return {
         "modes_s": _states(arm.modes),
         "joint_speed_ratio": [
             None if peak is None else peak[1] / limit
-            for peak, limit in zip(peaks, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
+            for peak, limit in zip(peaks, limits_rad_per_s, strict=True)
         ],
         "tool_speed_mm_per_s": _most(arm.tool_speed, 1e3),
         "edge_force_n": _most(arm.edge_force, 1.0),

@@ -30,7 +30,7 @@ from flexsheet.messages.bag import BagError, BagInfo, BagReader
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.busy import is_busy
 from flexsheet.messages.clock_table import ClockTable
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import RV_1A, Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
     ArmState,
@@ -253,6 +253,11 @@ class Session:
         self._restarts: dict[str, int] = {}
         self._finger_text = ""
         self._late_before: int | None = None
+
+    def joint_speeds_rad_per_s(self, side: str) -> tuple[float, ...]:
+        """Return the maximum joint speeds (6,) of an arm; without a scene, those of an RV-1A."""
+        model = RV_1A if self.scene is None else getattr(self.scene.arms, side).model
+        return tuple(model.speed_rad_per_s)
 
     def add(self, topic: str, message: Message, header: Header, log_ns: int) -> None:
         """Add one message of the bag to the summary. log_ns: time at which it was recorded."""

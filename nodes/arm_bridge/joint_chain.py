@@ -1,0 +1,283 @@
+"""Compute the kinematics of any arm with six rotary joints numerically.
+
+Joints are (6,) or (n, 6) in radians, poses 4x4 `base_from_flange` in metres.  The inverse is a
+damped Newton method from known joints, with a bounded number of steps.  Poses that are far from the
+known joints are reached through intermediate poses, so that the arm stays on its branch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import degrees, pi
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from flexsheet.messages.scene import JointChain
+from flexsheet.nodes.arm_bridge.kinematics import SeedBranch, UnreachableError
+from flexsheet.nodes.models.rigid import pose_matrix
+
+Floats = NDArray[np.float64]
+
+MAX_STEPS = 12
+"""Maximum number of Newton steps from known joints; a step of a bridge's cycle needs 2 or 3."""
+
+WAYPOINTS, STEPS_PER_WAYPOINT = 8, 5
+"""Number of intermediate poses on the way to a far pose, and of Newton steps to each of them."""
+
+MAX_STEP_RAD = 0.3
+"""Maximum change of a joint in one Newton step."""
+
+TOLERANCE = 1e-8
+"""Error of a solved pose (m, rad) below which the iteration ends."""
+
+MAX_ERROR = 1e-6
+"""Maximum error of a solved pose, m and rad."""
+
+DAMPING = 1e-9
+"""Damping of the normal equations; it bounds the steps at a singularity."""
+
+SINGULAR_LENGTH_M = 0.25
+"""Length by which velocities are divided in the Jacobian's singular values."""
+
+MIN_SINGULAR_VALUE, NEAR_SINGULAR_VALUE = 0.01, 0.05
+"""Smallest singular value of the Jacobian below which a pose is refused, and above which paths must
+stay: there a flange speed of 0.25 m/s needs joint speeds of at most 20 rad/s."""
+
+SEEDS = 256
+"""Number of random joints from which `solve_all` starts."""
+
+SEED_STEPS = 40
+
+MIN_DIFFERENCE = 0.02
+"""Sine of half the difference of a joint above which two solutions are distinct."""
+
+
+class SerialChain:
+    """Poses and Jacobians of a chain of six rotary joints, many at once."""
+
+    def __init__(self, model: JointChain) -> None:
+        # A joint's transform is P + sin(q) Q + cos(q) R, with the constants below.
+        constant, sine, cosine = np.zeros((3, 6, 4, 4))
+        self._axes = np.array(model.axes)
+        for joint, (origin, axis) in enumerate(zip(model.origins, self._axes, strict=True)):
+            x, y, z = axis.tolist()
+            cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            placed = pose_matrix(origin)
+            along = np.outer(axis, axis)
+            constant[joint] = placed
+            constant[joint, :3, :3] = placed[:3, :3] @ along
+            sine[joint, :3, :3] = placed[:3, :3] @ cross
+            cosine[joint, :3, :3] = placed[:3, :3] @ (np.eye(3) - along)
+        self._constant, self._sine, self._cosine = constant, sine, cosine
+        self._flange = pose_matrix(model.flange)
+        self.offsets_m = np.array([np.linalg.norm(one.position_m) for one in model.origins])
+        self.flange_m = float(np.linalg.norm(model.flange.position_m))
+
+    def _frames(self, joints_rad: Floats) -> list[Floats]:
+        """Return base_from_joint (..., 4, 4) of all joints (..., 6), and of the flange."""
+        angles = joints_rad[..., None, None]
+        links = self._constant + np.sin(angles) * self._sine + np.cos(angles) * self._cosine
+        frames = [links[..., 0, :, :]]
+        for joint in range(1, 6):
+            frames.append(frames[-1] @ links[..., joint, :, :])
+        return [*frames, frames[-1] @ self._flange]
+
+    def forward(self, joints_rad: Floats) -> Floats:
+        """Return base_from_flange (..., 4, 4) at joints (..., 6) rad."""
+        return self._frames(joints_rad)[-1]
+
+    def jacobian(self, joints_rad: Floats) -> Floats:
+        """Return the flange's velocity and angular velocity per joint speed, (..., 6, 6)."""
+        return self.pose_and_jacobian(joints_rad)[1]
+
+    def pose_and_jacobian(self, joints_rad: Floats) -> tuple[Floats, Floats]:
+        """Return base_from_flange (..., 4, 4), and the Jacobian (..., 6, 6) in the base frame."""
+        *frames, flange = self._frames(joints_rad)
+        placed = np.stack(frames, axis=-3)
+        x, y, z = np.moveaxis((placed[..., :3, :3] @ self._axes[:, :, None])[..., 0], -1, 0)
+        dx, dy, dz = np.moveaxis(flange[..., None, :3, 3] - placed[..., :3, 3], -1, 0)
+        rows = (y * dz - z * dy, z * dx - x * dz, x * dy - y * dx, x, y, z)
+        return flange, np.stack(rows, axis=-2)
+
+    def levers_m(self, beyond_flange_m: float) -> Floats:
+        """Return upper bounds (6,) of the distances from the joints' axes to a point, m.
+
+        beyond_flange_m: distance of the point from the flange.
+        """
+        after = np.append(self.offsets_m[1:], self.flange_m + beyond_flange_m)
+        return np.asarray(np.cumsum(after[::-1])[::-1])
+
+
+class NumericKinematics:
+    """Kinematics of one arm by Newton's method; see `kinematics.ArmKinematics`."""
+
+    def __init__(self, model: JointChain) -> None:
+        self.model = model
+        self._chain = SerialChain(model)
+        self._lowest, self._highest = np.array(model.min_rad), np.array(model.max_rad)
+        self._start = np.array(model.start_rad)
+
+    def forward(self, joints_rad: Floats) -> Floats:
+        """Return base_from_flange (4, 4) at joints (6,) rad."""
+        return self._chain.forward(np.asarray(joints_rad, dtype=np.float64))
+
+    def jacobian(self, joints_rad: Floats) -> Floats:
+        """Return the Jacobian (n, 6, 6) at joints (n, 6) rad."""
+        return self._chain.jacobian(joints_rad)
+
+    def _refine(self, poses: Floats, joints_rad: Floats, steps: int) -> tuple[Floats, Floats]:
+        """Return joints (n, 6) after Newton steps towards poses, and their errors (n,)."""
+        joints = joints_rad
+        for left in reversed(range(steps + 1)):
+            flanges, slopes = self._chain.pose_and_jacobian(joints)
+            errors = _pose_errors(poses, flanges)
+            largest = np.abs(errors).max(axis=1)
+            if left == 0 or float(largest.max()) <= TOLERANCE:
+                break
+            transposed = np.swapaxes(slopes, 1, 2)
+            normal = transposed @ slopes + DAMPING * np.eye(6)
+            change = np.linalg.solve(normal, transposed @ errors[..., None])[..., 0]
+            fastest = np.abs(change).max(axis=1, keepdims=True)
+            joints = joints + change * np.minimum(1.0, MAX_STEP_RAD / np.maximum(fastest, 1e-12))
+        return joints, largest
+
+    def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
+        """Return joints (n, 6) on the branch of `joints_rad` (6,), and their errors (n,)."""
+        start = self.forward(joints_rad)
+        turns = Rotation.from_matrix(poses[:, :3, :3] @ start[:3, :3].T).as_rotvec()
+        joints = np.tile(joints_rad, (len(poses), 1))
+        between = np.tile(np.eye(4), (len(poses), 1, 1))
+        for number in range(1, WAYPOINTS + 1):
+            part = number / WAYPOINTS
+            between[:, :3, :3] = Rotation.from_rotvec(part * turns).as_matrix() @ start[:3, :3]
+            between[:, :3, 3] = start[:3, 3] + part * (poses[:, :3, 3] - start[:3, 3])
+            joints, _ = self._refine(between, joints, STEPS_PER_WAYPOINT)
+        return self._refine(poses, joints, STEPS_PER_WAYPOINT)
+
+    def solve_next_joints(self, base_from_flange: Floats, present_rad: Floats) -> Floats:
+        """Return joints (6,) rad near the present ones; raises UnreachableError.
+
+        The result may leave the ranges of the joints only by raising the error, which names the
+        first such joint.
+        """
+        poses, present = base_from_flange[None], np.asarray(present_rad, dtype=np.float64)
+        if not (np.isfinite(poses).all() and np.isfinite(present).all()):
+            raise UnreachableError(
+                "the flange's pose or the present joints are not finite", "reach"
+            )
+        joints, errors = self._refine(poses, present[None], MAX_STEPS)
+        if not errors[0] <= MAX_ERROR:
+            joints, errors = self._continue(poses, present)
+        x, y, z = np.round(base_from_flange[:3, 3] * 1e3) + 0.0
+        where = f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base"
+        if not errors[0] <= MAX_ERROR:
+            if self.reach_margins_m(poses)[0] < 0.0:
+                away_mm = 1e3 * float(np.linalg.norm(base_from_flange[:3, 3]))
+                raise UnreachableError(
+                    f"{where}: out of the arm's reach, {away_mm:.0f} mm away, at most "
+                    f"{1e3 * self._max_distance_m:.0f} mm",
+                    "reach",
+                )
+            raise UnreachableError(
+                f"{where}: no joints found near the present ones; the nearest pose is "
+                f"{1e3 * errors[0]:.2g} mm or mrad away",
+                "reach",
+            )
+        found = joints[0]
+        beyond = np.maximum(self._lowest - found, found - self._highest)
+        if (worst := int(beyond.argmax())) >= 0 and beyond[worst] > 0.0:
+            raise UnreachableError(
+                f"{where}: J{worst + 1} would be at {degrees(found[worst]):.1f} degrees, its range "
+                f"is {degrees(self._lowest[worst]):.0f} to {degrees(self._highest[worst]):.0f}",
+                f"J{worst + 1}",
+            )
+        smallest = float(self._singular_values(joints)[0])
+        if not smallest >= MIN_SINGULAR_VALUE:
+            raise UnreachableError(
+                f"{where}: too near to a singularity, the smallest singular value is "
+                f"{smallest:.2g}, at least {MIN_SINGULAR_VALUE}",
+                "singularity",
+            )
+        return np.asarray(found)
+
+    def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
+        """Return the distinct solutions (6,) rad within the ranges, the nearest to the start first.
+
+        They are found from random joints, always the same ones, so that one may be missed.
+        """
+        random = np.random.default_rng(1)
+        low, high = np.maximum(self._lowest, -pi), np.minimum(self._highest, pi)
+        seeds = np.vstack([self._start, random.uniform(low, high, (SEEDS, 6))])
+        poses = np.broadcast_to(base_from_flange, (len(seeds), 4, 4))
+        joints, errors = self._refine(poses, seeds, SEED_STEPS)
+        turned = self._start + np.remainder(joints - self._start + pi, 2.0 * pi) - pi
+        turned += 2.0 * pi * (1.0 * (turned < self._lowest) - 1.0 * (turned > self._highest))
+        found: list[Floats] = []
+        for one in turned[np.flatnonzero(np.less_equal(errors, MAX_ERROR))]:
+            in_range = (np.maximum(self._lowest - one, one - self._highest) <= 0.0).all()
+            # Joints that differ by a revolution are the same solution.
+            apart = [np.abs(np.sin(0.5 * (one - old))).max() for old in found]
+            if in_range and min(apart, default=1.0) > MIN_DIFFERENCE:
+                found.append(one)
+        return sorted(found, key=lambda one: float(np.abs(one - self._start).max()))
+
+    def find_branch(self, joints_rad: Floats) -> SeedBranch:
+        """Return the branch that continues from joints (6,) rad."""
+        return SeedBranch(tuple(float(angle) for angle in joints_rad))
+
+    def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:
+        """Return the branches on which the arm reaches the first reachable of poses (n, 4, 4)."""
+        for pose in base_from_flange:
+            if found := self.solve_all(pose):
+                return [self.find_branch(joints) for joints in found]
+        return [self.find_branch(self._start)]
+
+    def solve_joints_on_branch(
+        self, base_from_flange: Floats, branch: SeedBranch, near_rad: Floats
+    ) -> Floats:
+        """Return joints (n, 6) rad for poses (n, 4, 4) on one branch; NaN where out of reach."""
+        joints, errors = self._continue(base_from_flange, np.array(branch.seed_rad))
+        return np.where(errors[:, None] <= MAX_ERROR, joints, np.nan)
+
+    @property
+    def _max_distance_m(self) -> float:
+        return float(self._chain.offsets_m.sum() + self._chain.flange_m)
+
+    def reach_margins_m(self, base_from_flange: Floats) -> Floats:
+        """Return how far (n,) poses (n, 4, 4) are within the sum of all link lengths."""
+        away = np.linalg.norm(base_from_flange[:, :3, 3], axis=1)
+        return np.asarray(self._max_distance_m - away)
+
+    def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
+        """Return how far (n,) the smallest singular value is above its minimum."""
+        return {"singularity": self._singular_values(joints_rad) - NEAR_SINGULAR_VALUE}
+
+    def _singular_values(self, joints_rad: Floats) -> Floats:
+        finite = np.asarray(np.isfinite(joints_rad).all(axis=1))
+        slopes = self._chain.jacobian(np.where(finite[:, None], joints_rad, self._start))
+        slopes[:, :3] /= SINGULAR_LENGTH_M
+        smallest = np.linalg.svd(slopes, compute_uv=False)[:, -1]
+        return np.where(finite, smallest, np.nan)
+
+
+def _pose_errors(wanted: Floats, present: Floats) -> Floats:
+    """Return translations (m) and rotation vectors (rad), (n, 6), from present to wanted poses.
+
+    The rotation vectors are exact for small angles, and have the right direction for others.
+    """
+    turn = wanted[:, :3, :3] @ np.swapaxes(present[:, :3, :3], 1, 2)
+    spin = 0.5 * np.stack(
+        [
+            turn[:, 2, 1] - turn[:, 1, 2],
+            turn[:, 0, 2] - turn[:, 2, 0],
+            turn[:, 1, 0] - turn[:, 0, 1],
+        ],
+        axis=1,
+    )
+    # Beyond 90 degrees the sine falls again: keep its direction, and the length of a right angle.
+    cosine = 0.5 * (np.trace(turn, axis1=1, axis2=2) - 1.0)
+    sine = np.linalg.norm(spin, axis=1)
+    factor = np.where(cosine < 0.0, 1.0 / np.maximum(sine, 1e-6), 1.0)
+    return np.concatenate([wanted[:, :3, 3] - present[:, :3, 3], spin * factor[:, None]], axis=1)

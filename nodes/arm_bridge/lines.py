@@ -1,0 +1,108 @@
+"""Exchange lines of text with an arm's program over TCP; the example of a driver.
+
+Most controllers can run a program that reads and writes lines on a socket.  Each command and its
+answer are one line, with fields separated by spaces:
+
+    SEQUENCE MODE Q1 Q2 Q3 Q4 Q5 Q6
+    SEQUENCE COUNT FAULTS Q1 Q2 Q3 Q4 Q5 Q6
+
+SEQUENCE counts commands, and the answer repeats it.  MODE is `idle`, `move`, `hold` or `stop`.
+COUNT is the number of the controller's measurements, modulo 2**32.  FAULTS is `-` or names of
+`ArmFault` in lower case, separated by commas.  The joints are in radians.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.nodes.arm_bridge.link import (
+    JOINTS,
+    ArmAnswerError,
+    ArmFault,
+    ArmSilentError,
+    ArmStatus,
+    ConnectedLink,
+    validate_joints,
+)
+
+Floats = NDArray[np.float64]
+
+MAX_LINE_BYTES = 512
+
+
+def encode_line(sequence: int, mode: str, joints_rad: Floats) -> bytes:
+    """Encode a command; raises ValueError unless there are six finite joints."""
+    angles = " ".join(f"{angle:.9g}" for angle in validate_joints(joints_rad))
+    return f"{sequence} {mode} {angles}\n".encode("ascii")
+
+
+def decode_line(line: bytes, sequence: int) -> tuple[ArmStatus, tuple[int, ...]]:
+    """Decode the answer to a command; return the status and its counter.  Raises ArmAnswerError."""
+    try:
+        answered, count, faults, *angles = line.decode("ascii").split()
+        joints = np.array([float(angle) for angle in angles])
+        found = () if faults == "-" else tuple(ArmFault[one.upper()] for one in faults.split(","))
+        numbers = int(answered), int(count)
+    except (KeyError, ValueError) as error:
+        raise ArmAnswerError(f"the answer {line[:80]!r} is not a status line") from error
+    if numbers[0] != sequence:
+        raise ArmAnswerError(f"expected the answer to command {sequence}, found {numbers[0]}")
+    if len(joints) != JOINTS or not all(math.isfinite(angle) for angle in joints):
+        raise ArmAnswerError(f"the answer {line[:80]!r} must have {JOINTS} finite joints")
+    if not 0 <= numbers[1] < 2**32:
+        raise ArmAnswerError(f"the count {numbers[1]} must be from 0 to 2**32 - 1")
+    return ArmStatus(joints, found), (numbers[1],)
+
+
+class LineLink(ConnectedLink):
+    """Driver for one arm whose program answers lines of text."""
+
+    period_s = 0.008
+
+    def __init__(self, host: str, port: int, *, timeout_s: float = 0.03) -> None:
+        super().__init__(host, port, timeout_s=timeout_s)
+        self._sequence = 0
+        self._streams: tuple[asyncio.StreamReader, asyncio.StreamWriter] | None = None
+
+    @property
+    def connected(self) -> bool:
+        """Return whether the connection is open."""
+        return self._streams is not None and not self._streams[1].is_closing()
+
+    async def _connect(self) -> None:
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                self._streams = await asyncio.open_connection(
+                    self.host, self.port, limit=MAX_LINE_BYTES
+                )
+        except OSError as error:
+            raise ArmSilentError(f"no connection to {self.host}:{self.port}: {error}") from error
+
+    async def _request(
+        self, mode: str, joints_rad: Floats, now_ns: int
+    ) -> tuple[ArmStatus, tuple[int, ...]]:
+        assert self._streams is not None
+        reader, writer = self._streams
+        self._sequence += 1
+        writer.write(encode_line(self._sequence, mode, joints_rad))
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                line = await reader.readline()
+        except TimeoutError as error:
+            raise ArmSilentError(
+                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
+            ) from error
+        except (OSError, ValueError) as error:
+            raise ArmAnswerError(f"answer of {self.host}:{self.port}: {error}") from error
+        if not line.endswith(b"\n"):
+            raise ArmSilentError(f"{self.host}:{self.port} has closed the connection")
+        return decode_line(line, self._sequence)
+
+    def _disconnect(self) -> None:
+        if self._streams is not None:
+            self._streams[1].close()
+        self._streams = None

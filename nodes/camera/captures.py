@@ -1,0 +1,408 @@
+"""Open cameras that OpenCV's package cannot open, with the interface of cv2.VideoCapture.
+
+`AravisCapture` reads one GenICam camera (GigE Vision or USB3 Vision), `GstreamerCapture` a
+pipeline, and `RealSenseCapture` the infrared pair of a RealSense camera as one image with both
+views side by side.  Their packages are optional and imported when a device is opened.
+`settings.BACKENDS` states the units of their controls.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.nodes.camera.image_pair import DeviceError, Image
+
+GRAB_S = 1.0
+"""Maximum duration of a grab, so that a thread that reads a silent camera can end."""
+
+BUFFERS = 4
+
+
+def _import(module: str, remedy: str) -> Any:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ImportWarning)  # The importer of gi causes them.
+            return importlib.import_module(module)
+    except ImportError as error:
+        raise DeviceError(f"{module} cannot be imported ({error}); {remedy}") from error
+
+
+def _import_introspected(name: str, version: str) -> Any:
+    remedy = (
+        f"install the system packages python3-gi and gir1.2 of {name}, and make them visible: "
+        "PYTHONPATH=/usr/lib/python3/dist-packages"
+    )
+    gi = _import("gi", remedy)
+    try:
+        gi.require_version(name, version)
+    except ValueError as error:
+        raise DeviceError(f"{error}; {remedy}") from error
+    return _import(f"gi.repository.{name}", remedy)
+
+
+def _monotonic_ms(real_time_ns: int) -> float:
+    """Convert a time of the system clock to the monotonic clock, ms."""
+    return (real_time_ns - time.time_ns() + time.monotonic_ns()) * 1e-6
+
+
+class CapturedDevice:
+    """Base class of captures: stores the requested format, and starts the device when it is needed.
+
+    stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if there is none.
+    """
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self.stamp_ms = 0.0
+        self.image: NDArray[Any] | None = None
+        self.wanted = {
+            cv2.CAP_PROP_FRAME_WIDTH: 640.0,
+            cv2.CAP_PROP_FRAME_HEIGHT: 480.0,
+            cv2.CAP_PROP_FPS: 30.0,
+        }
+        self.started = False
+
+    def _start(self) -> None:
+        """Start the device with the format in `wanted`; raises DeviceError."""
+        raise NotImplementedError
+
+    def _ensure_started(self) -> None:
+        if not self.started:
+            self._start()
+            self.started = True
+
+    def set(self, property_id: int, value: float) -> bool:
+        """Set the format before the start, or a control; return whether it may have been set."""
+        if property_id in self.wanted and not self.started:
+            self.wanted[property_id] = value
+            return True
+        if property_id in {cv2.CAP_PROP_FOURCC, cv2.CAP_PROP_BUFFERSIZE}:
+            return False
+        self._ensure_started()
+        return self._set_control(property_id, value)
+
+    def get(self, property_id: int) -> float:
+        """Return an actual setting, or the timestamp of the frame; 0 if it is unknown."""
+        if property_id == cv2.CAP_PROP_POS_MSEC:
+            return self.stamp_ms
+        self._ensure_started()
+        return self._get_control(property_id)
+
+    def _set_control(self, property_id: int, value: float) -> bool:
+        return False
+
+    def _get_control(self, property_id: int) -> float:
+        return 0.0
+
+    def retrieve(self) -> tuple[bool, Image | None]:
+        """Return the grabbed image, grey (h, w)."""
+        return self.image is not None, self.image
+
+
+class AravisCapture(CapturedDevice):
+    """One GenICam camera by Aravis; device: its name, or empty for the only one."""
+
+    def __init__(self, device: str) -> None:
+        super().__init__(device)
+        self._aravis = _import_introspected("Aravis", "0.8")
+        if device.startswith("Fake"):
+            self._aravis.enable_interface("Fake")
+        self._stream: Any = None
+        self._camera = self._call(lambda: self._aravis.Camera.new(device or None), "open")
+
+    def _call(self, call: Any, what: str) -> Any:
+        """Call Aravis; raises DeviceError that names the device and what was tried."""
+        try:
+            return call()
+        except Exception as error:  # GLib.Error, which is known only after the import.
+            raise DeviceError(f"{self.device!r}: Aravis cannot {what}: {error}") from error
+
+    def _start(self) -> None:
+        camera = self._camera
+        width, height = (
+            round(self.wanted[one]) for one in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+        )
+        self._call(lambda: camera.set_pixel_format_from_string("Mono8"), "set Mono8")
+        self._call(lambda: camera.set_region(0, 0, width, height), f"set {width}x{height} px")
+        if camera.is_frame_rate_available():
+            rate_hz = self.wanted[cv2.CAP_PROP_FPS]
+            self._call(lambda: camera.set_frame_rate(rate_hz), f"set {rate_hz:g} Hz")
+        self._stream = self._call(lambda: camera.create_stream(None, None), "create a stream")
+        for _ in range(BUFFERS):
+            self._stream.push_buffer(self._aravis.Buffer.new_allocate(camera.get_payload()))
+        self._call(camera.start_acquisition, "start")
+
+    def _set_control(self, property_id: int, value: float) -> bool:
+        camera = self._camera
+        try:
+            if property_id == cv2.CAP_PROP_EXPOSURE:
+                camera.set_exposure_time(value)
+            elif property_id == cv2.CAP_PROP_GAIN:
+                camera.set_gain(value)
+            elif property_id == cv2.CAP_PROP_AUTO_EXPOSURE and camera.is_exposure_auto_available():
+                camera.set_exposure_time_auto(self._aravis.Auto.OFF)
+            else:
+                return False
+        except Exception:  # GLib.Error; the caller reads the setting back and reports it.
+            return False
+        return True
+
+    def _get_control(self, property_id: int) -> float:
+        camera = self._camera
+        if property_id in {cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT}:
+            region = camera.get_region()
+            return float(region[2 + (property_id == cv2.CAP_PROP_FRAME_HEIGHT)])
+        if property_id == cv2.CAP_PROP_FPS:
+            return float(camera.get_frame_rate()) if camera.is_frame_rate_available() else 0.0
+        if property_id == cv2.CAP_PROP_EXPOSURE:
+            return float(camera.get_exposure_time()) if camera.is_exposure_time_available() else 0.0
+        if property_id == cv2.CAP_PROP_GAIN:
+            return float(camera.get_gain()) if camera.is_gain_available() else 0.0
+        if property_id == cv2.CAP_PROP_AUTO_EXPOSURE and camera.is_exposure_auto_available():
+            return float(camera.get_exposure_time_auto() != self._aravis.Auto.OFF)
+        if property_id == cv2.CAP_PROP_FOURCC:
+            return float(cv2.VideoWriter.fourcc(*"GREY"))
+        return 0.0
+
+    def grab(self) -> bool:
+        """Wait for the next complete frame; return False if there is none."""
+        self._ensure_started()
+        end_s = time.monotonic() + GRAB_S
+        while (left_s := end_s - time.monotonic()) > 0.0:
+            buffer = self._stream.timeout_pop_buffer(round(1e6 * left_s))
+            if buffer is None:
+                break
+            complete = buffer.get_status() == self._aravis.BufferStatus.SUCCESS
+            if complete:
+                shape = buffer.get_image_height(), buffer.get_image_width()
+                self.image = np.frombuffer(buffer.get_data(), np.uint8).reshape(shape).copy()
+                # The time at which this computer received the first packet of the frame.
+                self.stamp_ms = _monotonic_ms(buffer.get_system_timestamp())
+            self._stream.push_buffer(buffer)
+            if complete:
+                return True
+        return False
+
+    def release(self) -> None:
+        """Stop and close the camera."""
+        if self.started:
+            self._camera.stop_acquisition()
+        self._stream = self._camera = None
+
+
+class RealSenseCapture(CapturedDevice):
+    """Infrared pair of a RealSense camera; device: its serial number, or empty for any one.
+
+    The projector of dots is switched off.  Both sensors share their trigger.  The timestamp is the
+    middle of the exposure, if the camera reports the time of the sensor.
+    """
+
+    def __init__(self, device: str) -> None:
+        super().__init__(device)
+        remedy = 'install it by `pip install "flexsheet[realsense]"`, and the system package libusb'
+        self._rs = _import("pyrealsense2", remedy)
+        self._pipeline: Any = None
+        self._sensor: Any = None
+
+    def _start(self) -> None:
+        rs, wanted = self._rs, self.wanted
+        width, height = (
+            round(wanted[cv2.CAP_PROP_FRAME_WIDTH] / 2),
+            round(wanted[cv2.CAP_PROP_FRAME_HEIGHT]),
+        )
+        rate_hz = round(wanted[cv2.CAP_PROP_FPS])
+        config, pipeline = rs.config(), rs.pipeline()
+        if self.device:
+            config.enable_device(self.device)
+        for index in (1, 2):
+            config.enable_stream(rs.stream.infrared, index, width, height, rs.format.y8, rate_hz)
+        try:
+            profile = pipeline.start(config)
+        except RuntimeError as error:
+            raise DeviceError(
+                f"RealSense {self.device or '(any)'}: no infrared pair of {width}x{height} px at "
+                f"{rate_hz} Hz: {error}; set camera.width_px, height_px and rate_hz of the scene "
+                "to a mode that `rs-enumerate-devices` lists"
+            ) from error
+        self._pipeline, self._sensor = pipeline, profile.get_device().first_depth_sensor()
+        for option, value in (
+            (rs.option.emitter_enabled, 0.0),
+            (rs.option.global_time_enabled, 1.0),
+        ):
+            if self._sensor.supports(option):
+                self._sensor.set_option(option, value)
+        stream = profile.get_stream(rs.stream.infrared, 1).as_video_stream_profile()
+        self._format = (2.0 * stream.width(), float(stream.height()), float(stream.fps()))
+
+    def _option(self, property_id: int) -> Any:
+        option = self._rs.option
+        return {
+            cv2.CAP_PROP_EXPOSURE: option.exposure,
+            cv2.CAP_PROP_GAIN: option.gain,
+            cv2.CAP_PROP_AUTO_EXPOSURE: option.enable_auto_exposure,
+        }.get(property_id)
+
+    def _set_control(self, property_id: int, value: float) -> bool:
+        option = self._option(property_id)
+        if option is None or not self._sensor.supports(option):
+            return False
+        try:
+            self._sensor.set_option(option, value)
+        except RuntimeError:  # Out of range; the caller reads the setting back and reports it.
+            return False
+        return True
+
+    def _get_control(self, property_id: int) -> float:
+        sizes = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
+        if property_id in sizes:
+            return self._format[sizes.index(property_id)]
+        if property_id == cv2.CAP_PROP_FOURCC:
+            return float(cv2.VideoWriter.fourcc(*"GREY"))
+        option = self._option(property_id)
+        if option is None or not self._sensor.supports(option):
+            return 0.0
+        return float(self._sensor.get_option(option))
+
+    def grab(self) -> bool:
+        """Wait for the next pair; return False if there is none."""
+        self._ensure_started()
+        found, frames = self._pipeline.try_wait_for_frames(round(1e3 * GRAB_S))
+        if not found:
+            return False
+        left, right = (frames.get_infrared_frame(index) for index in (1, 2))
+        self.image = np.hstack([np.asanyarray(one.get_data()) for one in (left, right)])
+        self.stamp_ms = self._find_stamp_ms(left)
+        return True
+
+    def _find_stamp_ms(self, frame: Any) -> float:
+        """Return the middle of the exposure on the monotonic clock, ms; 0 if it is unknown."""
+        rs = self._rs
+        if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
+            return 0.0
+        value = rs.frame_metadata_value
+        back_us = 0.0
+        if all(
+            frame.supports_frame_metadata(one)
+            for one in (value.frame_timestamp, value.sensor_timestamp)
+        ):
+            back_us = frame.get_frame_metadata(value.frame_timestamp) - frame.get_frame_metadata(
+                value.sensor_timestamp
+            )
+        return _monotonic_ms(round(1e6 * frame.get_timestamp())) - 1e-3 * back_us
+
+    def release(self) -> None:
+        """Stop the camera."""
+        if self._pipeline is not None:
+            self._pipeline.stop()
+        self._pipeline = self._sensor = None
+
+
+class GstreamerCapture(CapturedDevice):
+    """GStreamer pipeline; device: its text up to raw video, such as `v4l2src device=/dev/video0`.
+
+    The pipeline decides format and controls; its timestamps are those of its source.
+    """
+
+    def __init__(self, device: str) -> None:
+        super().__init__(device)
+        self._gst = _import_introspected("Gst", "1.0")
+        self._gst.init(None)
+        self._pipeline: Any = None
+        self._size = (0.0, 0.0, 0.0)
+
+    def _start(self) -> None:
+        gst = self._gst
+        text = (
+            f"{self.device} ! videoconvert ! video/x-raw,format=GRAY8 ! "
+            f"appsink name=sink sync=false max-buffers={BUFFERS} drop=true"
+        )
+        try:
+            self._pipeline = gst.parse_launch(text)
+        except Exception as error:  # GLib.Error, which is known only after the import.
+            raise DeviceError(f"{self.device!r}: no valid GStreamer pipeline: {error}") from error
+        self._sink = self._pipeline.get_by_name("sink")
+        self._pipeline.use_clock(gst.SystemClock.obtain())
+        self._pipeline.set_state(gst.State.PLAYING)
+        if not self.grab_sample():
+            self.release()
+            raise DeviceError(f"{self.device!r}: the GStreamer pipeline delivers no image")
+
+    def grab_sample(self) -> bool:
+        """Wait for the next image of the running pipeline; return False if there is none."""
+        gst = self._gst
+        sample = self._sink.emit("try-pull-sample", round(1e9 * GRAB_S))
+        if sample is None:
+            return False
+        buffer, caps = sample.get_buffer(), sample.get_caps().get_structure(0)
+        width, height = caps.get_value("width"), caps.get_value("height")
+        found, rate, per = caps.get_fraction("framerate")
+        self._size = float(width), float(height), rate / per if found and per else 0.0
+        data = np.frombuffer(buffer.extract_dup(0, buffer.get_size()), np.uint8)
+        # Rows of a grey image begin at multiples of four bytes.
+        self.image = data.reshape(height, -1)[:, :width].copy()
+        known = buffer.pts != gst.CLOCK_TIME_NONE
+        # The system clock of GStreamer is CLOCK_MONOTONIC.
+        self.stamp_ms = 1e-6 * (buffer.pts + self._pipeline.get_base_time()) if known else 0.0
+        return True
+
+    def grab(self) -> bool:
+        """Wait for the next image; return False if the pipeline has ended or is silent."""
+        self._ensure_started()
+        return self.grab_sample()
+
+    def _get_control(self, property_id: int) -> float:
+        sizes = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
+        if property_id in sizes:
+            return self._size[sizes.index(property_id)]
+        return 0.0
+
+    def release(self) -> None:
+        """Stop the pipeline."""
+        if self._pipeline is not None:
+            self._pipeline.set_state(self._gst.State.NULL)
+        self._pipeline = None
+
+
+CAPTURES: dict[str, type[AravisCapture | GstreamerCapture | RealSenseCapture]] = {
+    "aravis": AravisCapture,
+    "gstreamer": GstreamerCapture,
+    "realsense": RealSenseCapture,
+}
+"""Captures by the name of `api` in the camera's source."""
+
+
+def list_devices(sysfs: Path = Path("/sys/class/video4linux")) -> list[str]:
+    """Return a line for each camera that is found, with its `api` and its name.
+
+    Packages that are not installed are skipped.
+    """
+    found = []
+    for node in sorted(sysfs.glob("video*")):
+        try:
+            name = (node / "name").read_text(encoding="utf-8").strip()
+        except OSError:
+            continue
+        found.append(f"v4l2 /dev/{node.name} ({name})")
+    try:
+        aravis = _import_introspected("Aravis", "0.8")
+        aravis.update_device_list()
+        count = aravis.get_n_devices()
+        found += [f"aravis {aravis.get_device_id(number)}" for number in range(count)]
+    except DeviceError:
+        pass
+    try:
+        rs = _import("pyrealsense2", "")
+        for device in rs.context().query_devices():
+            serial = device.get_info(rs.camera_info.serial_number)
+            found.append(f"realsense {serial} ({device.get_info(rs.camera_info.name)})")
+    except (DeviceError, RuntimeError):
+        pass
+    return found
