@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -243,19 +243,30 @@ def recover(
     epilog=examples(
         "flexsheet bag export session.mcap -o for-foxglove.mcap",
         "flexsheet bag export session.mcap -o small.mcap --topic fingertip --topic sheet_target",
+        "flexsheet bag export session.mcap -o for-ros --format ros2",
     )
 )
 def export(
+    *,
     bag: BagArgument,
     target: FormerOutput = None,
-    output: Annotated[Path | None, output_file("MCAP file to write.")] = None,
+    output: Annotated[
+        Path | None,
+        output_file("MCAP file to write; for ROS 2 also a folder, which is then a bag of ROS 2."),
+    ] = None,
+    form: Annotated[
+        Literal["foxglove", "ros2"],
+        typer.Option("--format", help="foxglove: for Foxglove and Rerun; ros2: for ROS 2."),
+    ] = "foxglove",
     topics: TopicsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Convert a bag to an MCAP file that the viewers Foxglove and Rerun can show."""
-    from flexsheet.launch.bags.export import export as export_bag
-
+    """Convert a bag to an MCAP file for the viewers Foxglove and Rerun, or for ROS 2."""
     output = _require_output(output or target)
+    if form == "ros2":
+        from flexsheet.launch.bags.export_ros2 import export_ros2 as export_bag
+    else:
+        from flexsheet.launch.bags.export import export as export_bag
     with progress_bar(f"exporting {bag.name}") as progress:
         result = export_bag(bag, output, topics=topics, progress=progress)
     if result.unreadable:
