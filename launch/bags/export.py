@@ -161,12 +161,12 @@ class TopicsToExport:
     clock_id: str | None
 
 
-def select_topics(bag: Path, output: Path, topics: Iterable[str] | None) -> TopicsToExport:
+def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) -> TopicsToExport:
     """Select the topics of a bag to export; default: all that can be read.
 
     Raises ExportError if the output exists or the bag does not contain a topic, and BagError.
     """
-    if output.exists():
+    if output is not None and output.exists():
         raise ExportError(f"{output}: file exists already; give the name of a new file")
     reader = BagReader(bag)
     summary = reader.info()

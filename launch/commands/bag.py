@@ -37,6 +37,7 @@ from flexsheet.launch.commands.output import (
 )
 
 if TYPE_CHECKING:
+    from flexsheet.launch.bags.export import ExportResult
     from flexsheet.launch.bags.replay import Verification
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
@@ -269,17 +270,33 @@ def export(
         from flexsheet.launch.bags.export import export as export_bag
     with progress_bar(f"exporting {bag.name}") as progress:
         result = export_bag(bag, output, topics=topics, progress=progress)
-    if result.unreadable:
-        listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
-        more = len(result.unreadable) - MAX_TOPICS_LISTED
-        also = f" and {more} more" if more > 0 else ""
-        words.print(
-            f"not exported: {listed}{also} (recorded with incompatible message types)", markup=False
-        )
-    if as_json:
-        print_json({**asdict(result), "output": str(output)})
-        return
-    print_table(("channel", "messages"), sorted(result.messages.items()))
+    _print_export(result, "channel", as_json=as_json)
+
+
+@app.command(
+    "to-parquet",
+    epilog=examples(
+        "flexsheet bag to-parquet session.mcap -o tables",
+        "flexsheet bag to-parquet session.mcap -o tables --topic fingertip --topic sheet_target",
+    ),
+)
+def to_parquet(
+    *,
+    bag: BagArgument,
+    output: Annotated[
+        Path | None, output_file("Folder to write; default: next to the bag.", "FOLDER")
+    ] = None,
+    topics: TopicsOption = None,
+    images: Annotated[bool, typer.Option("--images", help="Write images too, as bytes.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Convert a bag to one table per topic, for pandas and other tools that read Parquet files."""
+    from flexsheet.launch.bags.parquet import write_parquet
+
+    output = output or bag.with_suffix("")
+    with progress_bar(f"converting {bag.name}") as progress:
+        result = write_parquet(bag, output, topics=topics, images=images, progress=progress)
+    _print_export(result, "topic", as_json=as_json)
 
 
 @app.command(
@@ -397,6 +414,21 @@ def plot(
         print_json([one.to_json() for one in series])
     else:
         print(image)
+
+
+def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
+    """Print how many messages were written by topic or channel, and what could not be read."""
+    if result.unreadable:
+        listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
+        more = len(result.unreadable) - MAX_TOPICS_LISTED
+        also = f" and {more} more" if more > 0 else ""
+        words.print(
+            f"not exported: {listed}{also} (recorded with incompatible message types)", markup=False
+        )
+    if as_json:
+        print_json({**asdict(result), "output": str(result.output)})
+        return
+    print_table((unit, "messages"), sorted(result.messages.items()))
 
 
 def _require_output(output: Path | None) -> Path:

@@ -20,13 +20,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel, TypeAdapter
 
 from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.base import Message, find_stamp_fields
+from flexsheet.messages.field_types import get_annotation, is_image, split_annotation
 
 PACKAGE = "flexsheet_msgs"
 HEADER = "std_msgs/Header header\nstring writer\nuint64 sequence_number\n"
@@ -53,20 +54,13 @@ def ros_name(kind: type[BaseModel]) -> str:
     return f"{PACKAGE}/msg/{kind.__name__}"
 
 
-def is_image(spec: ArraySpec) -> bool:
-    """Return whether an array is an image: it has more than one axis of variable length."""
-    return sum(isinstance(length, str) for length in spec.shape) > 1
-
-
 @cache
 def list_fields(kind: type[BaseModel]) -> tuple[OwnField, ...]:
     """Return the fields of a message or group in their order, without images."""
     stamps = find_stamp_fields(kind) if issubclass(kind, Message) else ()
     fields = []
     for name, info in kind.model_fields.items():
-        annotation: Any = info.annotation
-        for mark in info.metadata:
-            annotation = Annotated[annotation, mark]
+        annotation = get_annotation(info)
         if name in stamps:
             fields.append(OwnField(name, "builtin_interfaces/Time", _convert_stamp))
         elif not _holds_images(annotation):
@@ -117,7 +111,7 @@ def _list_groups(kind: type[BaseModel]) -> list[type[BaseModel]]:
 
 def _describe(annotation: Any) -> tuple[str, Callable[[Any, Make], Any]]:
     """Return the ROS type of an annotation, and the function that converts its values."""
-    annotation, spec = _unwrap(annotation)
+    annotation, spec = split_annotation(annotation)
     if spec is not None:
         return _describe_array(spec)
     scalar = _find_scalar(annotation)
@@ -177,18 +171,9 @@ def _find_scalar(annotation: Any) -> str | None:
     return {bool: "bool", int: "int64", float: "float64"}.get(annotation)
 
 
-def _unwrap(annotation: Any) -> tuple[Any, ArraySpec | None]:
-    """Return an annotation without its marks, and the array specification among them."""
-    spec = None
-    while get_origin(annotation) is Annotated:
-        annotation, *marks = get_args(annotation)
-        spec = next((mark for mark in marks if isinstance(mark, ArraySpec)), spec)
-    return annotation, spec
-
-
 def _holds_images(annotation: Any) -> bool:
     """Return whether a value is an image, a tuple of images or an optional image."""
-    inner, spec = _unwrap(annotation)
+    inner, spec = split_annotation(annotation)
     if spec is not None:
         return is_image(spec)
     if get_origin(inner) in (tuple, Union, types.UnionType):
