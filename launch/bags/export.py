@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
-from flexsheet.launch.ros2.mapping import SHEET_COLOUR, find_sheet_corners
+from flexsheet.launch.ros2.mapping import CONTEXT_TOPICS, SHEET_COLOUR, find_sheet_corners
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
@@ -68,8 +68,6 @@ FINGER_RADIUS_M = 0.007
 NamedImage = tuple[str, NDArray[np.uint8]]
 Output = tuple[str, Any]
 
-
-CONTEXT_TOPICS = {"scene", "skin", "arm_left", "arm_right"}
 
 MIN_FREE_BYTES = 4 << 20
 """Minimum free disk space during an export. It exceeds the write buffer of the library."""

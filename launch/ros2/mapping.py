@@ -45,6 +45,9 @@ Floats = NDArray[np.float64]
 OWN_PREFIX = "/flexsheet/"
 WORLD = "world"
 JOINTS = 6
+CONTEXT_TOPICS = frozenset({"scene", "skin", "arm_left", "arm_right"})
+"""Topics that contain what is needed to convert messages of other topics."""
+
 SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
 _TRIANGLE_LIST = 11
 _FLOAT32 = 7
@@ -519,6 +522,7 @@ VIEWS = (
 )  # fmt: skip
 
 
+@cache
 def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
     """Return the ROS topics of a topic: standard views, then the own type with all fields."""
     found: list[tuple[RosTopic, View | None]] = [
@@ -541,11 +545,17 @@ class Converter:
     flanges: dict[Side, Floats] = field(default_factory=dict)
 
     def convert(
-        self, topic: str, message: Message, header: Header, shift_ns: int
+        self,
+        topic: str,
+        message: Message,
+        header: Header,
+        shift_ns: int,
+        wanted: Callable[[RosTopic], bool] = lambda _: True,
     ) -> Iterator[tuple[RosTopic, Any]]:
         """Yield the ROS messages of a message, each with its ROS topic.
 
-        shift_ns: time since 1970 minus the time of the header's clock.
+        shift_ns: time since 1970 minus the time of the header's clock. wanted: function that
+        returns whether a message for a ROS topic is needed.
         """
         match message:
             case Scene():
@@ -558,6 +568,8 @@ class Converter:
         message = shift_stamps(message, shift_ns)
         source = Source(self.ros, topic, at_ns, self.scene, self.skin, self.flanges)
         for ros_topic, view in list_ros_topics(TOPICS[topic]):
+            if not wanted(ros_topic):
+                continue
             made = self._make_own(message, header, at_ns) if view is None else view.make(
                 message, source
             )  # fmt: skip
