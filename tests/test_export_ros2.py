@@ -97,8 +97,8 @@ def test_an_independent_reader_finds_all_values(bag: Path, tmp_path: Path) -> No
     assert list(command.points[0].positions) == list(range(6))
     assert at_ns(command.header) == STARTED_UNIX_NS
     frames = {one.child_frame_id: one for _, tf in found["/tf"] for one in tf.transforms}
-    assert frames.keys() == {"fingertip", "left_flange", "right_flange"}
-    assert frames["left_flange"].transform.translation.x == -0.15
+    assert frames.keys() == {"fingertip", "left_flange_measured", "right_flange_measured"}
+    assert frames["left_flange_measured"].transform.translation.x == -0.15
 
     image = found["/stereo/left/image_raw"][0][1]
     assert (image.width, image.height, image.step, image.encoding) == (4, 3, 4, "mono8")

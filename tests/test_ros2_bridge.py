@@ -135,7 +135,7 @@ async def test_ros_sees_arms_fingertip_and_images(tmp_path: Path) -> None:
             publish("stereo", stereo)
             names = ("rt/fingertip/point", "rt/joint_states", "rt/stereo/left/image_raw")
             frames = {frame for one in found.get("rt/tf", []) for frame in one["frames"]}
-            return peer.has(*names) and {"fingertip", "right_flange"} <= frames
+            return peer.has(*names) and {"fingertip", "right_flange_measured"} <= frames
 
         await until(all_arrived, found, period_s=0.05)
     point = found["rt/fingertip/point"][0]

@@ -2,8 +2,11 @@
 
 `VIEWS` lists the ROS topics with standard types, and `INPUTS` those that a ROS node may publish for
 flexsheet. In addition, each topic appears with all its fields as `flexsheet/TOPIC`, with its own
-type (`definitions`). Frames: `world`, and in it `object`, `camera_left`, `camera_right`,
-`projector`, `left_base`, `right_base`, `left_flange`, `right_flange`, `sheet`, `fingertip`.
+type (`definitions`).
+
+Frames in `world`: `object`, `camera_left`, `camera_right`, `projector`, `left_base`, `right_base`,
+`left_flange_measured`, `right_flange_measured`, `sheet`, `fingertip`.  A robot model that ROS nodes
+load can have flanges of its own, which follow from the joint angles.
 """
 
 from __future__ import annotations
@@ -420,6 +423,10 @@ def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floa
     return np.array(corners)
 
 
+def _flange_frame(arm: ArmState, source: Source) -> Any:
+    return _frames(source, {f"{arm.side}_flange_measured": arm.world_from_flange})
+
+
 def _sheet_marker(_: ArmState, source: Source) -> Any | None:
     corners = find_sheet_corners(source.scene, source.flanges)
     if corners is None:
@@ -492,7 +499,7 @@ VIEWS = (
     View(ArmState, "world_from_flange", "{topic}/flange", _POSE,
          lambda arm, source: _pose(source, arm.world_from_flange)),
     View(ArmState, "world_from_flange", "tf", _TF,
-         lambda arm, source: _frames(source, {f"{arm.side}_flange": arm.world_from_flange})),
+         _flange_frame),
     View(ArmState, "world_from_flange of both arms", "sheet/marker",
          "visualization_msgs/msg/Marker", _sheet_marker),
     View(Skin, "vertices_world_m", "{topic}/points", _CLOUD,
