@@ -15,9 +15,10 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch.bags.export import ExportError
 from flexsheet.launch.cli import main
-from flexsheet.launch.ros2.definitions import list_fields, make_definitions
+from flexsheet.launch.ros2.definitions import Ros2Error, list_fields, make_definitions
 from flexsheet.launch.ros2.mapping import VIEWS, list_ros_topics
-from flexsheet.messages.base import Message
+from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.base import Header, Message
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Eye, Force, Frame, Status, TwinEye, TwinFinger
 from flexsheet.nodes.models.rigid import is_rigid, rotation_from_rpy
@@ -226,6 +227,16 @@ def test_selected_topics_still_know_the_scene(bag: Path, tmp_path: Path) -> None
     found = opened(export_ros2(bag, tmp_path / "out.mcap", topics=["stereo"]).output)
     assert "/stereo/left/camera_info" in found
     assert "/tf_static" not in found
+
+
+def test_a_time_that_ros_cannot_represent_is_refused(tmp_path: Path) -> None:
+    bag = tmp_path / "late.mcap"
+    with BagWriter(bag, {"recording": {"clock_id": "c"}}) as writer:
+        header = Header(1, 2**62, 2**62, "c", "node", 1)
+        writer.write(TOPICS["eye"], FURTHER[0][1], header, 2**62)
+    with pytest.raises(Ros2Error, match="from 1970 to 2038"):
+        export_ros2(bag, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_existing_output_stays(bag: Path, tmp_path: Path) -> None:

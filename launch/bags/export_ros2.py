@@ -18,6 +18,7 @@ from flexsheet.launch.bags.export import (
     select_topics,
     wall_clock_offset_ns,
 )
+from flexsheet.launch.ros2.definitions import split_time
 from flexsheet.launch.ros2.mapping import Converter, RosTopic, load_ros_types
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.files import make_write_error
@@ -59,6 +60,7 @@ def export_ros2(
             reader = BagReader(bag, {*selection.readable, *selection.context})
             for number, (topic, message, header, log_ns) in enumerate(reader):
                 check_free_space(output)
+                split_time(log_ns + offset_ns)
                 # The recorder receives a message almost when it is published.
                 same_clock = header.clock_id == selection.clock_id
                 shift_ns = offset_ns if same_clock else offset_ns + log_ns - header.publish_ns

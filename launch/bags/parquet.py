@@ -240,7 +240,7 @@ class TableBuilder:
 
     def __init__(self, topic: str, selection: TopicsToExport, *, images: bool) -> None:
         arrow = _arrow()
-        self._selection = selection
+        self._selection, self._topic = selection, topic
         self._columns = list_columns(find_topic(topic).message, images=images)
         self._first = {
             "time_s": arrow.float64(),
@@ -292,10 +292,14 @@ class TableBuilder:
         """Return the rows as a table, and forget them."""
         arrow = _arrow()
         columns = zip(*self._rows, strict=True) if self._rows else ((),) * len(self.schema)
-        arrays = [
-            arrow.array(list(values), type=kind)
-            for values, kind in zip(columns, self.schema.types, strict=True)
-        ]
+        try:
+            arrays = [
+                arrow.array(list(values), type=kind)
+                for values, kind in zip(columns, self.schema.types, strict=True)
+            ]
+        except (OverflowError, arrow.ArrowInvalid) as error:
+            path = self._selection.reader.path
+            raise ExportError(f'{path}: topic "{self._topic}": {error}') from error
         self._rows, self._bytes = [], 0
         return arrow.table(arrays, schema=self.schema)
 

@@ -14,11 +14,11 @@ from typing import Any
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.ros2.dds import RosParticipant
+from flexsheet.launch.ros2.definitions import Ros2Error
 from flexsheet.launch.ros2.inputs import INPUTS, ExternalInputs
 from flexsheet.launch.ros2.mapping import (
     CONTEXT_TOPICS,
     Converter,
-    Ros2Error,
     list_ros_topics,
     load_ros_types,
 )

@@ -17,7 +17,8 @@ from typing import Any
 
 import psutil
 
-from flexsheet.launch.ros2.mapping import Ros2Error, RosTopic, load_ros_types
+from flexsheet.launch.ros2.definitions import Ros2Error
+from flexsheet.launch.ros2.mapping import RosTopic, load_ros_types
 
 LOOPBACK = "lo"
 MAX_DOMAIN = 232

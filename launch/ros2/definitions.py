@@ -27,6 +27,7 @@ from pydantic import BaseModel, TypeAdapter
 
 from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.base import Message, find_stamp_fields
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.field_types import get_annotation, is_image, split_annotation
 
 PACKAGE = "flexsheet_msgs"
@@ -40,6 +41,13 @@ Make = Callable[[str, dict[str, Any]], Any]
 """Function that makes a ROS message from the name of its type and its fields."""
 
 
+class Ros2Error(FlexsheetError, RuntimeError):
+    """Messages cannot be exchanged with ROS 2; the text gives the reason and the remedy."""
+
+    code = "ros2"
+    remedy = "Install the packages of the extra `flexsheet[ros2]`, or correct the named value."
+
+
 @dataclass(frozen=True, slots=True)
 class OwnField:
     """Field of a ROS type: name, ROS type, and function that converts a value of the field."""
@@ -47,6 +55,17 @@ class OwnField:
     name: str
     ros_type: str
     convert: Callable[[Any, Make], Any]
+
+
+def split_time(at_ns: int) -> dict[str, int]:
+    """Return the fields of a ROS time. Raises Ros2Error for a time before 1970 or after 2038."""
+    seconds, nanoseconds = divmod(at_ns, 1_000_000_000)
+    if not 0 <= seconds < 1 << 31:
+        raise Ros2Error(
+            f"the timestamp {at_ns} ns is not a time of ROS 2, which counts from 1970 to 2038; "
+            "check the bag with `flexsheet bag info`"
+        )
+    return {"sec": seconds, "nanosec": nanoseconds}
 
 
 def ros_name(kind: type[BaseModel]) -> str:
@@ -190,5 +209,4 @@ def _convert_group(value: BaseModel, make: Make) -> Any:
 
 
 def _convert_stamp(value: int, make: Make) -> Any:
-    seconds, nanoseconds = divmod(value, 1_000_000_000)
-    return make("builtin_interfaces/msg/Time", {"sec": seconds, "nanosec": nanoseconds})
+    return make("builtin_interfaces/msg/Time", split_time(value))

@@ -20,10 +20,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.ros2.definitions import convert_fields, make_definitions, ros_name
+from flexsheet.launch.ros2.definitions import (
+    Ros2Error,
+    convert_fields,
+    make_definitions,
+    ros_name,
+    split_time,
+)
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock_table import shift_stamps
-from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, Scene
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import (
@@ -54,13 +59,6 @@ CONTEXT_TOPICS = frozenset({"scene", "skin", "arm_left", "arm_right"})
 SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
 _TRIANGLE_LIST = 11
 _FLOAT32 = 7
-
-
-class Ros2Error(FlexsheetError, RuntimeError):
-    """Messages cannot be exchanged with ROS 2; the text gives the reason and the remedy."""
-
-    code = "ros2"
-    remedy = "Install the packages of the extra `flexsheet[ros2]`, or correct the named value."
 
 
 class RosTypes:
@@ -94,8 +92,7 @@ class RosTypes:
         return self.store.deserialize_cdr(data, name)
 
     def stamp(self, at_ns: int) -> Any:
-        seconds, nanoseconds = divmod(at_ns, 1_000_000_000)
-        return self.make("builtin_interfaces/msg/Time", {"sec": seconds, "nanosec": nanoseconds})
+        return self.make("builtin_interfaces/msg/Time", split_time(at_ns))
 
     def header(self, at_ns: int, frame: str = WORLD) -> Any:
         return self.make("std_msgs/msg/Header", {"stamp": self.stamp(at_ns), "frame_id": frame})
