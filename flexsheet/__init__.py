@@ -11,6 +11,7 @@ import sys
 # Importing `typing` would lengthen the time in which an interrupt meets Python's own handler.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from flexsheet.launch.bags.parquet import read_table
     from flexsheet.launch.experiments import ExperimentError
     from flexsheet.launch.experiments.driver import Driver
     from flexsheet.launch.experiments.run import run_experiment
@@ -51,6 +52,7 @@ _MODULES = {
     "load_graph": "flexsheet.launch.plans.plan",
     "load_scene": "flexsheet.launch.plans.plan",
     "periodic": "flexsheet.nodes.node",
+    "read_table": "flexsheet.launch.bags.parquet",
     "read_topic": "flexsheet.launch.running.tools",
     "recover": "flexsheet.messages.bag",
     "run_experiment": "flexsheet.launch.experiments.run",
@@ -88,6 +90,7 @@ __all__ = [
     "load_graph",
     "load_scene",
     "periodic",
+    "read_table",
     "read_topic",
     "recover",
     "run_experiment",

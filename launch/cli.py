@@ -35,6 +35,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "param": ("param",),
     "topic": ("topic",),
     "bag": ("bag",),
+    "ros2-bridge": ("ros2_bridge",),
     "arms": ("arms",),
     "experiment": ("experiment", "experiment_jnd", "experiment_sweeps"),
     "apparatus": ("apparatus",),

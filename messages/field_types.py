@@ -20,6 +20,28 @@ def describe_field_type(field: FieldInfo) -> str:
     return _type(field.annotation)
 
 
+def get_annotation(field: FieldInfo) -> Any:
+    """Return a field's type with its marks, as one annotation."""
+    annotation: Any = field.annotation
+    for mark in field.metadata:
+        annotation = Annotated[annotation, mark]
+    return annotation
+
+
+def split_annotation(annotation: Any) -> tuple[Any, ArraySpec | None]:
+    """Return an annotation without its marks, and the array specification among them."""
+    spec = None
+    while get_origin(annotation) is Annotated:
+        annotation, *marks = get_args(annotation)
+        spec = next((mark for mark in marks if isinstance(mark, ArraySpec)), spec)
+    return annotation, spec
+
+
+def is_image(spec: ArraySpec) -> bool:
+    """Return whether an array is an image: it has more than one axis of variable length."""
+    return sum(isinstance(length, str) for length in spec.shape) > 1
+
+
 def _type(annotation: Any) -> str:
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin is Annotated:

@@ -104,7 +104,9 @@ def test_a_former_name_of_an_option_is_no_longer_one(former: str) -> None:
     assert f"--{former}" not in options
 
 
-VALUE_NAME = re.compile(r"[A-Z][A-Z0-9_.=-]*([x|,: ][A-Z0-9_.]+|\|seed:N)*|[a-z]+(\|[a-z]+)+|'X.*'")
+VALUE_NAME = re.compile(
+    r"[A-Z][A-Z0-9_.=-]*([x|,: ][A-Z0-9_.]+|\|seed:N)*|[a-z]+(\|[a-z0-9]+)+|'X.*'"
+)
 """Names in capitals; a choice is written as it is."""
 
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
+from flexsheet.launch.ros2.mapping import CONTEXT_TOPICS, SHEET_COLOUR, find_sheet_corners
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
@@ -41,12 +42,12 @@ from flexsheet.messages.types import (
     Fingertip,
     Frame,
     SheetTarget,
+    Side,
     Skin,
     SoftBody,
     StereoPair,
     TwinEye,
 )
-from flexsheet.nodes.models.rigid import pose_matrix
 
 try:
     import foxglove
@@ -60,7 +61,6 @@ PLOTTED = 64
 """Maximum number of values of an array that is exported as JSON."""
 
 SKIN_COLOUR = (0.85, 0.55, 0.50, 1.0)
-SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
 FINGER_COLOUR = (0.30, 0.65, 0.45, 1.0)
 LOST_COLOUR = (0.60, 0.60, 0.60, 0.5)
 FINGER_RADIUS_M = 0.007
@@ -105,27 +105,21 @@ def export(
         raise ExportError(
             "bag export needs the package foxglove-sdk: pip install 'flexsheet[export]'"
         )
-    if output.exists():
-        raise ExportError(f"{output}: file exists already; give the name of a new file")
-    reader = BagReader(bag)
-    summary = reader.info()
-    wanted = set(reader.topics if topics is None else topics)
-    if absent := sorted(wanted - reader.topics.keys()):
-        names = ", ".join(sorted(reader.topics)) or "no topic"
-        raise ExportError(f"{bag}: does not contain {', '.join(absent)}; it contains {names}")
-    readable = {one.name for one in summary.topics if one.readable} & wanted
-    offset_ns = _wall_clock_offset_ns(reader)
-    result = ExportResult(output, unreadable=tuple(sorted(wanted - readable)))
+    selection = select_topics(bag, output, topics)
+    offset_ns = wall_clock_offset_ns(selection.reader)
+    result = ExportResult(output, unreadable=selection.unreadable)
     context = foxglove.Context()
     channels: dict[str, Any] = {}
     draft = output.with_name(f"{output.name}.part")
     state = ViewState()
     try:
-        _check_free_space(output)
+        check_free_space(output)
         with foxglove.open_mcap(draft, context=context, allow_overwrite=True) as writer:
-            for number, (topic, message, _, log_time_ns) in enumerate(BagReader(bag, readable)):
+            for number, (topic, message, _, log_time_ns) in enumerate(
+                BagReader(bag, selection.readable)
+            ):
                 # On a full disk, the library would print a line for each message.
-                _check_free_space(output)
+                check_free_space(output)
                 at_ns = log_time_ns + (offset_ns or 0)
                 views = state.views(topic, message, at_ns)
                 for name, value in ((topic, _plain(message)), *views):
@@ -134,8 +128,8 @@ def export(
                     channel.log(value, log_time=at_ns)
                     result.messages[name] = result.messages.get(name, 0) + 1
                 if number % 200 == 0:
-                    progress((log_time_ns - summary.start_ns) * 1e-9, summary.duration_s)
-            complete = str(summary.complete)
+                    progress((log_time_ns - selection.start_ns) * 1e-9, selection.duration_s)
+            complete = str(selection.reader.complete)
             writer.write_metadata("flexsheet", {"bag": bag.name, "complete": complete})
         draft.replace(output)
     except OSError as error:
@@ -147,7 +141,51 @@ def export(
     return result
 
 
-def _check_free_space(output: Path) -> None:
+@dataclass(frozen=True, slots=True)
+class TopicsToExport:
+    """Bag to export with its start and duration, and names of its topics to export.
+
+    context: other topics that contain what is needed to draw the topics to export. unreadable:
+    requested topics whose message type cannot be migrated. clock_id: clock of the recorder; None if
+    it is unknown.
+    """
+
+    reader: BagReader
+    start_ns: int
+    duration_s: float
+    readable: tuple[str, ...]
+    context: tuple[str, ...]
+    unreadable: tuple[str, ...]
+    clock_id: str | None
+
+
+def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) -> TopicsToExport:
+    """Select the topics of a bag to export; default: all that can be read.
+
+    Raises ExportError if the output exists or the bag does not contain a topic, and BagError.
+    """
+    if output is not None and output.exists():
+        raise ExportError(f"{output}: file exists already; give the name of a new file")
+    reader = BagReader(bag)
+    summary = reader.info()
+    wanted = set(reader.topics if topics is None else topics)
+    if absent := sorted(wanted - reader.topics.keys()):
+        names = ", ".join(sorted(reader.topics)) or "no topic"
+        raise ExportError(f"{bag}: does not contain {', '.join(absent)}; it contains {names}")
+    all_readable = {one.name for one in summary.topics if one.readable}
+    readable = all_readable & wanted
+    return TopicsToExport(
+        reader,
+        summary.start_ns,
+        summary.duration_s,
+        tuple(sorted(readable)),
+        tuple(sorted(CONTEXT_TOPICS & all_readable - readable)),
+        tuple(sorted(wanted - readable)),
+        summary.metadata.get("recording", {}).get("clock_id"),
+    )
+
+
+def check_free_space(output: Path) -> None:
     """Raise OSError if the disk is nearly full."""
     if free_bytes(output.parent) < MIN_FREE_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -159,7 +197,7 @@ class ViewState:
 
     scene: Scene | None = None
     skin: Skin | None = None
-    flanges: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    flanges: dict[Side, NDArray[np.float64]] = field(default_factory=dict)
 
     def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
         """Yield the images and 3D data of a message as (channel, Foxglove message)."""
@@ -213,16 +251,11 @@ class ViewState:
 
     def _sheet(self, stamp: Any) -> Any | None:
         """Return the sheet, drawn as a flat quadrilateral between both edges; None if unknown."""
-        if self.scene is None or len(self.flanges) < 2:
+        corners = find_sheet_corners(self.scene, self.flanges)
+        if corners is None:
             return None
-        half_m = 0.5 * self.scene.sheet.height_m
-        corners = []
-        for side, spec in (("left", self.scene.arms.left), ("right", self.scene.arms.right)):
-            flange_from_edge = pose_matrix(spec.flange_from_edge)
-            world_from_edge = self.flanges[side] @ flange_from_edge
-            corners += [(world_from_edge @ [0.0, y_m, 0.0, 1.0])[:3] for y_m in (-half_m, half_m)]
         triangles = np.array([[0, 2, 1], [1, 2, 3]])
-        return _mesh("sheet", np.array(corners), triangles, stamp, SHEET_COLOUR)
+        return _mesh("sheet", corners, triangles, stamp, SHEET_COLOUR)
 
 
 def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
@@ -239,7 +272,7 @@ def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
             yield f"{topic}/expected", message.expected
 
 
-def _wall_clock_offset_ns(reader: BagReader) -> int | None:
+def wall_clock_offset_ns(reader: BagReader) -> int | None:
     """Return what to add to a recorded time to count from 1970, ns; None if it is unknown."""
     recording = reader.metadata.get("recording", {})
     try:

@@ -6,7 +6,7 @@ import asyncio
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -36,6 +36,7 @@ from flexsheet.launch.commands.output import (
 )
 
 if TYPE_CHECKING:
+    from flexsheet.launch.bags.export import ExportResult
     from flexsheet.launch.bags.replay import Verification
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
@@ -240,30 +241,59 @@ def recover(
     epilog=examples(
         "flexsheet bag export session.mcap -o for-foxglove.mcap",
         "flexsheet bag export session.mcap -o small.mcap --topic fingertip --topic sheet_target",
+        "flexsheet bag export session.mcap -o for-ros --format ros2",
     )
 )
 def export(
+    *,
     bag: BagArgument,
     target: FormerOutput = None,
-    output: Annotated[Path | None, output_file("MCAP file to write.")] = None,
+    output: Annotated[
+        Path | None,
+        output_file("MCAP file to write; for ROS 2 also a folder, which is then a bag of ROS 2."),
+    ] = None,
+    form: Annotated[
+        Literal["foxglove", "ros2"],
+        typer.Option("--format", help="foxglove: for Foxglove and Rerun; ros2: for ROS 2."),
+    ] = "foxglove",
     topics: TopicsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Convert a bag to an MCAP file that the viewers Foxglove and Rerun can show."""
-    from flexsheet.launch.bags.export import export as export_bag
-
+    """Convert a bag to an MCAP file for the viewers Foxglove and Rerun, or for ROS 2."""
     output = _require_output(output or target)
+    if form == "ros2":
+        from flexsheet.launch.bags.export_ros2 import export_ros2 as export_bag
+    else:
+        from flexsheet.launch.bags.export import export as export_bag
     with progress_bar(f"exporting {bag.name}") as progress:
         result = export_bag(bag, output, topics=topics, progress=progress)
-    if result.unreadable:
-        listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
-        more = len(result.unreadable) - MAX_TOPICS_LISTED
-        also = f" and {more} more" if more > 0 else ""
-        words.print(f"not exported: {listed}{also} (recorded with incompatible message types)")
-    if as_json:
-        print_json({**asdict(result), "output": str(output)})
-        return
-    print_table(("channel", "messages"), sorted(result.messages.items()))
+    _print_export(result, "channel", as_json=as_json)
+
+
+@app.command(
+    "to-parquet",
+    epilog=examples(
+        "flexsheet bag to-parquet session.mcap -o tables",
+        "flexsheet bag to-parquet session.mcap -o tables --topic fingertip --topic sheet_target",
+    ),
+)
+def to_parquet(
+    *,
+    bag: BagArgument,
+    output: Annotated[
+        Path | None, output_file("Folder to write; default: next to the bag.", "FOLDER")
+    ] = None,
+    topics: TopicsOption = None,
+    images: Annotated[bool, typer.Option("--images", help="Write images too, as bytes.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Convert a bag to one table per topic, for pandas and other tools that read Parquet files."""
+    from flexsheet.launch.bags.parquet import write_parquet
+
+    output = output or bag.with_suffix("")
+    with progress_bar(f"converting {bag.name}") as progress:
+        result = write_parquet(bag, output, topics=topics, images=images, progress=progress)
+    _print_export(result, "topic", as_json=as_json)
 
 
 @app.command(
@@ -381,6 +411,21 @@ def plot(
         print_json([one.to_json() for one in series])
     else:
         print(image)
+
+
+def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
+    """Print how many messages were written by topic or channel, and what could not be read."""
+    if result.unreadable:
+        listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
+        more = len(result.unreadable) - MAX_TOPICS_LISTED
+        also = f" and {more} more" if more > 0 else ""
+        words.print(
+            f"not exported: {listed}{also} (recorded with incompatible message types)", markup=False
+        )
+    if as_json:
+        print_json({**asdict(result), "output": str(result.output)})
+        return
+    print_table((unit, "messages"), sorted(result.messages.items()))
 
 
 def _require_output(output: Path | None) -> Path:

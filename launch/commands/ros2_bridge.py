@@ -1,0 +1,155 @@
+"""`flexsheet ros2-bridge`: connect the running graph to ROS 2."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from enum import StrEnum
+from typing import Annotated, Any
+
+import typer
+
+from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.options import (
+    DurationOption,
+    JsonOption,
+    RunOption,
+    TopicsOption,
+    make_app,
+)
+from flexsheet.launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
+
+app = make_app()
+
+
+class ExternalTopic(StrEnum):
+    """Topic that ROS nodes may publish for flexsheet."""
+
+    EYE = "eye"
+    FINGERTIP = "fingertip"
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet ros2-bridge",
+        "flexsheet ros2-bridge --topic fingertip --topic arm_left --topic arm_right",
+        "flexsheet ros2-bridge --accept eye --domain 5",
+    )
+)
+def ros2_bridge(
+    *,
+    topics: TopicsOption = None,
+    accept: Annotated[
+        list[ExternalTopic] | None,
+        typer.Option(
+            "--accept",
+            help="Topic to accept from ROS nodes, as /external/eye or /external/fingertip; repeat "
+            "for several; default: none.",
+        ),
+    ] = None,
+    noise_mm: Annotated[
+        float,
+        typer.Option(
+            "--noise-mm",
+            metavar="MM",
+            min=0.01,
+            max=50.0,
+            help="Standard deviation of an external fingertip, mm.",
+        ),
+    ] = 1.0,
+    domain: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", min=0, max=232, help="DDS domain; default: ROS_DOMAIN_ID, else 0."
+        ),
+    ] = None,
+    interface: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Network interface. DDS has no authentication here: on another interface than lo, "
+            "everyone in that network can read the topics and publish external inputs.",
+        ),
+    ] = "lo",
+    duration: DurationOption = None,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Publish the topics of the running graph to ROS 2, and accept external inputs.
+
+    RViz and `ros2 bag record` see the arms, the sheet and the fingertip. The bridge uses the
+    loopback interface and never commands the arms.
+    """
+    from flexsheet.launch.ros2.bridge import list_default_topics
+    from flexsheet.launch.ros2.dds import MAX_DOMAIN, RosParticipant
+    from flexsheet.messages.topics import find_topic
+
+    plan, found = running_graph(run)
+    names = topics or list_default_topics(plan)
+    for name in names:
+        find_topic(name)
+        if name not in plan.writers:
+            raise CommandError(
+                f"--topic {name}: the topic has no writer in the running graph", BAD_INPUT
+            )
+    if domain is None:
+        given = os.environ.get("ROS_DOMAIN_ID", "0")
+        if not given.isdigit() or int(given) > MAX_DOMAIN:
+            raise CommandError(
+                f"ROS_DOMAIN_ID={given}: expected a number from 0 to {MAX_DOMAIN}; correct it, or "
+                "give --domain",
+                BAD_INPUT,
+            )
+        domain = int(given)
+    participant = RosParticipant(domain, interface)
+    options = {
+        "topics": names,
+        "accept": [one.value for one in accept or ()],
+        "noise_m": noise_mm * 1e-3,
+    }
+    words.print(f"ROS domain {domain} on {interface}; press Ctrl-C to stop", markup=False)
+    counts: dict[str, Any] = {"published": {}, "accepted": {}, "rejected": {}}
+    work = _run(plan, found, participant, options=options, duration_s=duration, counts=counts)
+    run_interruptible(work)
+    if as_json:
+        print_json(counts)
+        return
+    for what, numbers in counts.items():
+        listed = ", ".join(f"{number} {name}" for name, number in sorted(numbers.items()))
+        words.print(f"{what}: {listed or 'none'}", markup=False)
+
+
+async def _run(
+    plan: Any,
+    run: Any,
+    participant: Any,
+    *,
+    options: dict[str, Any],
+    duration_s: float | None,
+    counts: dict[str, Any],
+) -> int:
+    from flexsheet.launch.ros2.bridge import Ros2Bridge
+
+    try:
+        bridge = Ros2Bridge(
+            plan,
+            run,
+            participant,
+            **options,
+            on_problem=lambda text: words.print(text, markup=False),
+        )
+    except BaseException:
+        participant.close()
+        raise
+    try:
+        bridge.start()
+        async with asyncio.timeout(duration_s):
+            await asyncio.Event().wait()
+    except TimeoutError:
+        pass
+    finally:
+        bridge.close()
+        counts["published"] = dict(bridge.published)
+        counts["accepted"] = dict(bridge.accepted)
+        counts["rejected"] = {str(key): value for key, value in bridge.inputs.rejected.items()}
+    return 0

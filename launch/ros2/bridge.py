@@ -1,0 +1,119 @@
+"""Bridge a running graph to ROS 2: publish its topics over DDS, and accept external inputs.
+
+The bridge reads the graph as a tool does, and may write only topics that tools may write. External
+messages are published under the writer name of tools, by which readers and bags recognize them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Collection
+from functools import partial
+from typing import Any
+
+from flexsheet.launch.plans.plan_model import ResolvedGraph
+from flexsheet.launch.ros2.dds import RosParticipant
+from flexsheet.launch.ros2.definitions import Ros2Error
+from flexsheet.launch.ros2.inputs import INPUTS, ExternalInputs
+from flexsheet.launch.ros2.mapping import (
+    CONTEXT_TOPICS,
+    Converter,
+    list_ros_topics,
+    load_ros_types,
+)
+from flexsheet.launch.running.runs import Run
+from flexsheet.launch.running.tools import GraphWriter, make_subscriber
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Problem, Subscriber
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS, find_topic
+
+
+class Ros2Bridge:
+    """Bridge between one running graph and one DDS participant.
+
+    topics: topics to publish. accept: topics to accept from ROS nodes, keys of `INPUTS`. noise_m:
+    standard deviation of an external fingertip. published, accepted: numbers of messages by topic.
+    """
+
+    def __init__(
+        self,
+        plan: ResolvedGraph,
+        run: Run,
+        participant: RosParticipant,
+        *,
+        topics: Collection[str],
+        accept: Collection[str] = (),
+        noise_m: float,
+        on_problem: Problem,
+    ) -> None:
+        self.published: Counter[str] = Counter()
+        self.accepted: Counter[str] = Counter()
+        self.inputs = ExternalInputs(noise_m)
+        self._participant, self._on_problem = participant, on_problem
+        self._ros = load_ros_types()
+        self._converter = Converter(self._ros)
+        self._clock = SystemClock()
+        self._topics = frozenset(topics)
+        self._writer = GraphWriter(plan, run, accept) if accept else None
+        self._accept = tuple(accept)
+        for name in topics:
+            for ros_topic, _ in list_ros_topics(TOPICS[name]):
+                participant.advertise(ros_topic)
+        context = CONTEXT_TOPICS & plan.writers.keys()
+        self._subscribers: list[Subscriber] = [
+            make_subscriber(name, plan, run, partial(self._on_message, name), on_problem=on_problem)
+            for name in sorted(self._topics | context)
+        ]
+
+    def start(self) -> None:
+        """Connect to the graph and to ROS; requires a running event loop."""
+        for subscriber in self._subscribers:
+            subscriber.start()
+        for name in self._accept:
+            self._participant.subscribe(INPUTS[name].ros_topic, partial(self._on_external, name))
+
+    def close(self) -> None:
+        for subscriber in self._subscribers:
+            subscriber.close()
+        self._participant.close()
+        if self._writer is not None:
+            self._writer.close()
+
+    def _on_message(self, topic: str, message: Any, header: Header) -> None:
+        if isinstance(message, Scene):
+            self.inputs.set_scene(message)
+        now_ns = self._clock.now_ns()
+        shift_ns = time.time_ns() - now_ns
+        if header.clock_id != self._clock.id:
+            # The offset of the other computer's clock is unknown, but small on a fast network.
+            shift_ns += now_ns - header.publish_ns
+        self._publish(topic, message, header, shift_ns)
+
+    def _publish(self, topic: str, message: Message, header: Header, shift_ns: int) -> None:
+        wanted = self._participant.has_readers if topic in self._topics else lambda _: False
+        for ros_topic, made in self._converter.convert(topic, message, header, shift_ns, wanted):
+            try:
+                self._participant.write(ros_topic, self._ros.encode(ros_topic.ros_type, made))
+            except Ros2Error as error:
+                self._on_problem(str(error))
+                continue
+            self.published[ros_topic.name] += 1
+
+    def _on_external(self, topic: str, cdr: bytes) -> None:
+        assert self._writer is not None
+        now_ns = self._clock.now_ns()
+        decode = partial(self._ros.decode, INPUTS[topic].ros_topic.ros_type, cdr)
+        converted = self.inputs.convert(topic, decode, now_ns, time.time_ns())
+        if converted is None:
+            return
+        message, source_ns = converted
+        self._writer.publish(topic, message, source_ns=source_ns)
+        self.accepted[topic] += 1
+
+
+def list_default_topics(plan: ResolvedGraph) -> list[str]:
+    """Return the topics of a graph that are published by default: those recorded by default."""
+    return [name for name in plan.writers if find_topic(name).logged]

@@ -1,0 +1,221 @@
+"""Publish and subscribe to ROS 2 topics over DDS, by Cyclone DDS.
+
+ROS 2 maps the topic `/a` to the DDS topic `rt/a`, and the type `p/msg/T` to `p::msg::dds_::T_`.
+Messages are CDR bytes from `mapping.RosTypes`, so Cyclone DDS only transports them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
+
+import psutil
+
+from flexsheet.launch.ros2.definitions import Ros2Error
+from flexsheet.launch.ros2.mapping import RosTopic, load_ros_types
+
+LOOPBACK = "lo"
+MAX_DOMAIN = 232
+MAX_PARTICIPANTS = 120
+"""Maximum number of DDS participants on this computer that find each other without multicast."""
+
+WAIT_S = 0.2
+BLOCKING_S = 0.1
+MAX_SAMPLES = 100
+_ARRAY_LIMIT = 65535
+
+
+def mangle_topic(name: str) -> str:
+    """Return the DDS topic of a ROS topic."""
+    return f"rt{name}"
+
+
+def mangle_type(name: str) -> str:
+    """Return the DDS type of a ROS type."""
+    package, _, short = name.split("/")
+    return f"{package}::msg::dds_::{short}_"
+
+
+def make_configuration(interface: str) -> str:
+    """Return the configuration of Cyclone DDS for one network interface; on loopback, no multicast.
+
+    Raises Ros2Error for an unknown interface.
+    """
+    if interface not in psutil.net_if_addrs():
+        names = ", ".join(sorted(psutil.net_if_addrs()))
+        raise Ros2Error(f"--interface {interface}: no such network interface; there are {names}")
+    loopback = interface == LOOPBACK
+    multicast = "false" if loopback else "true"
+    peers = '<Peers><Peer Address="127.0.0.1"/></Peers>' if loopback else ""
+    return (
+        "<CycloneDDS><Domain><General>"
+        f"<AllowMulticast>{'false' if loopback else 'spdp'}</AllowMulticast>"
+        f'<Interfaces><NetworkInterface name="{interface}" multicast="{multicast}"/>'
+        "</Interfaces></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        f"<MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>{peers}"
+        "</Discovery></Domain></CycloneDDS>"
+    )
+
+
+@dataclass(slots=True)
+class Sample:
+    """Received message as CDR bytes."""
+
+    cdr: bytes
+    sample_info: Any = None
+
+
+@cache
+def make_dds_type(ros_type: str) -> Any:
+    """Return a Cyclone DDS type for a ROS type, whose samples contain CDR bytes in `cdr`."""
+    described = _describe(ros_type)
+
+    def serialize(self: Any, **_: Any) -> bytes:
+        cdr: bytes = self.cdr
+        return cdr
+
+    def deserialize(_: Any, /, data: bytes, **__: Any) -> Sample:
+        return Sample(bytes(data))
+
+    described.serialize = serialize
+    described.deserialize = classmethod(deserialize)
+    return described
+
+
+@cache
+def _describe(ros_type: str) -> Any:
+    from cyclonedds.idl import make_idl_struct
+    from rosbags.interfaces import Nodetype
+
+    def find_type(kind: Any, detail: Any) -> Any:
+        from cyclonedds.idl import types
+
+        if kind == Nodetype.NAME:
+            return _describe(detail)
+        if kind == Nodetype.BASE:
+            name = {"octet": "byte"}.get(detail[0], detail[0])
+            return {"string": str, "bool": bool}.get(name) or getattr(types, name)
+        item, length = find_type(*detail[0]), detail[1]
+        if kind == Nodetype.ARRAY:
+            return types.array[item, length]
+        return types.sequence[item, length] if 0 < length <= _ARRAY_LIMIT else types.sequence[item]
+
+    _, fields = load_ros_types().store.fielddefs[ros_type]
+    members = {name: find_type(*described) for name, described in fields}
+    return make_idl_struct(re.sub(r"\W", "_", ros_type), mangle_type(ros_type), members)
+
+
+class RosParticipant:
+    """Participant of a DDS domain that publishes and subscribes to ROS topics.
+
+    domain: number, ROS_DOMAIN_ID of the other participants. interface: name of the only network
+    interface that is used. Raises Ros2Error.
+    """
+
+    def __init__(self, domain: int, interface: str = LOOPBACK) -> None:
+        if find_spec("cyclonedds") is None:
+            raise Ros2Error("the bridge needs the package cyclonedds: pip install flexsheet[ros2]")
+        from cyclonedds.core import DDSException, WaitSet
+        from cyclonedds.domain import Domain, DomainParticipant
+
+        configuration = make_configuration(interface)
+        try:
+            self._domain = Domain(domain, configuration)
+            self._participant = DomainParticipant(domain)
+        except DDSException as error:
+            raise Ros2Error(f"DDS domain {domain} on {interface}: {error}") from error
+        self._writers: dict[str, Any] = {}
+        self._readers: list[tuple[Any, Callable[[bytes], None]]] = []
+        self._waiting = WaitSet(self._participant)
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def advertise(self, topic: RosTopic) -> None:
+        """Create the writer of a topic, so that other participants find it."""
+        from cyclonedds.pub import DataWriter
+
+        if topic.name not in self._writers:
+            self._writers[topic.name] = DataWriter(
+                self._participant, self._make_topic(topic), qos=_make_qos(topic)
+            )
+
+    def has_readers(self, topic: RosTopic) -> bool:
+        """Return whether a message would be received now, or by a late reader of a latched one."""
+        return topic.latched or bool(self._writers[topic.name].get_matched_subscriptions())
+
+    def write(self, topic: RosTopic, cdr: bytes) -> None:
+        """Publish a message on an advertised topic. Raises Ros2Error if no reader takes it."""
+        from cyclonedds.core import DDSException
+
+        kind = make_dds_type(topic.ros_type)
+        sample = kind.__new__(kind)
+        sample.cdr = cdr
+        try:
+            self._writers[topic.name].write(sample)
+        except DDSException as error:
+            raise Ros2Error(f"{topic.name}: {error}") from error
+
+    def subscribe(self, topic: RosTopic, on_message: Callable[[bytes], None]) -> None:
+        """Call a function with the CDR bytes of each message, in the running event loop."""
+        from cyclonedds.core import InstanceState as State
+        from cyclonedds.core import ReadCondition, SampleState, ViewState
+        from cyclonedds.sub import DataReader
+
+        reader = DataReader(self._participant, self._make_topic(topic), qos=_make_qos(topic))
+        condition = ReadCondition(reader, ViewState.Any | State.Any | SampleState.NotRead)
+        self._waiting.attach(condition)
+        self._readers.append((reader, on_message))
+        if self._thread is None:
+            loop = asyncio.get_running_loop()
+            self._thread = threading.Thread(
+                target=self._read, args=(loop,), name="ros2", daemon=True
+            )
+            self._thread.start()
+
+    def close(self) -> None:
+        self._closing.set()
+        if self._thread is not None:
+            self._thread.join()
+        self._readers.clear()
+        self._writers.clear()
+        del self._waiting, self._participant, self._domain
+
+    def _make_topic(self, topic: RosTopic) -> Any:
+        from cyclonedds.topic import Topic
+
+        return Topic(self._participant, mangle_topic(topic.name), make_dds_type(topic.ros_type))
+
+    def _read(self, loop: asyncio.AbstractEventLoop) -> None:
+        from cyclonedds.util import duration
+
+        while not self._closing.is_set():
+            self._waiting.wait(duration(milliseconds=round(WAIT_S * 1e3)))
+            for reader, on_message in tuple(self._readers):
+                for sample in reader.take(N=MAX_SAMPLES):
+                    if isinstance(sample, Sample) and not self._closing.is_set():
+                        loop.call_soon_threadsafe(on_message, sample.cdr)
+
+
+def _make_qos(topic: RosTopic) -> Any:
+    """Return the quality of service: reliable; a latched topic also for late readers.
+
+    Readers of ROS 2 are reliable or best-effort by choice, and a reliable writer serves both.  The
+    hash of the type lets ROS 2 Iron and later report the topic without a warning.
+    """
+    from cyclonedds.core import Policy, Qos
+    from cyclonedds.util import duration
+
+    own_hash = load_ros_types().store.hash_rihs01(topic.ros_type)
+    return Qos(
+        Policy.Reliability.Reliable(duration(milliseconds=round(BLOCKING_S * 1e3))),
+        Policy.Durability.TransientLocal if topic.latched else Policy.Durability.Volatile,
+        Policy.History.KeepLast(1 if topic.latched else 10),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.Userdata(f"typehash={own_hash};".encode()),
+    )

@@ -1,0 +1,590 @@
+"""Map topics of flexsheet to topics of ROS 2: one table for recorded and for live messages.
+
+`VIEWS` lists the ROS topics with standard types, and `INPUTS` those that a ROS node may publish for
+flexsheet. In addition, each topic appears with all its fields as `flexsheet/TOPIC`, with its own
+type (`definitions`).
+
+Frames in `world`: `object`, `camera_left`, `camera_right`, `projector`, `left_base`, `right_base`,
+`left_flange_measured`, `right_flange_measured`, `sheet`, `fingertip`.  A robot model that ROS nodes
+load can have flanges of its own, which follow from the joint angles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.launch.ros2.definitions import (
+    Ros2Error,
+    convert_fields,
+    make_definitions,
+    ros_name,
+    split_time,
+)
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock_table import shift_stamps
+from flexsheet.messages.scene import Lens, Scene
+from flexsheet.messages.topics import TOPICS, Delivery, Topic
+from flexsheet.messages.types import (
+    ArmState,
+    EStop,
+    Eye,
+    Fingertip,
+    Force,
+    Frame,
+    SheetTarget,
+    Side,
+    Skin,
+    SoftBody,
+    StereoPair,
+    TwinArms,
+    TwinEye,
+    TwinFinger,
+)
+from flexsheet.nodes.models.rigid import inverse, pose_matrix, quaternion_from_rotation
+
+Floats = NDArray[np.float64]
+OWN_PREFIX = "/flexsheet/"
+WORLD = "world"
+JOINTS = 6
+CONTEXT_TOPICS = frozenset({"scene", "skin", "arm_left", "arm_right"})
+"""Topics that contain what is needed to convert messages of other topics."""
+
+SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
+_TRIANGLE_LIST = 11
+_FLOAT32 = 7
+
+
+class RosTypes:
+    """ROS 2 message types with their CDR codec, including the types of `flexsheet_msgs`.
+
+    Raises Ros2Error if the package rosbags is not installed.
+    """
+
+    def __init__(self) -> None:
+        if find_spec("rosbags") is None:
+            raise Ros2Error("ROS 2 messages need the package rosbags: pip install flexsheet[ros2]")
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        # Humble and later releases have the same definitions of these types.
+        self.store = get_typestore(Stores.ROS2_JAZZY)
+        own: dict[str, Any] = {}
+        for name, text in make_definitions({topic.message for topic in TOPICS.values()}).items():
+            own.update(get_types_from_msg(text, name))
+        self.store.register(own)
+
+    def make(self, name: str, fields: dict[str, Any]) -> Any:
+        """Make a message of a type, such as `std_msgs/msg/Bool`, from its fields."""
+        return self.store.types[name](**fields)
+
+    def encode(self, name: str, message: Any) -> bytes:
+        """Serialize a message to CDR with its four header bytes."""
+        return bytes(self.store.serialize_cdr(message, name))
+
+    def decode(self, name: str, data: bytes) -> Any:
+        """Deserialize a message from CDR."""
+        return self.store.deserialize_cdr(data, name)
+
+    def stamp(self, at_ns: int) -> Any:
+        return self.make("builtin_interfaces/msg/Time", split_time(at_ns))
+
+    def header(self, at_ns: int, frame: str = WORLD) -> Any:
+        return self.make("std_msgs/msg/Header", {"stamp": self.stamp(at_ns), "frame_id": frame})
+
+    def xyz(self, values: Any, kind: str = "Vector3") -> Any:
+        x, y, z = (float(value) for value in values)
+        return self.make(f"geometry_msgs/msg/{kind}", {"x": x, "y": y, "z": z})
+
+    def quaternion(self, rotation: Floats) -> Any:
+        w, x, y, z = quaternion_from_rotation(rotation).tolist()
+        return self.make("geometry_msgs/msg/Quaternion", {"x": x, "y": y, "z": z, "w": w})
+
+    def pose(self, matrix: Floats) -> Any:
+        fields = {"position": self.xyz(matrix[:3, 3], "Point")}
+        return self.make(
+            "geometry_msgs/msg/Pose", fields | {"orientation": self.quaternion(matrix[:3, :3])}
+        )
+
+
+@cache
+def load_ros_types() -> RosTypes:
+    """Return the ROS types; loading them takes about half a second."""
+    return RosTypes()
+
+
+@dataclass(slots=True)
+class Source:
+    """Context in which a message is converted.
+
+    topic: its topic. at_ns: its source timestamp, ns since 1970. scene, skin, flanges: latest ones
+    of the same graph, as far as they are known.
+    """
+
+    ros: RosTypes
+    topic: str
+    at_ns: int
+    scene: Scene | None
+    skin: Skin | None
+    flanges: dict[Side, Floats]
+
+    def stamped(self, kind: str, name: str, value: Any, frame: str = WORLD) -> Any:
+        """Make a message of header and one field."""
+        return self.ros.make(kind, {"header": self.ros.header(self.at_ns, frame), name: value})
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """ROS topic with a standard type that contains a field of a message.
+
+    fields: fields of the message. name: name of the ROS topic without the slash at its start;
+    {topic} is the topic of the message. make: function that returns the ROS message, or None if
+    there is none.
+    """
+
+    message: type[Message]
+    fields: str
+    name: str
+    ros_type: str
+    make: Callable[[Any, Source], Any | None]
+    latched: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RosTopic:
+    """Topic of ROS 2: name, which begins with a slash, type, and whether it is latched."""
+
+    name: str
+    ros_type: str
+    latched: bool
+
+
+def _image(select: Callable[[Any], tuple[NDArray[np.uint8], str] | None]) -> Any:
+    def make(message: Any, source: Source) -> Any | None:
+        found = select(message)
+        if found is None:
+            return None
+        image, frame = found
+        height, width = image.shape[:2]
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        return source.ros.make(
+            "sensor_msgs/msg/Image",
+            {
+                "header": source.ros.header(source.at_ns, frame),
+                "height": height,
+                "width": width,
+                "encoding": "mono8" if channels == 1 else "rgb8",
+                "is_bigendian": 0,
+                "step": width * channels,
+                "data": np.ravel(image),
+            },
+        )
+
+    return make
+
+
+def _camera_info(side: Side) -> Callable[[StereoPair, Source], Any | None]:
+    def make(pair: StereoPair, source: Source) -> Any | None:
+        if source.scene is None:
+            return None
+        camera = source.scene.camera
+        lens: Lens = getattr(camera, side)
+        column, row = getattr(pair, f"{side}_origin_px")
+        height, width = getattr(pair, side).shape
+        matrix = [lens.fx_px, 0.0, lens.cx_px, 0.0, lens.fy_px, lens.cy_px, 0.0, 0.0, 1.0]
+        projection = np.column_stack([np.reshape(matrix, (3, 3)), np.zeros(3)])
+        cropped = (height, width) != (camera.height_px, camera.width_px)
+        roi = {"x_offset": column, "y_offset": row, "height": height, "width": width}
+        if not cropped:  # In ROS, zeros mean the whole image.
+            roi = dict.fromkeys(roi, 0)
+        return source.ros.make(
+            "sensor_msgs/msg/CameraInfo",
+            {
+                "header": source.ros.header(source.at_ns, f"camera_{side}"),
+                "height": camera.height_px,
+                "width": camera.width_px,
+                "distortion_model": "plumb_bob",
+                "d": np.array(lens.distortion),
+                "k": np.array(matrix),
+                "r": np.eye(3).ravel(),
+                "p": projection.ravel(),
+                "binning_x": 0,
+                "binning_y": 0,
+                "roi": source.ros.make(
+                    "sensor_msgs/msg/RegionOfInterest", {**roi, "do_rectify": False}
+                ),
+            },
+        )
+
+    return make
+
+
+def _frames(source: Source, world_from: dict[str, Floats]) -> Any:
+    transforms = [
+        source.ros.make(
+            "geometry_msgs/msg/TransformStamped",
+            {
+                "header": source.ros.header(source.at_ns),
+                "child_frame_id": name,
+                "transform": source.ros.make(
+                    "geometry_msgs/msg/Transform",
+                    {
+                        "translation": source.ros.xyz(matrix[:3, 3]),
+                        "rotation": source.ros.quaternion(matrix[:3, :3]),
+                    },
+                ),
+            },
+        )
+        for name, matrix in world_from.items()
+    ]
+    return source.ros.make("tf2_msgs/msg/TFMessage", {"transforms": transforms})
+
+
+def _static_frames(scene: Scene, source: Source) -> Any:
+    world_from_left = pose_matrix(scene.camera.world_from_left)
+    world_from = {
+        "object": pose_matrix(scene.object.world_from_object),
+        "left_base": pose_matrix(scene.arms.left.world_from_base),
+        "right_base": pose_matrix(scene.arms.right.world_from_base),
+        "camera_left": world_from_left,
+        "camera_right": world_from_left @ inverse(scene.camera.right_from_left),
+    }
+    if scene.projector is not None:
+        world_from["projector"] = pose_matrix(scene.projector.world_from_projector)
+    return _frames(source, world_from)
+
+
+def _point(source: Source, position: Floats) -> Any:
+    return source.stamped(
+        "geometry_msgs/msg/PointStamped", "point", source.ros.xyz(position, "Point")
+    )
+
+
+def _pose(source: Source, matrix: Floats) -> Any:
+    return source.stamped("geometry_msgs/msg/PoseStamped", "pose", source.ros.pose(matrix))
+
+
+def _twist(source: Source, linear: Any, angular: Any = (0.0, 0.0, 0.0)) -> Any:
+    fields = {"linear": source.ros.xyz(linear), "angular": source.ros.xyz(angular)}
+    twist = source.ros.make("geometry_msgs/msg/Twist", fields)
+    return source.stamped("geometry_msgs/msg/TwistStamped", "twist", twist)
+
+
+def _wrench(source: Source, force: Any, frame: str = WORLD) -> Any:
+    fields = {"force": source.ros.xyz(force), "torque": source.ros.xyz(np.zeros(3))}
+    wrench = source.ros.make("geometry_msgs/msg/Wrench", fields)
+    return source.stamped("geometry_msgs/msg/WrenchStamped", "wrench", wrench, frame)
+
+
+FORCE_DIRECTIONS = {
+    "sheet_normal": (0.0, 0.0, -1.0),
+    "left_edge": (1.0, 0.0, 0.0),
+    "right_edge": (-1.0, 0.0, 0.0),
+}
+"""Direction of a positive measured force in the frame of the sheet, by its axis."""
+
+
+def _measured_force(force: Force, source: Source) -> Any | None:
+    if not force.valid:
+        return None
+    return _wrench(source, force.force_n * np.array(FORCE_DIRECTIONS[force.axis]), "sheet")
+
+
+def list_joints(side: str) -> list[str]:
+    """Return the names of an arm's joints."""
+    return [f"{side}_joint_{number}" for number in range(1, JOINTS + 1)]
+
+
+def _joint_states(source: Source, joints_rad: dict[str, Floats]) -> Any:
+    return source.ros.make(
+        "sensor_msgs/msg/JointState",
+        {
+            "header": source.ros.header(source.at_ns, ""),
+            "name": [name for side in joints_rad for name in list_joints(side)],
+            "position": np.concatenate(list(joints_rad.values())),
+            "velocity": np.zeros(0),
+            "effort": np.zeros(0),
+        },
+    )
+
+
+def _joint_command(arm: ArmState, source: Source) -> Any | None:
+    if not arm.command_sent_ns:
+        return None
+    duration = source.ros.make("builtin_interfaces/msg/Duration", {"sec": 0, "nanosec": 0})
+    none = np.zeros(0)
+    point = source.ros.make(
+        "trajectory_msgs/msg/JointTrajectoryPoint",
+        {
+            "positions": arm.joints_commanded_rad,
+            "velocities": none,
+            "accelerations": none,
+            "effort": none,
+            "time_from_start": duration,
+        },
+    )
+    header = source.ros.header(arm.command_sent_ns, "")
+    fields = {"header": header, "joint_names": list_joints(arm.side), "points": [point]}
+    return source.ros.make("trajectory_msgs/msg/JointTrajectory", fields)
+
+
+def _predicted_path(fingertip: Fingertip, source: Source) -> Any | None:
+    if not fingertip.valid:
+        return None
+    step_ns = round(fingertip.prediction_step_s * 1e9)
+    poses = []
+    for number, position in enumerate(fingertip.predicted_path_world_m):
+        matrix = np.eye(4)
+        matrix[:3, 3] = position
+        poses.append(
+            source.ros.make(
+                "geometry_msgs/msg/PoseStamped",
+                {
+                    "header": source.ros.header(source.at_ns + number * step_ns),
+                    "pose": source.ros.pose(matrix),
+                },
+            )
+        )
+    return source.stamped("nav_msgs/msg/Path", "poses", poses)
+
+
+def _fingertip_frame(fingertip: Fingertip, source: Source) -> Any | None:
+    if not fingertip.valid:
+        return None
+    matrix = np.eye(4)
+    matrix[:3, 3] = fingertip.position_world_m
+    return _frames(source, {"fingertip": matrix})
+
+
+def _eye_pose(eye: Eye, source: Source) -> Any | None:
+    """Return the midpoint of the eyes; x of its frame points from the left to the right eye."""
+    if not eye.valid:
+        return None
+    x_axis = eye.right_world / np.linalg.norm(eye.right_world)
+    helper = np.eye(3)[1 if abs(x_axis[1]) < 0.9 else 2]
+    z_axis = np.cross(x_axis, helper)
+    z_axis /= np.linalg.norm(z_axis)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.column_stack([x_axis, np.cross(z_axis, x_axis), z_axis])
+    matrix[:3, 3] = eye.centre_world_m
+    return _pose(source, matrix)
+
+
+def _points(source: Source, points: NDArray[np.float32]) -> Any:
+    field_type = "sensor_msgs/msg/PointField"
+    fields = [
+        source.ros.make(
+            field_type, {"name": name, "offset": 4 * i, "datatype": _FLOAT32, "count": 1}
+        )
+        for i, name in enumerate("xyz")
+    ]
+    return source.ros.make(
+        "sensor_msgs/msg/PointCloud2",
+        {
+            "header": source.ros.header(source.at_ns),
+            "height": 1,
+            "width": len(points),
+            "fields": fields,
+            "is_bigendian": False,
+            "point_step": 12,
+            "row_step": 12 * len(points),
+            "data": np.ascontiguousarray(points, dtype="<f4").view(np.uint8).ravel(),
+            "is_dense": True,
+        },
+    )
+
+
+def _deformed_points(body: SoftBody, source: Source) -> Any | None:
+    if source.skin is None or source.skin.mesh_id != body.mesh_id:
+        return None
+    return _points(source, source.skin.vertices_world_m + body.displacement_world_m)
+
+
+def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floats | None:
+    """Return the corners (4, 3) of the sheet: left below, left above, right below, right above.
+
+    The sheet is drawn flat between both clamped edges.  None if the scene or an arm is unknown.
+    """
+    if scene is None or len(flanges) < 2:
+        return None
+    half_m = 0.5 * scene.sheet.height_m
+    corners = []
+    for side, spec in (("left", scene.arms.left), ("right", scene.arms.right)):
+        world_from_edge = flanges[side] @ pose_matrix(spec.flange_from_edge)  # type: ignore[index]
+        corners += [(world_from_edge @ [0.0, y_m, 0.0, 1.0])[:3] for y_m in (-half_m, half_m)]
+    return np.array(corners)
+
+
+def _flange_frame(arm: ArmState, source: Source) -> Any:
+    return _frames(source, {f"{arm.side}_flange_measured": arm.world_from_flange})
+
+
+def _sheet_marker(_: ArmState, source: Source) -> Any | None:
+    corners = find_sheet_corners(source.scene, source.flanges)
+    if corners is None:
+        return None
+    ros = source.ros
+    red, green, blue, alpha = SHEET_COLOUR
+    colour = ros.make("std_msgs/msg/ColorRGBA", {"r": red, "g": green, "b": blue, "a": alpha})
+    texture = {"header": ros.header(0, ""), "format": "", "data": np.zeros(0, np.uint8)}
+    duration = ros.make("builtin_interfaces/msg/Duration", {"sec": 0, "nanosec": 0})
+    mesh = {"filename": "", "data": np.zeros(0, np.uint8)}
+    return ros.make(
+        "visualization_msgs/msg/Marker",
+        {
+            "header": ros.header(source.at_ns),
+            "ns": "sheet",
+            "id": 0,
+            "type": _TRIANGLE_LIST,
+            "action": 0,
+            "pose": ros.pose(np.eye(4)),
+            "scale": ros.xyz((1.0, 1.0, 1.0)),
+            "color": colour,
+            "lifetime": duration,
+            "frame_locked": False,
+            "points": [ros.xyz(corners[i], "Point") for i in (0, 2, 1, 1, 2, 3)],
+            "colors": [],
+            "texture_resource": "",
+            "texture": ros.make("sensor_msgs/msg/CompressedImage", texture),
+            "uv_coordinates": [],
+            "text": "",
+            "mesh_resource": "",
+            "mesh_file": ros.make("visualization_msgs/msg/MeshFile", mesh),
+            "mesh_use_embedded_materials": False,
+        },
+    )
+
+
+_POINT, _POSE = "geometry_msgs/msg/PointStamped", "geometry_msgs/msg/PoseStamped"
+_TWIST, _WRENCH = "geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/WrenchStamped"
+_IMAGE, _TF = "sensor_msgs/msg/Image", "tf2_msgs/msg/TFMessage"
+_JOINTS, _CLOUD = "sensor_msgs/msg/JointState", "sensor_msgs/msg/PointCloud2"
+
+VIEWS = (
+    View(Scene, "poses of camera, projector, arms, object", "tf_static", _TF, _static_frames,
+         latched=True),
+    View(StereoPair, "left", "{topic}/left/image_raw", _IMAGE,
+         _image(lambda pair: (pair.left, "camera_left"))),
+    View(StereoPair, "right", "{topic}/right/image_raw", _IMAGE,
+         _image(lambda pair: (pair.right, "camera_right"))),
+    View(StereoPair, "left_origin_px, scene.camera.left", "{topic}/left/camera_info",
+         "sensor_msgs/msg/CameraInfo", _camera_info("left")),
+    View(StereoPair, "right_origin_px, scene.camera.right", "{topic}/right/camera_info",
+         "sensor_msgs/msg/CameraInfo", _camera_info("right")),
+    View(Fingertip, "position_world_m", "{topic}/point", _POINT,
+         lambda tip, source: _point(source, tip.position_world_m) if tip.valid else None),
+    View(Fingertip, "velocity_world_m_per_s", "{topic}/velocity", _TWIST,
+         lambda tip, source: _twist(source, tip.velocity_world_m_per_s) if tip.valid else None),
+    View(Fingertip, "predicted_path_world_m", "{topic}/predicted_path", "nav_msgs/msg/Path",
+         _predicted_path),
+    View(Fingertip, "position_world_m", "tf", _TF, _fingertip_frame),
+    View(SheetTarget, "world_from_sheet", "{topic}/pose", _POSE,
+         lambda target, source: _pose(source, target.world_from_sheet)),
+    View(SheetTarget, "twist_world", "{topic}/twist", _TWIST,
+         lambda target, source: _twist(source, target.twist_world[:3], target.twist_world[3:])),
+    View(SheetTarget, "world_from_sheet", "tf", _TF,
+         lambda target, source: _frames(source, {"sheet": target.world_from_sheet})),
+    View(ArmState, "joints_rad", "joint_states", _JOINTS,
+         lambda arm, source: _joint_states(source, {arm.side: arm.joints_rad})),
+    View(ArmState, "joints_commanded_rad", "{topic}/joint_command",
+         "trajectory_msgs/msg/JointTrajectory", _joint_command),
+    View(ArmState, "world_from_flange", "{topic}/flange", _POSE,
+         lambda arm, source: _pose(source, arm.world_from_flange)),
+    View(ArmState, "world_from_flange", "tf", _TF,
+         _flange_frame),
+    View(ArmState, "world_from_flange of both arms", "sheet/marker",
+         "visualization_msgs/msg/Marker", _sheet_marker),
+    View(Skin, "vertices_world_m", "{topic}/points", _CLOUD,
+         lambda skin, source: _points(source, skin.vertices_world_m), latched=True),
+    View(SoftBody, "displacement_world_m", "{topic}/points", _CLOUD, _deformed_points),
+    View(SoftBody, "force_world_n", "{topic}/force", _WRENCH,
+         lambda body, source: _wrench(source, body.force_world_n)),
+    View(Force, "force_n", "{topic}/wrench", _WRENCH, _measured_force),
+    View(Frame, "pixels", "{topic}/image", _IMAGE,
+         _image(lambda frame: (frame.pixels[0], "projector") if frame.pixels else None)),
+    View(Eye, "centre_world_m, right_world", "{topic}/pose", _POSE, _eye_pose),
+    View(EStop, "engaged", "{topic}/engaged", "std_msgs/msg/Bool",
+         lambda estop, source: source.ros.make("std_msgs/msg/Bool", {"data": estop.engaged}),
+         latched=True),
+    View(TwinFinger, "position_world_m", "{topic}/point", _POINT,
+         lambda finger, source: _point(source, finger.position_world_m)),
+    View(TwinFinger, "velocity_world_m_per_s", "{topic}/velocity", _TWIST,
+         lambda finger, source: _twist(source, finger.velocity_world_m_per_s)),
+    View(TwinFinger, "force_world_n", "{topic}/force", _WRENCH,
+         lambda finger, source: _wrench(source, finger.force_world_n)),
+    View(TwinArms, "joints_left_rad, joints_right_rad", "{topic}/joint_states", _JOINTS,
+         lambda arms, source: _joint_states(
+             source, {"left": arms.joints_left_rad, "right": arms.joints_right_rad})),
+    View(TwinEye, "seen", "{topic}/seen", _IMAGE, _image(lambda eye: (eye.seen, "eye"))),
+    View(TwinEye, "expected", "{topic}/expected", _IMAGE,
+         _image(lambda eye: (eye.expected, "eye"))),
+)  # fmt: skip
+
+
+@cache
+def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
+    """Return the ROS topics of a topic: standard views, then the own type with all fields."""
+    found: list[tuple[RosTopic, View | None]] = [
+        (RosTopic("/" + view.name.format(topic=topic.name), view.ros_type, view.latched), view)
+        for view in VIEWS
+        if view.message is topic.message
+    ]
+    latched = topic.delivery is Delivery.LATCHED
+    found.append((RosTopic(OWN_PREFIX + topic.name, ros_name(topic.message), latched), None))
+    return found
+
+
+@dataclass(slots=True)
+class Converter:
+    """Converter of the messages of one graph to ROS 2; it stores what later messages need."""
+
+    ros: RosTypes
+    scene: Scene | None = None
+    skin: Skin | None = None
+    flanges: dict[Side, Floats] = field(default_factory=dict)
+
+    def convert(
+        self,
+        topic: str,
+        message: Message,
+        header: Header,
+        shift_ns: int,
+        wanted: Callable[[RosTopic], bool] = lambda _: True,
+    ) -> Iterator[tuple[RosTopic, Any]]:
+        """Yield the ROS messages of a message, each with its ROS topic.
+
+        shift_ns: time since 1970 minus the time of the header's clock. wanted: function that
+        returns whether a message for a ROS topic is needed.
+        """
+        match message:
+            case Scene():
+                self.scene = message
+            case Skin():
+                self.skin = message
+            case ArmState():
+                self.flanges[message.side] = message.world_from_flange
+        at_ns = max(0, header.source_ns + shift_ns)
+        message = shift_stamps(message, shift_ns)
+        source = Source(self.ros, topic, at_ns, self.scene, self.skin, self.flanges)
+        for ros_topic, view in list_ros_topics(TOPICS[topic]):
+            if not wanted(ros_topic):
+                continue
+            made = self._make_own(message, header, at_ns) if view is None else view.make(
+                message, source
+            )  # fmt: skip
+            if made is not None:
+                yield ros_topic, made
+
+    def _make_own(self, message: Message, header: Header, at_ns: int) -> Any:
+        first = {
+            "header": self.ros.header(at_ns),
+            "writer": header.writer,
+            "sequence_number": header.sequence,
+        }
+        fields = convert_fields(message, self.ros.make)
+        return self.ros.make(ros_name(type(message)), first | fields)
