@@ -55,6 +55,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "systemd": ("systemd",),
     "doctor": ("doctor", "doctor_compliance", "doctor_hosts"),
     "explain": ("explain",),
+    "files": ("files",),
+    "man": ("man",),
 }
 """Modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
