@@ -38,6 +38,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "arms": ("arms",),
     "experiment": ("experiment", "experiment_jnd", "experiment_sweeps"),
     "apparatus": ("apparatus",),
+    "scene": ("scene",),
     "demo": ("demo",),
     "chart": ("chart",),
     "tune": ("tune",),
