@@ -31,6 +31,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "status": ("session:status_app",),
     "logs": ("session:logs_app",),
     "graph": ("drawing",),
+    "view": ("view",),
     "node": ("node",),
     "param": ("param",),
     "topic": ("topic",),
@@ -84,7 +85,7 @@ def _import(module: str) -> Any:
     return import_module(f"flexsheet.launch.commands.{module}")
 
 
-INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms"})
+INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms", "view"})
 """Commands for which Python's SIGINT handler is not installed.
 
 Until their event loop handles SIGINT, the signal ends them without cleanup. In other commands,

@@ -121,6 +121,8 @@ def test_the_wheel_runs_without_a_checkout(installed: Environment, tmp_path: Pat
     for path in shipped["docker"]:
         if path.suffix == ".yaml":
             assert YAML(typ="safe").load(path)["services"]
+    for path in shipped["layout"]:
+        assert json.loads(path.read_text())["configById"]
 
 
 @pytest.mark.long

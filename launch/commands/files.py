@@ -21,6 +21,7 @@ class FileKind(StrEnum):
     LAUNCH = "launch"
     SCENE = "scene"
     CALIBRATION = "calibration"
+    LAYOUT = "layout"
     SYSTEMD = "systemd"
     DOCKER = "docker"
 
@@ -29,6 +30,7 @@ PATTERNS = {
     FileKind.LAUNCH: "*.yaml",
     FileKind.SCENE: "scenes/*",
     FileKind.CALIBRATION: "calibrations/*",
+    FileKind.LAYOUT: "viewing/*.json",
     FileKind.SYSTEMD: "systemd/*",
     FileKind.DOCKER: "../docker/[!.]*",
 }
@@ -42,9 +44,9 @@ def files(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List launch files, scenes, calibrations, systemd units and Compose files.
+    """List launch files, scenes, calibrations, layouts, systemd units and Compose files.
 
-    KIND is launch, scene, calibration, systemd or docker. Copy a file to change it.
+    KIND is launch, scene, calibration, layout, systemd or docker. Copy a file to change it.
     """
     kinds = list(FileKind) if kind is None else [kind]
     rows = [{"kind": str(one), "path": str(path)} for one in kinds for path in list_files(one)]
