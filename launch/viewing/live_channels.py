@@ -179,12 +179,12 @@ def list_channels(topics: list[Topic]) -> Iterator[LiveChannel]:
 
 def _list_image_names(topic: Topic) -> tuple[str, ...]:
     """Return the names of the images in the messages of a topic."""
-    names = {
+    names: dict[type[Message], tuple[str, ...]] = {
         StereoPair: ("left", "right"),
         Frame: ("image",),
         TwinEye: ("seen", "expected"),
     }
-    return names.get(topic.message, ())  # type: ignore[call-overload, no-any-return]
+    return names.get(topic.message, ())
 
 
 def _make_image_maker(topic: str, suffix: str) -> Callable[..., Any]:

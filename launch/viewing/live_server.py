@@ -12,6 +12,7 @@ import asyncio
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import foxglove
@@ -176,7 +177,7 @@ class LiveServer:
                 topic,
                 self._plan,
                 self._run,
-                lambda message, header, topic=topic: self._receive(topic, message, header),
+                partial(self._receive, topic),
                 on_problem=self._on_problem,
             )
             self._subscribers[topic].start()
