@@ -71,7 +71,7 @@ JPEG_QUALITY = 80
 
 
 class Pace(Enum):
-    """How often a channel sends: at the rate of numbers or of images, or each message.
+    """Define how often a channel sends: at the rate of numbers or images, or each message.
 
     STATIC: when the scene changes, and once a second for viewers that connect later.
     """
