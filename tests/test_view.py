@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import socket
 import struct
 from collections import Counter
 from collections.abc import AsyncIterator, Mapping
@@ -22,7 +23,9 @@ pytest.importorskip("foxglove", reason="pip install 'flexsheet[view]'")
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
+from typer.testing import CliRunner, Result
 
+from flexsheet.launch.cli import app
 from flexsheet.launch.commands.files import FileKind, list_files
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -366,6 +369,28 @@ async def test_a_client_of_the_former_protocol_is_refused(short_folder: Path) ->
                 f"ws://127.0.0.1:{server.port}",
                 subprotocols=["foxglove.websocket.v1"],  # type: ignore[list-item]
             )
+
+
+def test_the_command_prints_address_and_layout(
+    short_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("os.nice", lambda _: 0)
+    (short_folder / "plan.json").write_text(load_plan(short_folder).model_dump_json())
+
+    def run(port: int) -> Result:
+        words = ["view", "--run", str(short_folder), "--port", str(port), "--duration", "0.1"]
+        return CliRunner().invoke(app, [*words, "--json"])
+
+    done = run(0)
+    assert done.exit_code == 0, done.output
+    printed = json.loads(done.stdout)
+    assert re.fullmatch(r"ws://127\.0\.0\.1:\d+", printed["address"])
+    assert Path(printed["layout"]).is_file()
+    assert {"fingertip", "tf", "apparatus"} <= set(printed["channels"])
+    with socket.create_server(("127.0.0.1", 0)) as occupied:
+        refused = run(occupied.getsockname()[1])
+    assert refused.exit_code != 0
+    assert "choose another port" in str(refused.exception)
 
 
 @pytest.mark.parametrize("topic", TOPICS)
