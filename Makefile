@@ -15,7 +15,7 @@ SITE_STAMP := $(SITE_VENV)/.installed
 
 .PHONY: setup demo try test test-long lint cached bench bench-gpu bench-peers faults deploy-trial soak fuzz limits load tune-scenes \
 	pages charts \
-	docs lock clean
+	docs lock release clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
@@ -179,6 +179,23 @@ docs: setup $(SITE_STAMP)
 	$(SITE_VENV)/bin/python -m zensical build --clean --strict
 	$(SITE_VENV)/bin/python -m website.finish site
 
+# dist/: source archive, wheel and checksums of the version in pyproject.toml.  The wheel is built
+# from the archive, so that both are complete.
+BUILD = $(CURDIR)/$(BIN)/python -c "import sys; from setuptools import build_meta; \
+	getattr(build_meta, sys.argv[1])(sys.argv[2])"
+release: setup
+	rm -rf dist share build/source
+	mkdir -p share/man/man1 build/source dist
+	$(BIN)/flexsheet man > share/man/man1/flexsheet.1
+	$(BUILD) build_sdist dist > build/release.log
+	tar --extract --directory build/source --strip-components 1 --file dist/*.tar.gz
+	cd build/source && $(BUILD) build_wheel $(CURDIR)/dist >> $(CURDIR)/build/release.log
+	cd dist && sha256sum *.tar.gz *.whl > SHA256SUMS
+	@version=$$($(BIN)/flexsheet --version | cut -d' ' -f2); \
+	grep -q "^## \[$$version\]" CHANGELOG.md || \
+		echo "note: CHANGELOG.md has no section [$$version]; this build is not a release" >&2
+	@ls -1 dist
+
 clean:
-	rm -rf $(VENV) $(SITE_VENV) site .cache build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(SITE_VENV) site .cache build dist share runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

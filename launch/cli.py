@@ -31,6 +31,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "status": ("session:status_app",),
     "logs": ("session:logs_app",),
     "graph": ("drawing",),
+    "view": ("view",),
     "node": ("node",),
     "param": ("param",),
     "topic": ("topic",),
@@ -39,6 +40,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "arms": ("arms",),
     "experiment": ("experiment", "experiment_jnd", "experiment_sweeps"),
     "apparatus": ("apparatus",),
+    "scene": ("scene",),
     "demo": ("demo",),
     "chart": ("chart",),
     "tune": ("tune",),
@@ -56,6 +58,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "systemd": ("systemd",),
     "doctor": ("doctor", "doctor_compliance", "doctor_hosts"),
     "explain": ("explain",),
+    "files": ("files",),
+    "man": ("man",),
 }
 """Modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
@@ -82,7 +86,7 @@ def _import(module: str) -> Any:
     return import_module(f"flexsheet.launch.commands.{module}")
 
 
-INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms"})
+INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms", "view"})
 """Commands for which Python's SIGINT handler is not installed.
 
 Until their event loop handles SIGINT, the signal ends them without cleanup. In other commands,

@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 from flexsheet.launch import cli
 from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.man import list_commands
 from flexsheet.launch.commands.options import FORMER_NAMES
 from flexsheet.launch.commands.output import (
     examples_in,
@@ -29,12 +30,11 @@ from flexsheet.launch.commands.output import (
 )
 from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.plans.plan import load_graph
-from website.commands_page import commands
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-COMMANDS = dict(commands())
+COMMANDS = dict(list_commands())
 
 
 def parse(line: str) -> str:

@@ -43,8 +43,8 @@ SCENE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 OURS = {"flexsheet", "make", "python", "pytest"}
 OTHERS = {
     ".", "cd", "chmod", "chown", "cp", "dask", "docker", "docker/keys.sh", "git", "install",
-    "ip", "journalctl", "mkdir", "nano", "pip-compile", "python", "scp", "sleep", "ssh", "sysctl",
-    "systemctl", "systemd-analyze", "useradd", "^C",
+    "ip", "journalctl", "mkdir", "nano", "pip", "pip-compile", "python", "scp", "sleep", "ssh",
+    "sysctl", "systemctl", "systemd-analyze", "useradd", "^C",
 }  # fmt: skip
 """Other programs that pages may call."""
 

@@ -3,33 +3,15 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator
 from typing import Any
 
-from typer.main import get_command
-
-from flexsheet.launch.cli import app
+from flexsheet.launch.commands.man import list_commands
 from flexsheet.launch.commands.output import examples_in
-
-
-def commands(group: Any = None, prefix: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield the name and the object of all commands, except hidden aliases."""
-    group = group or get_command(app)
-    for name, command in group.commands.items():
-        path = (*prefix, name)
-        if command.hidden:
-            continue
-        if not hasattr(command, "commands"):
-            yield " ".join(path), command
-            continue
-        if command.invoke_without_command:
-            yield " ".join(path), command
-        yield from commands(command, path)
 
 
 def render() -> str:
     """Return a list of links, and a section for each command."""
-    by_name = dict(commands())
+    by_name = dict(list_commands())
     links = "\n".join(f"- [`flexsheet {name}`](#flexsheet-{anchor(name)})" for name in by_name)
     return "\n".join([links + "\n", *(_section(name, one) for name, one in by_name.items())])
 

@@ -1,7 +1,7 @@
 """Export bags as MCAP files with standard schemas, which Foxglove and rerun open.
 
 Each topic becomes a JSON channel of the same name that contains its fields, without arrays of more
-than `PLOTTED` values. Images and 3D data become separate channels:
+than `json_channel.MAX_ARRAY` values. Images and 3D data become separate channels:
 
     stereo/left, stereo/right, frame/image, twin/eye/seen, twin/eye/expected     foxglove.RawImage
     tf          the sheet and both flanges                                foxglove.FrameTransforms
@@ -27,15 +27,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
 from flexsheet.launch.ros2.mapping import CONTEXT_TOPICS, SHEET_COLOUR, find_sheet_corners
+from flexsheet.launch.viewing.json_channel import make_schema
+from flexsheet.launch.viewing.json_channel import to_json as _plain
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import free_bytes, make_write_error
 from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
     ArmState,
     EStop,
@@ -56,9 +58,6 @@ except ImportError:
     HAS_FOXGLOVE = False
 else:
     HAS_FOXGLOVE = True
-
-PLOTTED = 64
-"""Maximum number of values of an array that is exported as JSON."""
 
 SKIN_COLOUR = (0.85, 0.55, 0.50, 1.0)
 FINGER_COLOUR = (0.30, 0.65, 0.45, 1.0)
@@ -284,46 +283,11 @@ def wall_clock_offset_ns(reader: BagReader) -> int | None:
 
 def _channel(name: str, value: Any, context: Any) -> Any:
     if isinstance(value, dict):
-        shape = json.dumps(_make_schema(value)).encode()
+        shape = json.dumps(make_schema(TOPICS[name].message)).encode()
         schema = foxglove.Schema(name=f"flexsheet.{name}", encoding="jsonschema", data=shape)
         return foxglove.Channel(name, schema=schema, message_encoding="json", context=context)
     channel_type = getattr(foxglove.channels, f"{type(value).__name__}Channel")
     return channel_type(name, context=context)
-
-
-def _make_schema(value: Any) -> dict[str, Any]:
-    """Make the JSON Schema of a value, so that other tools can list its fields."""
-    match value:
-        case dict():
-            fields = {name: _make_schema(item) for name, item in value.items()}
-            return {"type": "object", "properties": fields}
-        case list():
-            return {"type": "array", "items": _make_schema(value[0]) if value else {}}
-        case bool():
-            return {"type": "boolean"}
-        case int() | float():
-            return {"type": "number"}
-        case str():
-            return {"type": "string"}
-        case _:
-            return {}
-
-
-def _plain(value: Any) -> Any:
-    """Convert a message to JSON types, without arrays of more than PLOTTED values."""
-    if isinstance(value, BaseModel):
-        plain = {name: _plain(getattr(value, name)) for name in type(value).model_fields}
-        return {name: item for name, item in plain.items() if item is not _TOO_LARGE}
-    if isinstance(value, np.ndarray):
-        return value.tolist() if value.size <= PLOTTED else _TOO_LARGE
-    if isinstance(value, (tuple, list)):
-        return [item for item in map(_plain, value) if item is not _TOO_LARGE]
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    return value
-
-
-_TOO_LARGE = object()
 
 
 def _mesh(

@@ -1,0 +1,113 @@
+"""`flexsheet scene`: export the apparatus of a scene to other tools."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, output_file
+from flexsheet.launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    check_folder,
+    examples,
+    print_json,
+    words,
+)
+
+app = make_app("Export the apparatus of a scene to other tools.")
+
+
+class ModelFormat(StrEnum):
+    """Format of a model of the apparatus."""
+
+    URDF = "urdf"
+    GLTF = "gltf"
+
+
+SUFFIXES = {
+    ".urdf": ModelFormat.URDF,
+    ".xml": ModelFormat.URDF,
+    ".gltf": ModelFormat.GLTF,
+    ".glb": ModelFormat.GLTF,
+}
+
+
+@app.callback()
+def scene() -> None:
+    """Export the apparatus of a scene to other tools."""
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet scene export cylinder -o cylinder.urdf",
+        "flexsheet scene export cylinder -o cylinder.glb",
+        "flexsheet scene export organ --format urdf",
+    )
+)
+def export(
+    scene: SceneArgument,
+    form: Annotated[
+        ModelFormat | None,
+        typer.Option(
+            "--format", metavar="urdf|gltf", help="Format; default: that of the file name."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        output_file("File to write: .urdf, .gltf, or .glb (binary glTF); default: print the text."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write arms, clamps, camera, projector and screen as a URDF or glTF model.
+
+    The joints have the names left_joint_1 to right_joint_6. A viewer can move the arms by them. The
+    model contains geometry and joint limits, but no masses and torques.
+    """
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.launch.viewing.apparatus_model import make_model, solve_rest_joints
+    from flexsheet.launch.viewing.gltf import make_glb, make_gltf
+    from flexsheet.launch.viewing.urdf import make_urdf
+    from flexsheet.messages.files import write_file
+
+    if output is not None:
+        check_folder("--output", output)
+        if output.suffix not in SUFFIXES:
+            raise CommandError(
+                f"--output {output}: unknown file type; name a .urdf, .gltf or .glb file",
+                BAD_INPUT,
+            )
+    found = form or (ModelFormat.URDF if output is None else SUFFIXES[output.suffix])
+    if output is not None and SUFFIXES[output.suffix] is not found:
+        raise CommandError(
+            f"--format {found}: {output} has the suffix of another format; change one of them",
+            BAD_INPUT,
+        )
+    loaded = load_scene(scene)
+    model = make_model(loaded)
+    content: str | bytes
+    if found is ModelFormat.URDF:
+        content = make_urdf(model)
+    elif output is not None and output.suffix == ".glb":
+        content = make_glb(model, solve_rest_joints(loaded))
+    else:
+        content = make_gltf(model, solve_rest_joints(loaded))
+    if output is not None:
+        write_file(output, content)
+        words.print(f"wrote {output}", markup=False)
+    if as_json:
+        moving = [joint.name for joint in model.joints if joint.limit is not None]
+        print_json(
+            {
+                "scene": loaded.name,
+                "format": str(found),
+                "output": None if output is None else str(output),
+                "links": [link.name for link in model.links],
+                "joints": moving,
+            }
+        )
+    elif output is None:
+        print(content, end="")

@@ -1,0 +1,109 @@
+"""`flexsheet view`: serve the running graph to the viewers Foxglove and Lichtblick."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from flexsheet.launch.commands.files import FileKind, list_files
+from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.options import DurationOption, JsonOption, RunOption, make_app
+from flexsheet.launch.commands.output import CommandError, examples, print_json_line, words
+
+if TYPE_CHECKING:
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
+    from flexsheet.launch.running.runs import Run
+
+app = make_app()
+
+NICENESS = 10
+"""The viewer gives way to the nodes of the graph."""
+
+
+@app.command(
+    epilog=examples("flexsheet view", "flexsheet view --port 9100 --rate 15 --image-rate 5")
+)
+def view(
+    *,
+    port: Annotated[
+        int, typer.Option(help="TCP port of the server; 0: any free port.", min=0, max=65535)
+    ] = 8765,
+    rate: Annotated[
+        float,
+        typer.Option(metavar="HZ", help="Maximum rate of numbers per channel, Hz.", min=0.1),
+    ] = 30.0,
+    image_rate: Annotated[
+        float,
+        typer.Option(metavar="HZ", help="Maximum rate of images and meshes, Hz.", min=0.1),
+    ] = 10.0,
+    run: RunOption = None,
+    duration: DurationOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Serve the running graph to the viewers Foxglove and Lichtblick, until Ctrl-C.
+
+    In the viewer, open a connection of the type "Foxglove WebSocket" with the printed address, and
+    import the printed layout file. The server listens on this computer only, and is read-only. To
+    use it from another computer, run ssh -L 8765:127.0.0.1:8765 THIS_COMPUTER there.
+    """
+    try:
+        import foxglove  # noqa: F401
+    except ImportError as error:
+        raise CommandError(
+            "view needs the package foxglove-sdk: pip install 'flexsheet[view]'"
+        ) from error
+    plan, found = running_graph(run)
+    os.nice(NICENESS)
+    serving = _serve(
+        plan,
+        found,
+        port=port,
+        rates_hz=(rate, image_rate),
+        duration_s=duration,
+        as_json=as_json,
+    )
+    raise typer.Exit(run_interruptible(serving))
+
+
+async def _serve(
+    plan: ResolvedGraph,
+    run: Run,
+    *,
+    port: int,
+    rates_hz: tuple[float, float],
+    duration_s: float | None,
+    as_json: bool,
+) -> int:
+    from flexsheet.launch.viewing.live_server import ADDRESS, LiveServer
+
+    try:
+        server = LiveServer(
+            plan,
+            run,
+            port=port,
+            rate_hz=rates_hz[0],
+            image_rate_hz=rates_hz[1],
+            on_problem=lambda text: words.print(text, markup=False),
+        )
+    except (OSError, RuntimeError) as error:
+        raise CommandError(
+            f"--port {port}: the server cannot listen there: {error}; choose another port"
+        ) from error
+    try:
+        address = f"ws://{ADDRESS}:{server.port}"
+        (layout,) = list_files(FileKind.LAYOUT)
+        if as_json:
+            names = [channel.name for channel in server.channels]
+            print_json_line({"address": address, "layout": str(layout), "channels": names})
+        words.print(f"connect Foxglove or Lichtblick to {address}", markup=False)
+        words.print(f"layout: {layout}", markup=False)
+        async with asyncio.timeout(duration_s):
+            await server.serve()
+    except TimeoutError:
+        return 0
+    finally:
+        server.close()
+    return 0

@@ -1,0 +1,216 @@
+"""Describe the apparatus of a scene as a tree of links and joints, as URDF does.
+
+Links: `world`, for each side `SIDE_base`, `SIDE_link_1` to `SIDE_link_5`, `SIDE_flange` and
+`SIDE_clamp`, then `camera_left`, `camera_right`, `projector` and `screen`. Joints that move:
+`SIDE_joint_1` to `SIDE_joint_6`. The model contains only geometry: masses and torques are unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.scene import Projector, Scene
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.kinematics import (
+    JOINT_MAX_RAD,
+    JOINT_MIN_RAD,
+    JOINT_SPEED_RAD_PER_S,
+    UnreachableError,
+    inverse_kinematics,
+)
+from flexsheet.nodes.console.arms import BRACKET_WIDTH_M, CLAMP_SIZE_M, JOINTS, PIECES
+from flexsheet.nodes.models.rigid import inverse, pose_matrix, rotation_from_vector, transform
+from flexsheet.nodes.models.sheet import flange_pose
+
+Floats = NDArray[np.float64]
+Vector = tuple[float, float, float]
+Colour = tuple[float, float, float, float]
+
+WORLD = "world"
+LIGHT: Colour = (0.87, 0.89, 0.91, 1.0)
+DARK: Colour = (0.29, 0.33, 0.41, 1.0)
+LENS: Colour = (0.0, 0.42, 0.58, 1.0)
+SCREEN: Colour = (0.97, 0.93, 0.84, 0.35)
+
+CAMERA_BODY_M: Vector = (0.05, 0.035, 0.045)
+"""Size of the housing of each of the two cameras, centred behind its lens."""
+PROJECTOR_BODY_M: Vector = (0.16, 0.07, 0.12)
+LENS_LENGTH_M = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """Box of a link: size and centre (m) in the frame of the link; red, green, blue, opacity."""
+
+    size_m: Vector
+    centre_m: Vector
+    colour: Colour
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Rigid part of the apparatus, drawn as boxes."""
+
+    name: str
+    boxes: tuple[Box, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class JointLimit:
+    """Axis of a joint in the frame of its child, range (rad) and maximum speed (rad/s)."""
+
+    axis: Vector
+    min_rad: float
+    max_rad: float
+    max_speed_rad_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """Connection of two links.
+
+    parent_from_child: pose (4, 4) of the child at the joint angle zero. limit: None if it is fixed.
+    """
+
+    name: str
+    parent: str
+    child: str
+    parent_from_child: Floats
+    limit: JointLimit | None = None
+
+    def pose(self, angle_rad: float) -> Floats:
+        """Return parent_from_child (4, 4) at an angle; a fixed joint ignores it."""
+        if self.limit is None:
+            return self.parent_from_child
+        rotation = rotation_from_vector(angle_rad * np.array(self.limit.axis))
+        return self.parent_from_child @ transform(rotation, np.zeros(3))
+
+
+@dataclass(frozen=True, slots=True)
+class ApparatusModel:
+    """Links and joints of the apparatus; each joint's parent precedes its child."""
+
+    name: str
+    links: tuple[Link, ...]
+    joints: tuple[Joint, ...]
+
+    def poses(self, angles_rad: Mapping[str, float]) -> dict[str, Floats]:
+        """Return world_from_link (4, 4) of all links at joint angles by name; default: zero."""
+        found = {WORLD: np.eye(4)}
+        for joint in self.joints:
+            found[joint.child] = found[joint.parent] @ joint.pose(angles_rad.get(joint.name, 0.0))
+        return found
+
+
+def list_joints(side: Side) -> tuple[str, ...]:
+    """Return the names of an arm's joints."""
+    return tuple(f"{side}_joint_{number}" for number in range(1, len(JOINTS) + 1))
+
+
+def make_model(scene: Scene) -> ApparatusModel:
+    """Make the model of both arms with clamps, the camera, the projector, and the screen.
+
+    The screen is the unstretched sheet at the origin of the world. Joint angles are those that the
+    encoders report.
+    """
+    links, joints = [Link(WORLD)], []
+    for side in get_args(Side):
+        for joint, link in _make_arm(scene, side):
+            joints.append(joint)
+            links.append(link)
+    for name, world_from_device, boxes in _list_devices(scene):
+        joints.append(Joint(f"{name}_mount", WORLD, name, world_from_device))
+        links.append(Link(name, boxes))
+    return ApparatusModel(scene.name, tuple(links), tuple(joints))
+
+
+def solve_rest_joints(scene: Scene) -> dict[str, float]:
+    """Return the joint angles (rad) at which the arms hold the sheet at the screen.
+
+    An arm that does not reach the screen has its joints at the middle of their ranges.
+    """
+    angles: dict[str, float] = {}
+    for side in get_args(Side):
+        geometry = ArmGeometry(scene, side)
+        arm = scene.arms.left if side == "left" else scene.arms.right
+        half_m = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
+        edge = transform(np.eye(3), (-half_m if side == "left" else half_m, 0.0, 0.0))
+        flange = geometry.base_from_world @ flange_pose(edge, geometry.flange_from_edge)
+        middle = 0.5 * (JOINT_MIN_RAD + JOINT_MAX_RAD)
+        try:
+            joints = inverse_kinematics(flange, middle) - np.array(arm.joint_offsets_rad)
+        except UnreachableError:
+            joints = middle
+        angles |= dict(zip(list_joints(side), joints.tolist(), strict=True))
+    return angles
+
+
+def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
+    """Yield the links of an arm with the joints that carry them, from the base to the clamp."""
+    arm = scene.arms.left if side == "left" else scene.arms.right
+    numbered = [f"{side}_link_{number}" for number in range(1, len(JOINTS))]
+    names = [f"{side}_base", *numbered, f"{side}_flange"]
+    boxes = [
+        [
+            Box(one.size_m, one.centre_m, DARK if one.dark else LIGHT)
+            for one in PIECES
+            if one.link == i
+        ]
+        for i in range(len(names))
+    ]
+    bracket = np.asarray(arm.flange_from_edge.position_m)
+    bracket_size = (BRACKET_WIDTH_M + np.abs(bracket)).tolist()
+    boxes[-1].append(Box(tuple(bracket_size), tuple((0.5 * bracket).tolist()), DARK))
+    mount = Joint(f"{side}_mount", WORLD, names[0], pose_matrix(arm.world_from_base))
+    yield mount, Link(names[0], tuple(boxes[0]))
+    for i, name in enumerate(list_joints(side)):
+        position_m, axis = JOINTS[i]
+        # The encoder reads zero where the joint is at its offset.
+        offset = rotation_from_vector(arm.joint_offsets_rad[i] * np.array(axis))
+        limit = JointLimit(
+            axis,
+            float(JOINT_MIN_RAD[i]),
+            float(JOINT_MAX_RAD[i]),
+            float(JOINT_SPEED_RAD_PER_S[i]),
+        )
+        pose = transform(offset, position_m)
+        yield (
+            Joint(name, names[i], names[i + 1], pose, limit),
+            Link(names[i + 1], tuple(boxes[i + 1])),
+        )
+    across, along, through = CLAMP_SIZE_M
+    clamp = Box((across, along * scene.sheet.height_m, through), (0.0, 0.0, 0.0), DARK)
+    yield (
+        Joint(f"{side}_clamp_mount", names[-1], f"{side}_clamp", pose_matrix(arm.flange_from_edge)),
+        Link(f"{side}_clamp", (clamp,)),
+    )
+
+
+def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]:
+    """Yield name, pose in the world and boxes of cameras, projector and screen."""
+    left = pose_matrix(scene.camera.world_from_left)
+    yield "camera_left", left, _make_device(CAMERA_BODY_M, 0.02)
+    right = left @ inverse(np.asarray(scene.camera.right_from_left))
+    yield "camera_right", right, _make_device(CAMERA_BODY_M, 0.02)
+    projector: Projector | None = scene.projector
+    if projector is not None:
+        pose = pose_matrix(projector.world_from_projector)
+        yield "projector", pose, _make_device(PROJECTOR_BODY_M, 0.04)
+    sheet = scene.sheet
+    size_m = (sheet.width_m, sheet.height_m, sheet.thickness_m)
+    yield "screen", np.eye(4), (Box(size_m, (0.0, 0.0, 0.0), SCREEN),)
+
+
+def _make_device(body_m: Vector, lens_m: float) -> tuple[Box, ...]:
+    """Make the housing of a device and its lens, whose centre is the origin; z points outwards."""
+    depth_m = body_m[2]
+    return (
+        Box(body_m, (0.0, 0.0, -0.5 * (depth_m + LENS_LENGTH_M)), DARK),
+        Box((lens_m, lens_m, LENS_LENGTH_M), (0.0, 0.0, 0.0), LENS),
+    )

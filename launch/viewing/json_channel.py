@@ -1,0 +1,109 @@
+"""Describe messages as JSON that viewers can list and plot.
+
+Foxglove and Lichtblick refuse nested arrays and fields without a type, and one index selects an
+element. Therefore arrays are written row by row as one list, and a value that is None is omitted.
+"""
+
+from __future__ import annotations
+
+import types
+from enum import Enum
+from functools import cache
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import numpy as np
+from pydantic import BaseModel
+
+from flexsheet.messages.arrays import ArraySpec
+
+MAX_ARRAY = 64
+"""Maximum number of values of an array in a JSON message; larger ones are omitted."""
+
+JsonSchema = dict[str, Any]
+_NUMBER: JsonSchema = {"type": "number"}
+_TEXT: JsonSchema = {"type": "string"}
+_OMITTED = object()
+
+
+@cache
+def make_schema(kind: type[BaseModel]) -> JsonSchema:
+    """Return the JSON Schema of the values that `to_json` returns for a type of messages."""
+    fields = {}
+    for name, info in kind.model_fields.items():
+        annotation: Any = info.annotation
+        for mark in info.metadata:
+            annotation = Annotated[annotation, mark]
+        fields[name] = _describe(annotation)
+    return {"type": "object", "title": kind.__name__, "properties": fields}
+
+
+def to_json(value: Any) -> Any:
+    """Convert a message to JSON types, without arrays of more than MAX_ARRAY values."""
+    found = _convert(value)
+    return None if found is _OMITTED else found
+
+
+def _convert(value: Any) -> Any:
+    if isinstance(value, BaseModel):
+        named = ((name, _convert(getattr(value, name))) for name in type(value).model_fields)
+        return {name: item for name, item in named if item is not _OMITTED}
+    if value is None:
+        return _OMITTED
+    if isinstance(value, np.ndarray):
+        return value.ravel().tolist() if value.size <= MAX_ARRAY else _OMITTED
+    if isinstance(value, tuple | list):
+        found: list[Any] = []
+        for item in map(_convert, value):
+            if isinstance(item, list):
+                found += item
+            elif item is not _OMITTED:
+                found.append(item)
+        return found
+    if isinstance(value, dict):
+        pairs = ((str(key), _convert(item)) for key, item in value.items())
+        return {key: item for key, item in pairs if item is not _OMITTED}
+    return value.value if isinstance(value, Enum) else value
+
+
+def _describe(annotation: Any) -> JsonSchema:
+    """Return the schema of a field's type."""
+    marks: list[Any] = []
+    while get_origin(annotation) is Annotated:
+        annotation, *more = get_args(annotation)
+        marks += more
+    if any(isinstance(mark, ArraySpec) for mark in marks):
+        return {"type": "array", "items": _NUMBER}
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin in (Union, types.UnionType):
+        return _merge([_describe(one) for one in arguments if one is not type(None)])
+    if origin is Literal:
+        return _describe(type(arguments[0]))
+    if origin in (tuple, list):
+        item = _merge([_describe(one) for one in arguments if one is not Ellipsis])
+        return item if item["type"] == "array" else {"type": "array", "items": item}
+    if origin is dict:
+        return {"type": "object", "properties": {}}
+    return _describe_type(annotation) if isinstance(annotation, type) else _TEXT
+
+
+def _describe_type(kind: type) -> JsonSchema:
+    if issubclass(kind, BaseModel):
+        return make_schema(kind)
+    if issubclass(kind, bool):
+        return {"type": "boolean"}
+    return _NUMBER if issubclass(kind, int | float) else _TEXT
+
+
+def _merge(schemas: list[JsonSchema]) -> JsonSchema:
+    """Return a schema for values of several types: objects with the fields of all, else text."""
+    if not schemas:
+        return _TEXT
+    if all(one == schemas[0] for one in schemas):
+        return schemas[0]
+    if all(one["type"] == "object" for one in schemas):
+        fields: JsonSchema = {}
+        for one in schemas:
+            fields |= one["properties"]
+        return {"type": "object", "properties": fields}
+    kinds = {one["type"] for one in schemas}
+    return next(one for one in schemas if one["type"] == "array") if "array" in kinds else _TEXT

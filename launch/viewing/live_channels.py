@@ -1,0 +1,406 @@
+"""Define the channels of the live view, and make their messages from those of the graph.
+
+Every topic of the graph is a JSON channel of the same name. In addition:
+
+    tf                                   poses of links, sheet target and fingertip
+    apparatus, sheet, object, finger     the 3D scene
+    joint_states                         joint angles, named as in the URDF model
+    TOPIC/left, TOPIC/right, ...         images as JPEG; .../calibration of the stereo camera
+    log                                  e-stops and notes of the nodes
+
+The frame `viewer` has z up, which viewers expect; `world` has y up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, get_args
+
+import cv2
+import numpy as np
+from foxglove import messages as fg
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from flexsheet.launch.bags.export import list_images
+from flexsheet.launch.viewing.apparatus_model import (
+    WORLD,
+    ApparatusModel,
+    Colour,
+    Joint,
+    list_joints,
+    make_model,
+)
+from flexsheet.launch.viewing.json_channel import make_schema, to_json
+from flexsheet.messages.base import Message
+from flexsheet.messages.scene import Lens, Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import (
+    ArmState,
+    EStop,
+    Fingertip,
+    Frame,
+    SheetTarget,
+    Side,
+    Skin,
+    SoftBody,
+    Status,
+    StereoPair,
+    TwinEye,
+)
+from flexsheet.nodes.console.sheet import COLUMNS, ROWS, compute_sheet_points
+from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, transform
+from flexsheet.nodes.models.shapes.triangles import triangulate_grid
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+VIEWER = "viewer"
+VIEWER_FROM_WORLD = transform(rotation_from_vector((0.5 * np.pi, 0.0, 0.0)), np.zeros(3))
+SKIN_COLOUR: Colour = (0.84, 0.38, 0.33, 1.0)
+SHEET_COLOUR: Colour = (0.97, 0.93, 0.84, 0.45)
+FINGER_COLOUR: Colour = (0.30, 0.65, 0.45, 1.0)
+LOST_COLOUR: Colour = (0.60, 0.60, 0.60, 0.5)
+EYE_COLOUR: Colour = (0.98, 0.98, 0.98, 1.0)
+EYE_RADIUS_M = 0.011
+SHEET_STEP = 2
+"""Every n-th row and column of the drawn sheet is sent."""
+JPEG_QUALITY = 80
+
+
+class Pace(Enum):
+    """Define how often a channel sends: at the rate of numbers or images, or each message.
+
+    STATIC: when the scene changes, and once a second for viewers that connect later.
+    """
+
+    NUMBERS = "numbers"
+    IMAGES = "images"
+    EACH = "each"
+    STATIC = "static"
+
+
+@dataclass(slots=True)
+class LiveState:
+    """Latest messages of the graph by topic, and the model of its apparatus with its joints."""
+
+    latest: dict[str, Message] = field(default_factory=dict)
+    model: ApparatusModel | None = None
+    joints: dict[str, Joint] = field(default_factory=dict)
+
+    def update(self, topic: str, message: Message) -> None:
+        self.latest[topic] = message
+        if isinstance(message, Scene):
+            self.model = make_model(message)
+            self.joints = {joint.name: joint for joint in self.model.joints}
+
+    @property
+    def scene(self) -> Scene | None:
+        found = self.latest.get("scene")
+        return found if isinstance(found, Scene) else None
+
+    @property
+    def fingertip(self) -> Fingertip | None:
+        found = self.latest.get("fingertip")
+        return found if isinstance(found, Fingertip) else None
+
+    def edges(self) -> tuple[Floats, Floats] | None:
+        """Return the poses (4, 4) of the left and right clamped edge; None if unknown."""
+        scene, found = self.scene, []
+        for side in get_args(Side):
+            state = self.latest.get(f"arm_{side}")
+            if scene is None or not isinstance(state, ArmState):
+                return None
+            arm = scene.arms.left if side == "left" else scene.arms.right
+            found.append(state.world_from_flange @ pose_matrix(arm.flange_from_edge))
+        return found[0], found[1]
+
+
+@dataclass(frozen=True, slots=True)
+class LiveChannel:
+    """Channel of the live view.
+
+    topics: topics of the graph that it needs, besides the scene. triggers: those of them whose
+    messages it follows. make: function that makes its message from the state, the message that
+    arrived and its timestamp; it returns None if there is nothing to send. schema: JSON Schema, or
+    None if the messages are of the type `kind` of Foxglove.
+    """
+
+    name: str
+    topics: tuple[str, ...]
+    triggers: tuple[str, ...]
+    pace: Pace
+    make: Callable[[LiveState, Message | None, Any], Any]
+    kind: str = ""
+    schema: dict[str, Any] | None = None
+
+
+def list_channels(topics: list[Topic]) -> Iterator[LiveChannel]:
+    """Yield the channels for the topics that a graph writes."""
+    written = {topic.name for topic in topics}
+    arms = tuple(name for name in ("arm_left", "arm_right") if name in written)
+    for topic in topics:
+        yield LiveChannel(
+            topic.name, (topic.name,), (topic.name,),
+            Pace.NUMBERS if topic.rate_hz else Pace.EACH,
+            lambda _, message, __: to_json(message),
+            schema=make_schema(topic.message),
+        )  # fmt: skip
+        for suffix in _list_image_names(topic):
+            yield LiveChannel(
+                f"{topic.name}/{suffix}", (topic.name,), (topic.name,), Pace.IMAGES,
+                _make_image_maker(topic.name, suffix), "CompressedImage",
+            )  # fmt: skip
+        if topic.message is StereoPair:
+            for side in get_args(Side):
+                yield LiveChannel(
+                    f"{topic.name}/{side}/calibration", (), (), Pace.STATIC,
+                    _make_calibration_maker(side), "CameraCalibration",
+                )  # fmt: skip
+    moving = (*arms, *(name for name in ("sheet_target", "fingertip") if name in written))
+    yield LiveChannel("tf", moving, moving, Pace.EACH, _make_frames, "FrameTransforms")
+    yield LiveChannel("tf_static", (), (), Pace.STATIC, _make_static_frames, "FrameTransforms")
+    yield LiveChannel("apparatus", (), (), Pace.STATIC, _draw_apparatus, "SceneUpdate")
+    yield LiveChannel("joint_states", arms, arms, Pace.EACH, _make_joint_states, "JointStates")
+    if len(arms) == 2:
+        needed = (*arms, *({"fingertip"} & written))
+        yield LiveChannel("sheet", needed, arms[:1], Pace.IMAGES, _draw_sheet, "SceneUpdate")
+    if "fingertip" in written:
+        tip = ("fingertip",)
+        yield LiveChannel("finger", tip, tip, Pace.NUMBERS, _draw_finger, "SceneUpdate")
+    if "skin" in written:
+        body = tuple(name for name in ("skin", "soft_body") if name in written)
+        yield LiveChannel("object", body, body, Pace.IMAGES, _draw_object, "SceneUpdate")
+    notes = tuple(name for name in ("estop", "status") if name in written)
+    yield LiveChannel("log", notes, notes, Pace.EACH, _make_log, "Log")
+
+
+def _list_image_names(topic: Topic) -> tuple[str, ...]:
+    """Return the names of the images in the messages of a topic."""
+    names: dict[type[Message], tuple[str, ...]] = {
+        StereoPair: ("left", "right"),
+        Frame: ("image",),
+        TwinEye: ("seen", "expected"),
+    }
+    return names.get(topic.message, ())
+
+
+def _make_image_maker(topic: str, suffix: str) -> Callable[..., Any]:
+    frame = f"camera_{suffix}" if suffix in get_args(Side) else suffix
+
+    def make(_: LiveState, message: Message | None, stamp: Any) -> Any:
+        images = dict(list_images(topic, message)) if message is not None else {}
+        image = images.get(f"{topic}/{suffix}")
+        return None if image is None or not image.size else _compress(image, frame, stamp)
+
+    return make
+
+
+def _compress(image: Image, frame: str, stamp: Any) -> Any:
+    stored = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    done, data = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        return None
+    return fg.CompressedImage(
+        timestamp=stamp, frame_id=frame, format="jpeg", data=np.asarray(data).tobytes()
+    )
+
+
+def _make_calibration_maker(side: Side) -> Callable[..., Any]:
+    def make(state: LiveState, _: Message | None, stamp: Any) -> Any:
+        if state.scene is None:
+            return None
+        camera = state.scene.camera
+        lens: Lens = camera.left if side == "left" else camera.right
+        matrix = [lens.fx_px, 0.0, lens.cx_px, 0.0, lens.fy_px, lens.cy_px, 0.0, 0.0, 1.0]
+        projection = [lens.fx_px, 0.0, lens.cx_px, 0.0, 0.0, lens.fy_px, lens.cy_px, 0.0]
+        return fg.CameraCalibration(
+            timestamp=stamp,
+            frame_id=f"camera_{side}",
+            width=camera.width_px,
+            height=camera.height_px,
+            distortion_model="plumb_bob",
+            D=list(lens.distortion),
+            K=matrix,
+            R=np.eye(3).ravel().tolist(),
+            P=[*projection, 0.0, 0.0, 1.0, 0.0],
+        )
+
+    return make
+
+
+def _make_frames(state: LiveState, message: Message | None, stamp: Any) -> Any:
+    match message:
+        case ArmState() if state.joints:
+            named = zip(list_joints(message.side), message.joints_rad.tolist(), strict=True)
+            frames = []
+            for joint, angle in ((state.joints[name], angle) for name, angle in named):
+                frames.append(_frame(joint.parent, joint.child, joint.pose(angle), stamp))
+        case SheetTarget():
+            frames = [_frame(WORLD, "sheet", message.world_from_sheet, stamp)]
+        case Fingertip() if message.valid:
+            pose = transform(np.eye(3), message.position_world_m)
+            frames = [_frame(WORLD, "fingertip", pose, stamp)]
+        case _:
+            return None
+    return fg.FrameTransforms(transforms=frames)
+
+
+def _make_static_frames(state: LiveState, _: Message | None, stamp: Any) -> Any:
+    frames = [_frame(VIEWER, WORLD, VIEWER_FROM_WORLD, stamp)]
+    for joint in state.model.joints if state.model else ():
+        if joint.limit is None:
+            frames.append(_frame(joint.parent, joint.child, joint.parent_from_child, stamp))
+    return fg.FrameTransforms(transforms=frames)
+
+
+def _frame(parent: str, child: str, pose: Floats, stamp: Any) -> Any:
+    return fg.FrameTransform(
+        timestamp=stamp,
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=_vector(pose[:3, 3]),
+        rotation=_rotation(pose),
+    )
+
+
+def _make_joint_states(_: LiveState, message: Message | None, stamp: Any) -> Any:
+    if not isinstance(message, ArmState):
+        return None
+    named = zip(list_joints(message.side), message.joints_rad.tolist(), strict=True)
+    joints = [fg.JointState(name=name, position=angle) for name, angle in named]
+    return fg.JointStates(timestamp=stamp, joints=joints)
+
+
+def _draw_apparatus(state: LiveState, _: Message | None, stamp: Any) -> Any:
+    if state.model is None or state.scene is None:
+        return None
+    entities = []
+    for link in state.model.links:
+        if link.name == "screen" or not link.boxes:
+            continue  # the sheet is drawn where it is
+        cubes = [
+            fg.CubePrimitive(
+                pose=_pose(transform(np.eye(3), box.centre_m)),
+                size=_vector(box.size_m),
+                color=_colour(box.colour),
+            )
+            for box in link.boxes
+        ]
+        entities.append(
+            fg.SceneEntity(
+                timestamp=stamp, frame_id=link.name, id=link.name, frame_locked=True, cubes=cubes
+            )
+        )
+    eyes, half = state.scene.eyes, 0.5 * state.scene.eyes.interocular_m
+    balls = [
+        _ball(eyes.centre_world_m + np.array([x, 0.0, 0.0]), EYE_RADIUS_M, EYE_COLOUR)
+        for x in (-half, half)
+    ]
+    entities.append(_entity("eyes", stamp, spheres=balls))
+    return fg.SceneUpdate(entities=entities)
+
+
+def _draw_sheet(state: LiveState, _: Message | None, stamp: Any) -> Any:
+    scene, edges, tip = state.scene, state.edges(), state.fingertip
+    if scene is None or edges is None:
+        return None
+    points = compute_sheet_points(
+        *edges,
+        height_m=scene.sheet.height_m,
+        fingertip=tip.position_world_m if tip is not None and tip.valid else None,
+        finger_radius_m=scene.finger.radius_m,
+    )
+    if points is None:
+        return None
+    grid = points.reshape(ROWS, COLUMNS, 3)[::SHEET_STEP, ::SHEET_STEP]
+    triangles = triangulate_grid(*grid.shape[:2])
+    return _mesh("sheet", grid.reshape(-1, 3), triangles, stamp, SHEET_COLOUR)
+
+
+def _draw_object(state: LiveState, _: Message | None, stamp: Any) -> Any:
+    skin, body = state.latest.get("skin"), state.latest.get("soft_body")
+    if not isinstance(skin, Skin):
+        return None
+    vertices = skin.vertices_world_m
+    if isinstance(body, SoftBody) and body.mesh_id == skin.mesh_id:
+        vertices = vertices + body.displacement_world_m
+    return _mesh("object", vertices, skin.triangles, stamp, SKIN_COLOUR)
+
+
+def _draw_finger(state: LiveState, message: Message | None, stamp: Any) -> Any:
+    if not isinstance(message, Fingertip) or state.scene is None:
+        return None
+    colour = FINGER_COLOUR if message.valid else LOST_COLOUR
+    path = fg.LinePrimitive(
+        type=fg.LinePrimitiveLineType.LineStrip,
+        thickness=0.001,
+        points=_points(message.predicted_path_world_m),
+        color=_colour(colour),
+    )
+    ball = _ball(message.position_world_m, state.scene.finger.radius_m, colour)
+    return fg.SceneUpdate(entities=[_entity("finger", stamp, spheres=[ball], lines=[path])])
+
+
+def _make_log(_: LiveState, message: Message | None, stamp: Any) -> Any:
+    match message:
+        case EStop():
+            level = fg.LogLevel.Fatal if message.engaged else fg.LogLevel.Info
+            text = f"e-stop {'engaged' if message.engaged else 'reset'}: {message.reason}"
+            return fg.Log(timestamp=stamp, level=level, message=text, name="estop")
+        case Status() if message.state == "degraded" or message.note:
+            text = message.note or message.last_error or message.state
+            level = fg.LogLevel.Warning
+            return fg.Log(timestamp=stamp, level=level, message=text, name=message.node)
+    return None
+
+
+def make_stamp(at_ns: int) -> Any:
+    """Return a timestamp of Foxglove for a time since 1970, ns."""
+    return fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
+
+
+def _mesh(
+    name: str, vertices: NDArray[Any], triangles: NDArray[Any], stamp: Any, rgba: Colour
+) -> Any:
+    surface = fg.TriangleListPrimitive(
+        pose=_pose(np.eye(4)),
+        points=_points(vertices),
+        indices=np.ravel(triangles).tolist(),
+        color=_colour(rgba),
+    )
+    return fg.SceneUpdate(entities=[_entity(name, stamp, triangles=[surface])])
+
+
+def _entity(name: str, stamp: Any, **shapes: Any) -> Any:
+    return fg.SceneEntity(timestamp=stamp, frame_id=WORLD, id=name, **shapes)
+
+
+def _ball(position_m: Floats, radius_m: float, rgba: Colour) -> Any:
+    pose = _pose(transform(np.eye(3), position_m))
+    return fg.SpherePrimitive(pose=pose, size=_vector((2 * radius_m,) * 3), color=_colour(rgba))
+
+
+def _points(points: NDArray[Any]) -> list[Any]:
+    return [fg.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()]
+
+
+def _pose(matrix: Floats) -> Any:
+    return fg.Pose(position=_vector(matrix[:3, 3]), orientation=_rotation(matrix))
+
+
+def _vector(vector: Any) -> Any:
+    x, y, z = map(float, vector)
+    return fg.Vector3(x=x, y=y, z=z)
+
+
+def _rotation(matrix: Floats) -> Any:
+    x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()
+    return fg.Quaternion(x=x, y=y, z=z, w=w)
+
+
+def _colour(rgba: Colour) -> Any:
+    red, green, blue, opacity = rgba
+    return fg.Color(r=red, g=green, b=blue, a=opacity)
