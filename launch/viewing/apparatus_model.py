@@ -1,6 +1,6 @@
 """Describe the apparatus of a scene as a tree of links and joints, as URDF does.
 
-Links: `world`, for each side `SIDE_base`, `SIDE_link_1` to `SIDE_link_5`, `SIDE_flange` and
+Links: `world`, for each side `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and
 `SIDE_clamp`, then `camera_left`, `camera_right`, `projector` and `screen`. Joints that move:
 `SIDE_joint_1` to `SIDE_joint_6`. The model contains only geometry: masses and torques are unknown.
 """
@@ -14,17 +14,11 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import Projector, Scene
+from flexsheet.messages.scene import ClosedFormArm, Projector, Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.kinematics import (
-    JOINT_MAX_RAD,
-    JOINT_MIN_RAD,
-    JOINT_SPEED_RAD_PER_S,
-    UnreachableError,
-    inverse_kinematics,
-)
-from flexsheet.nodes.console.arms import BRACKET_WIDTH_M, CLAMP_SIZE_M, JOINTS, PIECES
+from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
+from flexsheet.nodes.console.arms import BRACKET_WIDTH_M, CLAMP_SIZE_M, make_pieces
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, rotation_from_vector, transform
 from flexsheet.nodes.models.sheet import flange_pose
 
@@ -110,7 +104,7 @@ class ApparatusModel:
 
 def list_joints(side: Side) -> tuple[str, ...]:
     """Return the names of an arm's joints."""
-    return tuple(f"{side}_joint_{number}" for number in range(1, len(JOINTS) + 1))
+    return tuple(f"{side}_joint_{number}" for number in range(1, 7))
 
 
 def make_model(scene: Scene) -> ApparatusModel:
@@ -138,13 +132,12 @@ def solve_rest_joints(scene: Scene) -> dict[str, float]:
     angles: dict[str, float] = {}
     for side in get_args(Side):
         geometry = ArmGeometry(scene, side)
-        arm = scene.arms.left if side == "left" else scene.arms.right
         half_m = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
         edge = transform(np.eye(3), (-half_m if side == "left" else half_m, 0.0, 0.0))
-        flange = geometry.base_from_world @ flange_pose(edge, geometry.flange_from_edge)
-        middle = 0.5 * (JOINT_MIN_RAD + JOINT_MAX_RAD)
+        flange = flange_pose(edge, geometry.flange_from_edge)
+        middle = 0.5 * (np.array(geometry.model.min_rad) + np.array(geometry.model.max_rad))
         try:
-            joints = inverse_kinematics(flange, middle) - np.array(arm.joint_offsets_rad)
+            joints = geometry.solve_joints(flange, middle)
         except UnreachableError:
             joints = middle
         angles |= dict(zip(list_joints(side), joints.tolist(), strict=True))
@@ -154,36 +147,33 @@ def solve_rest_joints(scene: Scene) -> dict[str, float]:
 def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
     """Yield the links of an arm with the joints that carry them, from the base to the clamp."""
     arm = scene.arms.left if side == "left" else scene.arms.right
-    numbered = [f"{side}_link_{number}" for number in range(1, len(JOINTS))]
+    chain = arm.model.chain() if isinstance(arm.model, ClosedFormArm) else arm.model
+    numbered = [f"{side}_link_{number}" for number in range(1, 7)]
     names = [f"{side}_base", *numbered, f"{side}_flange"]
-    boxes = [
-        [
-            Box(one.size_m, one.centre_m, DARK if one.dark else LIGHT)
-            for one in PIECES
-            if one.link == i
-        ]
-        for i in range(len(names))
-    ]
+    boxes: list[list[Box]] = [[] for _ in names]
+    for piece in make_pieces(arm.model):
+        # The last link of the pieces is the flange.
+        link = piece.link if piece.link < len(numbered) else -1
+        boxes[link].append(Box(piece.size_m, piece.centre_m, DARK if piece.dark else LIGHT))
     bracket = np.asarray(arm.flange_from_edge.position_m)
     bracket_size = (BRACKET_WIDTH_M + np.abs(bracket)).tolist()
     boxes[-1].append(Box(tuple(bracket_size), tuple((0.5 * bracket).tolist()), DARK))
     mount = Joint(f"{side}_mount", WORLD, names[0], pose_matrix(arm.world_from_base))
     yield mount, Link(names[0], tuple(boxes[0]))
     for i, name in enumerate(list_joints(side)):
-        position_m, axis = JOINTS[i]
+        axis = chain.axes[i]
         # The encoder reads zero where the joint is at its offset.
         offset = rotation_from_vector(arm.joint_offsets_rad[i] * np.array(axis))
-        limit = JointLimit(
-            axis,
-            float(JOINT_MIN_RAD[i]),
-            float(JOINT_MAX_RAD[i]),
-            float(JOINT_SPEED_RAD_PER_S[i]),
-        )
-        pose = transform(offset, position_m)
+        limit = JointLimit(axis, chain.min_rad[i], chain.max_rad[i], chain.speed_rad_per_s[i])
+        pose = pose_matrix(chain.origins[i]) @ transform(offset, np.zeros(3))
         yield (
             Joint(name, names[i], names[i + 1], pose, limit),
             Link(names[i + 1], tuple(boxes[i + 1])),
         )
+    yield (
+        Joint(f"{side}_flange_mount", names[-2], names[-1], pose_matrix(chain.flange)),
+        Link(names[-1], tuple(boxes[-1])),
+    )
     across, along, through = CLAMP_SIZE_M
     clamp = Box((across, along * scene.sheet.height_m, through), (0.0, 0.0, 0.0), DARK)
     yield (
