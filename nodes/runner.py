@@ -92,10 +92,9 @@ class ProcessConfig(BaseModel):
 
 
 class NodeTransport:
-    """Sockets of one node's inputs and outputs; needs a running loop.
+    """Sockets of one node's inputs and outputs.
 
     local: bus between the nodes of one process; None if it has only one node.
-    failed: has an exception when a socket could not be opened again.
     """
 
     def __init__(self, config: NodeConfig, log: Any, local: LocalBus | None = None) -> None:
@@ -105,7 +104,8 @@ class NodeTransport:
         self._subscribers: list[Subscriber] = []
         self._keys_problem = ""
         self._stop_socket: StopSocket | None = None
-        self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._failure: BusError | None = None
+        self._has_failed = asyncio.Event()
 
     def open_outputs(self, node: Node) -> None:
         for output in self._config.outputs:
@@ -186,14 +186,21 @@ class NodeTransport:
     def _end_input(self, node: Node, port: str) -> None:
         """Mark a watched input as ended; pass the end on to the nodes that read this one."""
         node.inputs[port].has_ended = True
-        if not node.ends_with_inputs or self.failed.done():
+        if not node.ends_with_inputs or self._has_failed.is_set():
             return
         try:
             for topic, publisher in self._publishers.items():
                 if topic != node.status.topic.name:
                     publisher.interrupt()
         except BusError as error:
-            self.failed.set_exception(error)
+            self._failure = error
+            self._has_failed.set()
+
+    async def watch_failure(self) -> None:
+        """Wait until a socket could not be opened again.  Raises BusError."""
+        await self._has_failed.wait()
+        if self._failure is not None:
+            raise self._failure
 
     def _report_problem(self, node: Node, text: str) -> None:
         node.last_error = text
@@ -334,7 +341,7 @@ async def run_node(
         plan_hash=config.plan_hash,
     )
     process = psutil.Process()
-    tasks: list[asyncio.Future[Any]] = [transport.failed]
+    tasks: list[asyncio.Task[Any]] = []
     try:
         transport.open_outputs(node)
         await node.setup()
@@ -347,6 +354,7 @@ async def run_node(
             tasks.append(asyncio.create_task(run_timer(node, number, timer)))
         tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))
         tasks.append(asyncio.create_task(stop.wait()))
+        tasks.append(asyncio.create_task(transport.watch_failure()))
         if transport.keys is not None:
             tasks.append(asyncio.create_task(run_key_reload(transport)))
         # Exclude the objects that `setup` has made from garbage collection while the node runs.
@@ -366,7 +374,7 @@ async def run_node(
             transport.close()
 
 
-async def end_tasks(tasks: list[asyncio.Future[Any]]) -> None:
+async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
     """Cancel tasks repeatedly until they have ended.
 
     Once is not enough, because a handler can suppress a cancellation.  `wait_for` of Python 3.11

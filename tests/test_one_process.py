@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import structlog
 
 from flexsheet.launch.plans.plan import load_scene
@@ -21,6 +23,7 @@ from flexsheet.nodes.node import Input, Node, NodeParameters, Output
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.runner import (
+    LoggedNodeError,
     NodeConfig,
     NodeTransport,
     PortConfig,
@@ -228,3 +231,32 @@ async def test_the_end_of_the_images_is_passed_on_to_the_arms(tmp_path: Path) ->
         await asyncio.gather(*running)
         bridge.close()
         images.close()
+
+
+async def test_a_node_fails_if_it_cannot_open_its_output_again(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    ends = {"fingertip": f"ipc://{tmp_path}/in", "sheet_target": f"ipc://{folder}/a"}
+    inputs, outputs = (
+        (PortConfig(port=topic, topic=topic, endpoints=(end,)),) for topic, end in ends.items()
+    )
+    planner = NodeConfig(
+        name="planner", type="planner", parameters={}, inputs=inputs, outputs=outputs,
+        plan_hash="", run_dir=str(tmp_path),
+    )  # fmt: skip
+    fingers = Publisher(TOPICS["fingertip"], [ends["fingertip"]])
+    config = ProcessConfig(name="planner", nodes=(planner,))
+    running = asyncio.create_task(run_nodes(config, asyncio.Event()))
+    try:
+        await until((folder / "a").exists)
+        shutil.rmtree(folder)
+
+        def interrupt() -> bool:
+            fingers.interrupt()
+            return running.done()
+
+        await until(interrupt, period_s=0.2)
+    finally:
+        fingers.close()
+    with pytest.raises(LoggedNodeError):
+        running.result()
