@@ -30,9 +30,9 @@ Floats = NDArray[np.float64]
 QUICK_TABLE = "quick_table"
 """Name of the method that uses the coarse table, which is computed first from few snapshots."""
 LINEAR_ERROR_RATIO, TABLE_ERROR_RATIO, UNCORRECTED_RATIO, QUICK_EXTRA_RATIO = 0.25, 0.03, 0.15, 0.07
-"""Stated relative errors of the force at depths above 1 mm: of the linear method, of the complete
-table with and without correction by a push on a fine mesh, and the additional error of the coarse
-table (docs/soft-body.md)."""
+"""Stated relative errors of the force at depths above 1 mm and 95 % of the touchable nodes: of the
+linear method, of the complete table with and without correction by a push on a fine mesh, and the
+additional error of the coarse table (docs/soft-body-verification.md)."""
 
 
 def state_force_error_ratio(method: str, geometry: Geometry) -> float:
