@@ -285,6 +285,11 @@ class SoftBody(Message):
         default=0.0,
         description="time from the exposure to the predicted finger position of this response, s",
     )
+    force_error_ratio: NonNegative = Field(
+        default=0.0,
+        description="stated relative error of the force at depths above 1 mm, the larger one while "
+        "a method replaces another; 0: unknown",
+    )
     displacement_world_m: Points3
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from pathlib import Path
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -11,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.simulated_sheet import simulate_force
-from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments import ExperimentError, driver
 from flexsheet.launch.experiments.compliance import (
     DEPTHS_M,
     EVALUATED_S,
@@ -24,19 +26,22 @@ from flexsheet.launch.experiments.compliance import (
     make_presses,
     read_bag,
 )
+from flexsheet.launch.experiments.driver import Driver, TableMethod
 from flexsheet.launch.experiments.force_reference import ReferenceForce, find_reference_curve
 from flexsheet.launch.experiments.pictures import draw_compliance
 from flexsheet.launch.experiments.stroke import SampledMotion
-from flexsheet.launch.plans.plan import load_scene
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.types import SoftBody, Status
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
 from tests.scenes import make_weightless
+from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
-SCENE = make_weightless(
-    load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
-)
+DEMO = Path(__file__).parent.parent / "launch" / "demo.yaml"
+SCENE = make_weightless(load_scene(DEMO.parent / "scenes" / "cylinder.yaml"))
 TIMES = np.array([0, 1_000_000_000], dtype=np.int64)
 STRETCH = 1.06
 CURVE = np.array([[0.0, 0.0], [0.02, 1.0], [0.05, 2.5]])
@@ -185,3 +190,89 @@ def test_the_image_shows_each_position(tmp_path: Path) -> None:
     draw_compliance({"rows": rows, "moving": moving, "noticed_percent": [15, 22]}, picture)
     height, width = cv2.imread(str(picture)).shape[:2]
     assert width > 1.5 * height
+
+
+class Bench:
+    """Driver without sockets, which receives the messages of a soft-body node from the test."""
+
+    def __init__(self, *settings: str) -> None:
+        self.driver = Driver(load_graph(DEMO, settings=settings), cast(Any, None))
+        self.texts: list[str] = []
+
+    async def wait(self, method: TableMethod = "quick_table") -> None:
+        await self.driver.wait_for_table(SCENE, method, self.texts.append)
+
+    def deliver(self, name: str, message: Message) -> None:
+        self.driver._make_handler(name)(message, Header(1, 0, 0, "virtual", "test", 0))
+
+    def answer(self, method: str, force_error_ratio: float) -> None:
+        body = SoftBody(
+            mesh_id="a",
+            method=method,
+            in_range=True,
+            push_depth_m=0.0,
+            force_world_n=np.zeros(3),
+            stiffness_n_per_m=1.0,
+            force_error_ratio=force_error_ratio,
+            displacement_world_m=np.zeros((1, 3), dtype=np.float32),
+        )
+        self.deliver("soft_body", body)
+
+    def report(self, note: str, error: str = "") -> None:
+        status = Status(
+            node="fem_solver",
+            state="running",
+            pid=1,
+            uptime_s=1.0,
+            cpu_ratio=0.0,
+            resident_bytes=1,
+            inputs=(),
+            outputs=(),
+            errors=int(bool(error)),
+            last_error=error,
+            note=note,
+            plan_hash="",
+        )
+        self.deliver("status", status)
+
+
+@pytest.mark.parametrize(("method", "needed"), [("quick_table", 0.1), ("nonlinear_table", 0.03)])
+async def test_the_pushes_begin_when_the_stated_error_is_that_of_the_table(
+    method: TableMethod, needed: float
+) -> None:
+    bench = Bench()
+    bench.answer("linear", 0.25)
+    waiting = asyncio.create_task(bench.wait(method))
+    await asyncio.sleep(0)
+    bench.report("precomputing the soft body: 40 %, about 30 s left")
+    # The quick table has replaced the linear method, which still contributes.
+    bench.answer("quick_table", 0.25)
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    bench.answer(method, needed)
+    await asyncio.wait_for(waiting, DEADLINE_S)
+    assert bench.texts == ["precomputing the soft body: 40 %, about 30 s left"]
+
+
+@pytest.mark.parametrize("setting", ["compute_table=false", "method=linear", "friction_ratio=0.3"])
+async def test_an_experiment_does_not_wait_for_a_table_that_is_not_computed(setting: str) -> None:
+    bench = Bench(f"fem_solver.{setting}")
+    bench.answer("linear", 0.25)
+    await bench.wait()
+
+
+async def test_a_table_that_fails_ends_the_experiment_with_the_reason() -> None:
+    bench = Bench()
+    waiting = asyncio.create_task(bench.wait())
+    await asyncio.sleep(0)
+    bench.report("", "too little memory")
+    with pytest.raises(ExperimentError, match='table: node "fem_solver": too little memory'):
+        await asyncio.wait_for(waiting, DEADLINE_S)
+
+
+async def test_a_table_that_takes_too_long_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(driver, "MAX_TABLE_WAIT_S", 0.01)
+    bench = Bench()
+    bench.report("precomputing the soft body: 4 %")
+    with pytest.raises(ExperimentError, match=r"(?s)quick table.*at most 10 %.*fem_solver: precom"):
+        await bench.wait()

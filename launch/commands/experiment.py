@@ -35,6 +35,7 @@ from flexsheet.launch.plans.features import Feature
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from flexsheet.launch.experiments.driver import TableMethod
     from flexsheet.launch.experiments.hand_gestures import FeltForce
     from flexsheet.launch.experiments.image import Series
 
@@ -255,6 +256,7 @@ def push(
         both_eyes=both_eyes,
         apparatus=apparatus,
         as_json=as_json,
+        with_table=True,
     )
 
 
@@ -265,10 +267,22 @@ def compliance(
     scene: OtherSceneOption = None,
     settings: SettingsOption = None,
     apparatus: ApparatusOption = None,
+    complete_table: Annotated[
+        bool,
+        typer.Option(
+            "--complete-table",
+            help="Wait for the complete table of the soft body; otherwise the pushes begin with "
+            "the coarse table, if the complete one is not in the cache.",
+        ),
+    ] = False,
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the force on the finger with that of the virtual object at several push depths."""
+    """Compare the force on the finger with that of the virtual object at several push depths.
+
+    The experiment waits until the soft body is computed by a table, about a minute on the first
+    start.
+    """
     from flexsheet.launch.experiments import compliance as experiment
     from flexsheet.launch.experiments.pictures import draw_compliance
     from flexsheet.launch.experiments.run import run_experiment
@@ -276,7 +290,8 @@ def compliance(
     folder = make_result_folder(output, "compliance")
     bag, image = folder / "compliance.mcap", folder / "compliance.png"
     with progress_words() as progress:
-        procedure = experiment.make_compliance_procedure(progress)
+        table: TableMethod = "nonlinear_table" if complete_table else "quick_table"
+        procedure = experiment.make_compliance_procedure(progress, table)
         given = with_scene(settings, scene)
         run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.compliance_result(bag, progress)
@@ -331,10 +346,17 @@ def _measure_images(
     both_eyes: bool,
     apparatus: str | None,
     as_json: bool,
+    with_table: bool = False,
 ) -> None:
+    """Run the experiment; with_table: wait for a table of the soft body."""
     from flexsheet.launch.experiments import image
     from flexsheet.launch.experiments.maps import draw_error_maps
-    from flexsheet.launch.experiments.run import make_image_procedure, run_experiment
+    from flexsheet.launch.experiments.run import (
+        chain_procedures,
+        make_image_procedure,
+        make_table_procedure,
+        run_experiment,
+    )
 
     mapped = map_file is not None
     with progress_words() as progress:
@@ -346,6 +368,8 @@ def _measure_images(
             with_maps=mapped,
             with_eyes=both_eyes,
         )
+        if with_table:
+            procedure = chain_procedures(make_table_procedure(progress), procedure)
         needed = ["twin/eye"]
         run_experiment(
             launch_file, settings, bag, procedure, progress, apparatus=apparatus, needed=needed

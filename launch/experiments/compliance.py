@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
 from flexsheet.launch.experiments import ExperimentError, find_recorded
-from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.driver import Driver, TableMethod
 from flexsheet.launch.experiments.force_reference import (
     ReferenceForce,
     ReferenceForceCurve,
@@ -148,10 +148,14 @@ def _make_press(
     return Press(path, place, place_m, surface, normal, holds)
 
 
-def make_compliance_procedure(progress: Progress) -> Procedure:
-    """Make the procedure of the experiment: push at each position, then move in and out."""
+def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
+    """Make the procedure of the experiment: push at each position, then move in and out.
+
+    method: least precise table of the soft body with which the pushes begin.
+    """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
+        await driver.wait_for_table(scene, method, progress)
         for press in make_presses(scene):
             progress(press.path.label)
             await driver.follow(press.path)
@@ -407,6 +411,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
         "median_percent": float(np.median(errors)),
         "worst_percent": float(errors.max()),
         "against_reference": _summarize_judged(judged),
+        "methods": sorted({row["method"] for row in resting}),
         "target_percent": 100.0 * TARGET_ERROR_RATIO,
         "noticed_percent": [100.0 * WEBER_RATIO, 100.0 * WEBER_RATIO_BARE],
         "moving": {

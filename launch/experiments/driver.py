@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Callable, Mapping
-from typing import Self
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Literal, Self
 
 import numpy as np
 
@@ -29,10 +30,17 @@ from flexsheet.messages.types import (
     Shading,
     SheetTarget,
     Skin,
+    SoftBody,
     Status,
     TwinEye,
     TwinFinger,
 )
+from flexsheet.nodes import node_class
+from flexsheet.nodes.fem_solver.body import state_force_error_ratio
+from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
+from flexsheet.nodes.fem_solver.soft_body_factory import choose_method
+
+TableMethod = Literal["quick_table", "nonlinear_table"]
 
 READ = (
     "twin/finger",
@@ -58,6 +66,10 @@ EYE_PIXELS_EVERY = 9
 in turn."""
 WAIT_S = 20.0
 IMAGE_WAIT_S = 40.0
+MAX_TABLE_WAIT_S = 3600.0
+"""Maximum time until a table of the soft body is used; two idle cores need about a minute for the
+coarse one, and about eight minutes for the complete one."""
+PROGRESS_PERIOD_S = 5.0
 MAX_LOAD_PER_CORE = 3.0
 """Load average per core above which the computer counts as overloaded; the demo causes less."""
 
@@ -185,6 +197,56 @@ class Driver:
         what = " and a soft body" if needs_body else ""
         await self.wait_for(ready, f"both arms in mode follow{what}", 3 * WAIT_S)
 
+    async def wait_for_table(
+        self, scene: Scene, method: TableMethod, progress: Callable[[str], None]
+    ) -> None:
+        """Wait until the soft body is computed by a table that is at least as precise as `method`.
+
+        Until then, a node with an empty cache uses a less precise method. Return at once if the
+        scene or the parameters of all nodes choose such a method. progress: receives the node's
+        progress and remaining time. Raises ExperimentError after `MAX_TABLE_WAIT_S`, and if the
+        table cannot be computed.
+        """
+        solvers = {name: p for name, p in self._solvers() if _computes_table(p, scene)}
+        if not solvers:
+            return
+        max_error_ratio = state_force_error_ratio(method, scene.object.geometry)
+        failures: list[str] = []
+        reported_s = -PROGRESS_PERIOD_S
+
+        def is_precise() -> bool:
+            body = self._newest.get("soft_body")
+            return isinstance(body, SoftBody) and 0.0 < body.force_error_ratio <= max_error_ratio
+
+        def watch(message: Message) -> None:
+            nonlocal reported_s
+            if not isinstance(message, Status) or message.node not in solvers:
+                return
+            if message.errors:
+                failures.append(f'node "{message.node}": {message.last_error}')
+            if time.monotonic() - reported_s >= PROGRESS_PERIOD_S:
+                progress(message.note)
+                reported_s = time.monotonic()
+
+        previous, self.on_message = self.on_message, watch
+        try:
+            await self.wait_for(
+                lambda: is_precise() or bool(failures),
+                f"the soft body by the {method.replace('_', ' ')}, with a force error of at most "
+                f"{100 * max_error_ratio:.0f} %; compute the table before the experiment "
+                "(flexsheet precompute SCENE), or choose the linear method in the scene",
+                MAX_TABLE_WAIT_S,
+            )
+        finally:
+            self.on_message = previous
+        if failures:
+            raise ExperimentError(f"error while waiting for the soft body's table: {failures[0]}")
+
+    def _solvers(self) -> Iterator[tuple[str, FemSolverParameters]]:
+        for name, node in self._plan.nodes.items():
+            if issubclass(node_class(node.type), node_class("fem_solver")):
+                yield name, FemSolverParameters.model_validate(node.parameters)
+
     async def change_scene(self, scene: Scene) -> None:
         """Replace the scene of the graph, and wait for its soft body and both arms."""
         if self._publish_scene is None:
@@ -282,6 +344,18 @@ class Driver:
 
         await self.wait_for(received, f'the images of "{label}" for both eyes', IMAGE_WAIT_S)
         self.show(Display(correction=correction, stereo="side_by_side"))
+
+
+def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
+    """Return whether a solver uses a table for a scene, and computes it if it is not cached."""
+    method, _ = choose_method(
+        scene,
+        parameters.method,
+        parameters.skin_spacing_m,
+        compute_table=parameters.compute_table,
+    )
+    has_body = scene.object.material is not None
+    return has_body and method == "nonlinear_table" and parameters.friction_ratio == 0.0
 
 
 def _describe_load() -> str:

@@ -286,6 +286,7 @@ def run_gestures(
     load_or_compute_reaction(scene, truth)
 
     async def procedure(driver: Driver, _: Scene) -> None:
+        await driver.wait_for_table(scene, "quick_table", progress)
         for name, (make_path, _touches) in HAND_GESTURES.items():
             progress(name)
             await driver.follow(make_path(scene, depth_m))

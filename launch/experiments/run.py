@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError, image, stroke
-from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.driver import Driver, TableMethod
 from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -192,6 +192,15 @@ def make_image_procedure(
                 for pattern in image.RAMPS if with_eyes else ():
                     eyes_label = image.make_eyes_label(label, pattern)
                     await driver.capture_both_eyes(eyes_label, correction, pattern)
+
+    return procedure
+
+
+def make_table_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
+    """Make a procedure that waits for a table of the soft body, see `Driver.wait_for_table`."""
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        await driver.wait_for_table(scene, method, progress)
 
     return procedure
 

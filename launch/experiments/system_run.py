@@ -177,6 +177,8 @@ def run_system(
     used = CpuUse()
 
     async def procedure(driver: Driver, scene: Scene) -> None:
+        if has_forces:
+            await driver.wait_for_table(scene, "quick_table", progress)
         progress(f"stroke for {seconds:g} s")
         await used.measure(driver, make_stroke(scene, seconds))
         if has_forces:

@@ -94,8 +94,12 @@ class FemSolver(Node):
     def _describe(self, current: body.SceneBody) -> str:
         """Return a text for the node's status: method in use, its force error, and skin nodes."""
         nodes = len(current.skin.vertices_world_m)
-        percent = 100.0 * current.force_error_ratio
+        percent = 100.0 * self._force_error_ratio(current)
         return f"{current.method.name}, force within {percent:.0f} %, {nodes} skin nodes"
+
+    def _force_error_ratio(self, current: body.SceneBody) -> float:
+        """Return the stated error of the force, with that of bodies which are being replaced."""
+        return max(one.force_error_ratio for one in (current, *(old for old, _ in self._replaced)))
 
     async def close(self) -> None:
         self._stop.set()
@@ -115,9 +119,9 @@ class FemSolver(Node):
             self.note = "no soft body: the object is rigid"
             return
         p, factory = self.parameters, self._factory
-        method, factory.skin_spacing_m = choose_method(scene, p.method, p.skin_spacing_m)
-        if p.compute_table and method == "auto":
-            method = "nonlinear_table"
+        method, factory.skin_spacing_m = choose_method(
+            scene, p.method, p.skin_spacing_m, compute_table=p.compute_table
+        )
         try:
             bodies = await run_unless_superseded(
                 partial(factory.bodies, scene, method),
@@ -177,6 +181,7 @@ class FemSolver(Node):
         if not self._bodies:
             return
         current = self._bodies[self._fallback.name]
+        self._end_transitions()
         if fingertip.valid:
             start_ns = self.clock.now_ns()
             point = body.predict_position(fingertip, self.parameters.prediction_horizon_s)
@@ -185,6 +190,7 @@ class FemSolver(Node):
             if self._fallback.record((self.clock.now_ns() - start_ns) * 1e-9):
                 late = f", {current.method.name} was late" if self._fallback.is_fallback else ""
                 chosen = self._bodies[self._fallback.name]
+                self._replaced.append((current, self.clock.now_ns()))
                 self.note = f"soft body by {self._describe(chosen)}{late}"
             response = self._blend_in(response, lambda old: old.respond(point, anchor)[0])
             self._last, self._last_ns = response, header.source_ns
@@ -197,19 +203,31 @@ class FemSolver(Node):
                 hold_s=self.parameters.hold_s,
                 relax_s=self.parameters.relax_s,
             )
-        message = current.message(response, horizon_s=self.parameters.prediction_horizon_s)
+        message = current.message(
+            response,
+            horizon_s=self.parameters.prediction_horizon_s,
+            force_error_ratio=self._force_error_ratio(current),
+        )
         self.soft_body.publish(message, source_ns=header.source_ns)
+
+    def _end_transitions(self) -> None:
+        """Forget the replaced bodies that no longer contribute to the responses."""
+        if not self._replaced:
+            return
+        begin_ns = self.clock.now_ns() - round(1e9 * BLEND_S)
+        self._replaced = [one for one in self._replaced if one[1] > begin_ns]
+        builds_table = self._table_task is not None and not self._table_task.done()
+        if not (self._replaced or builds_table or self._fallback.is_fallback):
+            self.note = f"soft body ready, {self._describe(self._bodies[self._fallback.name])}"
 
     def _blend_in(
         self, response: Response, respond: Callable[[body.SceneBody], Response]
     ) -> Response:
         """Return the response as a weighted mean with those of recently replaced bodies."""
-        now_ns = self.clock.now_ns()
-        fractions = [(now_ns - at_ns) / 1e9 / BLEND_S for _, at_ns in self._replaced]
-        while fractions and fractions[0] >= 1.0:
-            del self._replaced[0], fractions[0]
-        if not fractions:
+        if not self._replaced:
             return response
+        now_ns = self.clock.now_ns()
+        fractions = [min((now_ns - at_ns) / 1e9 / BLEND_S, 1.0) for _, at_ns in self._replaced]
         shown, *newer = [respond(replaced) for replaced, _ in self._replaced]
         for fraction, one in zip(fractions, [*newer, response], strict=True):
             shown = body.blend_responses(shown, one, smoothstep(fraction))

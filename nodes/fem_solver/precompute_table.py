@@ -22,8 +22,10 @@ from concurrent.futures import (
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -35,9 +37,18 @@ from flexsheet.nodes.fem_solver.contact import unit_linear_body
 from flexsheet.nodes.fem_solver.mesh import build_mesh
 from flexsheet.nodes.fem_solver.mesh.from_scene import VERSION as mesh_version
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
-from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator, place_snapshots
-from flexsheet.nodes.fem_solver.table import Table, fill_table, table_bytes
+from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotSet
+from flexsheet.nodes.fem_solver.table import (
+    FilledNodes,
+    FillJob,
+    Table,
+    fill_table,
+    interpolate_nodes,
+    table_bytes,
+)
 from flexsheet.nodes.models.shapes import make_shape
+
+T = TypeVar("T")
 
 VERSION = 4
 """Version of the computation. Increase it when results for the same specification change."""
@@ -69,15 +80,19 @@ class TableSpec:
 class TableBudget:
     """Estimate of the resources that the computation of a table needs.
 
-    nodes: number of nodes of the table. bytes: memory.
+    nodes: number of nodes of the table. bytes: memory. coarse: whether it is the coarse table.
     """
 
     snapshots: int
     nodes: int
     bytes: int
+    coarse: bool = False
 
     def text(self) -> str:
-        return f"{self.snapshots} snapshots for {self.nodes} nodes, {self.bytes / 1e6:.0f} MB"
+        return (
+            f"{'coarse' if self.coarse else 'complete'} table, {self.snapshots} snapshots for "
+            f"{self.nodes} nodes, {self.bytes / 1e6:.0f} MB"
+        )
 
 
 @contextmanager
@@ -194,71 +209,102 @@ def _compute_table(
         mirrors,
         user,
     )
-    table = table_bytes(len(response.contact_nodes), len(response.rest), len(snapshots.DEPTHS_M))
-    need = TableBudget(
-        len(samples), len(response.contact_nodes), 2 * table + workers * SNAPSHOT_BYTES
-    )
     given = {"poisson_ratio": spec.body.poisson_ratio, "finger_radius_m": spec.finger_radius_m}
+    fine_job = snapshots.make_fine_job(mesh_spec, samples[0], **given)
     linear = unit_linear_body(
         response,
         make_shape(dict(mesh_spec.geometry)),
         response.rest[model.bounds],
         spec.finger_radius_m,
     )
-    fine_job = snapshots.make_fine_job(mesh_spec, samples[0], **given)
-    fine_jobs = [] if fine_job is None else [fine_job]
-    stages: list[tuple[list[snapshots.SamplePoint], tuple[float, ...], str]] = [
-        (samples, snapshots.DEPTHS_M, "push")
-    ]
-    if on_quick is not None:
-        stages.insert(0, (samples[: snapshots.QUICK_COUNT], snapshots.QUICK_DEPTHS_M, "quick"))
-    pushes = len(fine_jobs) + sum(len(stage[0]) for stage in stages)
-    total = SNAPSHOT_STEPS * pushes + NODE_STEPS * len(stages) * len(response.contact_nodes)
-    progress(0, total, need)
-    precompute.require_memory(
-        need.bytes,
-        f"computing the nonlinear table of the soft body ({need.text()})",
-        f'increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "linear"',
-    )
-    done = 0
-    fine: tuple[snapshots.SamplePoint, snapshots.Snapshot] | None = None
+    loads = len(response.contact_nodes)
+    table = table_bytes(loads, len(response.rest), len(snapshots.DEPTHS_M))
 
-    def report(steps: int) -> None:
-        progress(done + steps, total, need)
-
-    for some, depths_m, name in stages:
+    def compute_stage(
+        name: str, some: list[snapshots.SamplePoint], depths_m: tuple[float, ...], *, coarse: bool
+    ) -> Table:
         jobs = [
             snapshots.make_snapshot_job(mesh_spec, mesh, sample, depths_m=depths_m, **given)
             for sample in some
         ]
+        names = [f"{name}-{number:04d}" for number in range(len(jobs))]
+        if fine_job is not None:
+            # Both stages need it; the second one loads it from the checkpoints.
+            jobs, names = [fine_job, *jobs], ["fine", *names]
+        solving = SNAPSHOT_STEPS * len(jobs)
+        need = TableBudget(len(jobs), loads, 2 * table + workers * SNAPSHOT_BYTES, coarse=coarse)
+
+        def report(steps: int) -> None:
+            progress(steps, solving + NODE_STEPS * loads, need)
+
+        report(0)
+        precompute.require_memory(
+            need.bytes,
+            f"computing the nonlinear table of the soft body ({need.text()})",
+            f"increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "
+            '"linear"',
+        )
         solved = solve_all(
-            [*fine_jobs, *jobs],
-            executor,
-            checkpoints,
-            lambda count: report(SNAPSHOT_STEPS * count),
-            names=[
-                *("fine" for _ in fine_jobs),
-                *(f"{name}-{number:04d}" for number in range(len(jobs))),
-            ],
+            jobs, executor, checkpoints, lambda count: report(SNAPSHOT_STEPS * count), names=names
         )
-        done += SNAPSHOT_STEPS * len(solved)
-        if fine_jobs:
-            fine, fine_jobs = (samples[0], solved.pop(0)), []
-        interpolator = SnapshotInterpolator(
-            place_snapshots(some, solved, mirrors), user, spec.finger_radius_m
-        )
-        result = fill_table(
+        return fill_table(
             response,
             model.triangles,
             linear,
-            interpolator,
-            lambda node, _: report(node),
-            fine=fine,
+            SnapshotSet(some, solved[-len(some) :], mirrors, user, spec.finger_radius_m),
+            fine=None if fine_job is None else (samples[0], solved[0]),
+            interpolate=partial(
+                _interpolate_by, executor, lambda count: report(solving + NODE_STEPS * count)
+            ),
         )
-        done += NODE_STEPS * len(response.contact_nodes)
-        if name == "quick" and on_quick is not None:
-            on_quick(result)
-    return result
+
+    if on_quick is not None:
+        some = samples[: snapshots.QUICK_COUNT]
+        on_quick(compute_stage("quick", some, snapshots.QUICK_DEPTHS_M, coarse=True))
+    return compute_stage("push", samples, snapshots.DEPTHS_M, coarse=False)
+
+
+def _interpolate_by(
+    executor: Executor, on_progress: Callable[[int], None], jobs: Sequence[FillJob]
+) -> list[FilledNodes]:
+    """Interpolate the nodes of jobs by an executor. on_progress: called with the nodes done."""
+    filled: dict[int, FilledNodes] = {}
+    _collect(
+        {executor.submit(interpolate_nodes, job): number for number, job in enumerate(jobs)},
+        filled.__setitem__,
+        lambda: on_progress(sum(len(one.reached) for one in filled.values())),
+    )
+    return [filled[number] for number in range(len(jobs))]
+
+
+def _collect(
+    waiting: dict[Future[T], int],
+    on_result: Callable[[int, T], None],
+    on_progress: Callable[[], None],
+) -> None:
+    """Await the futures, and cancel the remaining ones after an exception.
+
+    on_result: called with the number and the result of each. on_progress: called periodically.
+    Raises LostWorkersError if the executor loses its workers, and the errors of the futures.
+    """
+    try:
+        while waiting:
+            done, _ = wait(waiting, timeout=POLL_S, return_when=FIRST_COMPLETED)
+            for future in done:
+                number = waiting.pop(future)
+                try:
+                    result = future.result()
+                except CancelledError as error:
+                    raise LostWorkersError(
+                        "the worker processes that solve snapshots for the soft body's table were "
+                        "lost; restart them and repeat the command, which continues from the "
+                        "finished snapshots"
+                    ) from error
+                on_result(number, result)
+            on_progress()
+    finally:
+        for future in waiting:
+            future.cancel()
 
 
 def solve_all(
@@ -287,23 +333,10 @@ def solve_all(
         for number, job in enumerate(jobs)
         if number not in solved
     }
-    try:
-        while waiting:
-            done, _ = wait(waiting, timeout=POLL_S, return_when=FIRST_COMPLETED)
-            for future in done:
-                number = waiting.pop(future)
-                try:
-                    snapshot = future.result()
-                except CancelledError as error:
-                    raise LostWorkersError(
-                        "the worker processes that solve snapshots for the soft body's table were "
-                        "lost; restart them and repeat the command, which continues from the "
-                        "finished snapshots"
-                    ) from error
-                checkpoints.save(names[number], encode_fields(snapshot))
-                solved[number] = snapshot
-            on_progress(len(solved))
-    finally:
-        for future in waiting:
-            future.cancel()
+
+    def store(number: int, snapshot: snapshots.Snapshot) -> None:
+        checkpoints.save(names[number], encode_fields(snapshot))
+        solved[number] = snapshot
+
+    _collect(waiting, store, lambda: on_progress(len(solved)))
     return [solved[number] for number in range(len(jobs))]

@@ -32,9 +32,8 @@ from flexsheet.nodes.fem_solver.precompute import SoftBodyModel
 from flexsheet.nodes.fem_solver.precompute_table import local_processes, make_table_cache, solve_all
 from flexsheet.nodes.fem_solver.snapshot_interpolator import (
     NEIGHBOURS,
-    SnapshotInterpolator,
+    SnapshotSet,
     SurfaceLocator,
-    place_snapshots,
 )
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob
 from flexsheet.nodes.fem_solver.table import CANDIDATE_FACES, END_SPAN_M, Table, fill_table
@@ -206,8 +205,10 @@ class LocalTable:
         )
         count = len(self._samples)
         fine = (self._samples[0], solved[count]) if len(solved) > count else None
-        interpolator = SnapshotInterpolator(
-            place_snapshots(self._samples, solved[:count], self._mirrors),
+        source = SnapshotSet(
+            self._samples,
+            solved[:count],
+            self._mirrors,
             np.array(self._body.spec.mesh.towards_user),
             radius,
         )
@@ -216,9 +217,7 @@ class LocalTable:
             contact_nodes=response.contact_nodes[self._near],
             normals=response.normals[self._near],
         )
-        part = fill_table(
-            near, self._model.triangles, linear, interpolator, lambda *_: None, fine=fine
-        )
+        part = fill_table(near, self._model.triangles, linear, source, fine=fine)
         count = len(response.contact_nodes)
         table = Table(
             depths_m=part.depths_m,

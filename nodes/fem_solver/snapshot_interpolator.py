@@ -178,6 +178,26 @@ def _tangents(towards_user: Floats) -> list[int]:
     return [axis for axis in range(3) if axis != int(np.abs(towards_user).argmax())]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SnapshotSet:
+    """Snapshots at sample points, from which a worker makes an interpolator.
+
+    mirrors: symmetries of the body, see `snapshots.find_mirror_planes`. towards_user (3,),
+    radius_m: see `SnapshotInterpolator`.
+    """
+
+    samples: Sequence[SamplePoint]
+    solved: Sequence[Snapshot]
+    mirrors: Sequence[Floats]
+    towards_user: Floats
+    radius_m: float
+
+    def make_interpolator(self) -> SnapshotInterpolator:
+        """Return an interpolator of the snapshots and their mirror images."""
+        placed = place_snapshots(self.samples, self.solved, self.mirrors)
+        return SnapshotInterpolator(placed, self.towards_user, self.radius_m)
+
+
 def place_snapshots(
     samples: Sequence[SamplePoint], solved: Sequence[Snapshot], mirrors: Sequence[Floats]
 ) -> list[PlacedSnapshot]:

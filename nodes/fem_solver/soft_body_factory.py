@@ -27,20 +27,24 @@ SKIN_SPACING_M = 0.003
 
 
 def choose_method(
-    scene: Scene, method: MethodChoice, skin_spacing_m: float | Literal["auto"]
+    scene: Scene,
+    method: MethodChoice,
+    skin_spacing_m: float | Literal["auto"],
+    *,
+    compute_table: bool = False,
 ) -> tuple[MethodChoice, float]:
     """Return the method and the skin spacing (m), given a scene and the parameters of a node.
 
     method, skin_spacing_m: parameters; `auto` leaves the choice to the scene. If the scene chooses
-    the linear method, that is used even if a table is cached. If it chooses the table, the table is
-    used if it is cached; only the parameter starts its computation, which takes minutes.
+    the linear method, that is used even if a table is cached. Otherwise `auto` uses the table if it
+    is cached. compute_table: whether `auto` also computes a missing table, which takes minutes.
     """
     choice = scene.methods.soft_body
     by_scene_m = None if choice is None else choice.skin_spacing_m
     spacing_m = resolve_method(skin_spacing_m, by_scene_m, SKIN_SPACING_M)
     if method == "auto" and choice is not None and choice.method == "linear":
         return "linear", spacing_m
-    return method, spacing_m
+    return "nonlinear_table" if compute_table and method == "auto" else method, spacing_m
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ linear method is used instead.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +34,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     triangle_shape_functions,
     triangle_shape_functions_at,
 )
-from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator
+from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator, SnapshotSet
 from flexsheet.nodes.fem_solver.snapshots import FINE_RATIO, SamplePoint, Snapshot
 from flexsheet.nodes.models.interpolation import smoothstep
 
@@ -57,8 +57,8 @@ radii."""
 CANDIDATE_FACES = 4
 MESH_ORDER = 2.0
 """Order of convergence of the force with the element size."""
-Progress = Callable[[int, int], None]
-"""Callback with the number of nodes done and their total."""
+FILLED_NODES = 48
+"""Maximum number of contact nodes of a job that fills a table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,42 +84,94 @@ def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
     return loads * skin_nodes * 3 * 4 * (depths + len(LINEAR_DEPTHS_M))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FillJob:
+    """Contact nodes at which snapshots are interpolated. It contains all inputs, for a worker.
+
+    samples: contact nodes. rest (s, 3): undeformed skin nodes. triangles (t, 3): skin triangles.
+    """
+
+    samples: Sequence[SamplePoint]
+    rest: Floats
+    triangles: NDArray[np.int32]
+    source: SnapshotSet
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilledNodes:
+    """Interpolated snapshots at n nodes and k depths.
+
+    moved (n, k, 3 s), force_n (n, k, 3): displacement of the skin, and force. reached (n,): see
+    `SnapshotInterpolator.interpolate`. valid (n,): see `count_valid_levels`.
+    """
+
+    moved: Floats32
+    force_n: Floats
+    reached: Floats
+    valid: Ints
+
+
+def interpolate_nodes(job: FillJob) -> FilledNodes:
+    """Interpolate the snapshots at the nodes of a job."""
+    interpolator = job.source.make_interpolator()
+    moved, force, reached = zip(
+        *(interpolator.interpolate(sample, job.rest) for sample in job.samples), strict=True
+    )
+    valid = [count_valid_levels(job.rest, one, job.triangles) for one in moved]
+    count = len(job.samples)
+    return FilledNodes(
+        np.stack(moved).reshape(count, len(force[0]), -1),
+        np.stack(force),
+        np.array(reached),
+        np.array(valid),
+    )
+
+
+Interpolate = Callable[[Sequence[FillJob]], Iterable[FilledNodes]]
+"""Function that interpolates the nodes of jobs, in this or in other processes, in their order."""
+
+
 def fill_table(
     response: SkinResponse,
     triangles: NDArray[np.int32],
     linear: LinearSoftBody,
-    interpolator: SnapshotInterpolator,
-    on_progress: Progress,
+    source: SnapshotSet,
     *,
     fine: tuple[SamplePoint, Snapshot] | None = None,
+    interpolate: Interpolate = lambda jobs: map(interpolate_nodes, jobs),
 ) -> Table:
     """Compute the table of a body.
 
     triangles (t, 3): triangles of its skin. linear: linear method for the same response and a
-    modulus of 1 Pa; its linear range must contain all blended depths. on_progress: called with the
-    number of nodes done and their total; it may raise an exception to stop. fine: push on a fine
-    mesh with which all forces are corrected (`compute_force_factors`).
+    modulus of 1 Pa; its linear range must contain all blended depths. fine: push on a fine mesh
+    with which all forces are corrected (`compute_force_factors`).
     """
+    interpolator = source.make_interpolator()
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
+    first = len(depths) - len(interpolator.depths_m)
     points, normals = response.rest[response.contact_nodes], response.normals
     count = len(points)
-
     factors = np.ones(len(depths))
     if fine is not None:
         factors = compute_force_factors(fine, response, linear, interpolator, depths)
     fields = np.empty((count, len(depths) - 1, response.rest.size), dtype=np.float32)
     force, reach = np.empty((count, len(depths), 3)), np.empty(count)
-    for number in range(count):
-        sample = SamplePoint(points[number], normals[number])
-        moved, force[number], reach[number] = _fill_levels(
-            sample, response, linear, interpolator, depths
-        )
-        force[number] *= factors[:, None]
-        fields[number] = moved[1:]
-        sound = count_valid_levels(response.rest, moved.reshape(len(depths), -1, 3), triangles)
-        reach[number] = min(reach[number], float(depths[sound - 1]))
-        on_progress(number + 1, count)
-    return Table(depths, fields, force, reach)
+    samples = [SamplePoint(*one) for one in zip(points, normals, strict=True)]
+    jobs = [
+        FillJob(samples[start : start + FILLED_NODES], response.rest, triangles, source)
+        for start in range(0, count, FILLED_NODES)
+    ]
+    number = 0
+    for job, filled in zip(jobs, interpolate(jobs), strict=True):
+        for at, sample in enumerate(job.samples):
+            moved, force[number] = _blend_levels(
+                sample, linear, depths, filled.moved[at], filled.force_n[at]
+            )
+            fields[number] = moved[1:]
+            sound_m = depths[first + filled.valid[at] - 1]
+            reach[number] = min(_reach_m(filled.reached[at], depths[first:]), sound_m)
+            number += 1
+    return Table(depths, fields, force * factors[:, None], reach)
 
 
 def compute_force_factors(
@@ -143,7 +195,8 @@ def compute_force_factors(
     factors = np.ones(len(depths))
     if not len(solved_m):
         return factors
-    _, force, _ = _fill_levels(sample, response, linear, interpolator, depths)
+    moved, pushed, _ = interpolator.interpolate(sample, response.rest)
+    _, force = _blend_levels(sample, linear, depths, moved.reshape(len(pushed), -1), pushed)
     coarse_n, fine_n = force @ sample.normal, push.force_n[: push.reached] @ sample.normal
     within = (depths > 0.0) & (depths <= solved_m[-1] * (1.0 + 1e-9))
     # As in Hertz' theory, force / depth^1.5 hardly changes, so its interpolation is precise.
@@ -156,33 +209,32 @@ def compute_force_factors(
     return factors
 
 
-def _fill_levels(
-    sample: SamplePoint,
-    response: SkinResponse,
-    linear: LinearSoftBody,
-    interpolator: SnapshotInterpolator,
-    depths: Floats,
-) -> tuple[Floats32, Floats, float]:
-    """Compute the table entries of one contact node.
+def _blend_levels(
+    sample: SamplePoint, linear: LinearSoftBody, depths: Floats, solved: Floats32, pushed: Floats
+) -> tuple[Floats32, Floats]:
+    """Blend interpolated snapshots with the linear response at small depths.
 
-    Returns the displacement (L, 3 s) and the force (L, 3) at the L depths, and the maximum depth
-    (m) with a valid solution.
+    solved (k, 3 s), pushed (k, 3): displacement and force at the last k of the L depths. Returns
+    the displacement (L, 3 s) and the force (L, 3) at all depths.
     """
-    moved = np.zeros((len(depths), response.rest.size), dtype=np.float32)
+    moved = np.zeros((len(depths), solved.shape[1]), dtype=np.float32)
     force = np.zeros((len(depths), 3))
-    solved, pushed, reached = interpolator.interpolate(sample, response.rest)
     first = len(depths) - len(solved)
     fractions = np.clip((depths - BLEND_M[0]) / (BLEND_M[1] - BLEND_M[0]), 0.0, 1.0)
     for level, (depth, weight) in enumerate(zip(depths, fractions, strict=True)):
         if weight > 0.0:
-            moved[level] = np.float32(weight) * solved[level - first].ravel()
+            moved[level] = np.float32(weight) * solved[level - first]
             force[level] = weight * pushed[level - first]
         if depth > 0.0 and weight < 1.0:
-            response_here = linear.respond(ContactQuery(sample.point, sample.normal, float(depth)))
-            moved[level] += np.float32(1.0 - weight) * response_here.displacement.ravel()
-            force[level] += (1.0 - weight) * response_here.force_n
-    reach = float(np.interp(reached, np.arange(1, len(solved) + 1), depths[first:]))
-    return moved, force, reach
+            response = linear.respond(ContactQuery(sample.point, sample.normal, float(depth)))
+            moved[level] += np.float32(1.0 - weight) * response.displacement.ravel()
+            force[level] += (1.0 - weight) * response.force_n
+    return moved, force
+
+
+def _reach_m(reached: float, depths: Floats) -> float:
+    """Return the maximum depth (m) with a valid solution, from the number of converged depths."""
+    return float(np.interp(reached, np.arange(1, len(depths) + 1), depths))
 
 
 class CubicInterpolator:
