@@ -29,7 +29,7 @@ from flexsheet.launch.commands.commission_steps import (
     BOARD,
     INSTRUCTIONS,
     Laboratory,
-    measured_stiffness,
+    describe_sheet,
     open_laboratory,
 )
 from flexsheet.launch.experiments.trial import run_robustness_trial
@@ -211,14 +211,15 @@ def test_a_stiffer_sheet_is_identified_from_pushes_between_the_true_arms() -> No
     assert found.hysteresis_ratio.value == pytest.approx(0.1, abs=0.03)
 
 
-def test_a_measured_modulus_keeps_the_displacement_of_the_flanges() -> None:
+def test_a_measured_sheet_keeps_the_displacement_of_the_flanges() -> None:
     arm = SCENE.arms.left.model_copy(update={"flange_compliance_m_per_n": 60e-6})
     scene = SCENE.model_copy(update={"arms": SCENE.arms.model_copy(update={"left": arm})})
     before = scene.sheet.young_modulus_pa * scene.sheet.thickness_m
-    values = measured_stiffness(scene, 1.2 * before)
+    values = describe_sheet(scene, 1.2 * before, scene.sheet.width_m)
     assert values == pytest.approx(
         {
             "sheet.young_modulus_pa": 1.2 * scene.sheet.young_modulus_pa,
+            "sheet.width_m": scene.sheet.width_m,
             "arms.left.flange_compliance_m_per_n": 50e-6,
             "arms.right.flange_compliance_m_per_n": 0.0,
         }

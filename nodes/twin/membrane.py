@@ -17,6 +17,7 @@ the limit of Coulomb friction is exceeded.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -421,10 +422,40 @@ def solve(
 ) -> DeformedSheet:
     """Solve the equilibrium of the sheet between its edges, pushed by a fingertip.
 
+    finger_tip: the point (3,) of the fingertip sphere that is farthest from the user. Without it,
+    or if it lies in front of or beside the sheet, there is no contact. The other arguments, and the
+    errors, are those of `solve_path`.
+    """
+    return solve_path(
+        rubber,
+        world_from_left_edge,
+        world_from_right_edge,
+        finger_tips=() if finger_tip is None else (finger_tip,),
+        finger_radius_m=finger_radius_m,
+        friction_coefficient=friction_coefficient,
+        cells=cells,
+        slack_tension=slack_tension,
+    )[-1]
+
+
+def solve_path(
+    rubber: TrueRubber,
+    world_from_left_edge: Floats,
+    world_from_right_edge: Floats,
+    *,
+    finger_tips: Sequence[Floats],
+    finger_radius_m: float = 0.007,
+    friction_coefficient: float | None = None,
+    cells: int = CELLS,
+    slack_tension: float = SLACK_TENSION,
+) -> list[DeformedSheet]:
+    """Solve the equilibria of the sheet while a fingertip advances through the given positions.
+
+    Returns the sheet at each position; without any, the sheet that nothing touches.
+
     world_from_left_edge, world_from_right_edge: (4, 4) poses of the clamped edges; the origin is
     the centre of the edge, y points along it.
-    finger_tip: the point (3,) of the fingertip sphere that is farthest from the user. Without it,
-    or if it lies in front of or beside the sheet, there is no contact.
+    finger_tips: positions (3,) on one normal of the sheet, in the order of their depths.
     friction_coefficient: Coulomb coefficient between finger and sheet; None: touched nodes stick.
     cells: number of intervals between nodes along each side; even.
     slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a barely
@@ -445,14 +476,13 @@ def solve(
     y_axis = np.cross(normal, x_axis)
     middle = 0.5 * (left[:3, 3] + right[:3, 3])
 
-    depth = 0.0
     focus: tuple[float | None, float | None] = (None, None)
-    if finger_tip is not None:
-        offset = finger_tip - middle
+    tips = list(finger_tips)
+    if tips:
+        offset = tips[-1] - middle
         across, along_edge = float(offset @ x_axis / distance), float(offset @ y_axis)
         over = abs(across) < 0.5 and abs(along_edge) < 0.5 * rubber.height_m
-        depth = float(-offset @ normal) if over else 0.0
-        if depth > 0.0:
+        if over and offset @ normal < 0.0:
             focus = (
                 (across + 0.5) * rubber.width_m,
                 along_edge + 0.5 * rubber.height_m,
@@ -470,14 +500,19 @@ def solve(
     )
     positions, iterations = _relax(mesh, flat.reshape(-1, 3), None)
 
-    finger = None
-    if finger_tip is not None and depth > 0.0:
-        steps = int(np.ceil(depth / (MAX_STEP_RADII * finger_radius_m)))
-        advance = -(depth / steps) * normal
-        carried = _cone(mesh, focus, rubber)
-        stuck = np.zeros(len(positions), bool)
+    if focus[0] is None:
+        return [_describe(mesh, positions, None, iterations)] * max(len(tips), 1)
+    carried = _cone(mesh, focus, rubber)
+    stuck = np.zeros(len(positions), bool)
+    finger: _Finger | None = None
+    solved = []
+    before_m = 0.0
+    for tip in tips:
+        depth = float((middle - tip) @ normal)
+        steps = int(np.ceil((depth - before_m) / (MAX_STEP_RADII * finger_radius_m)))
+        advance = -((depth - before_m) / max(steps, 1)) * normal
         for step in range(1, steps + 1):
-            centre = finger_tip + finger_radius_m * normal - (steps - step) * advance
+            centre = tip + finger_radius_m * normal - (steps - step) * advance
             positions = positions + np.where(stuck, 1.0, carried)[:, None] * advance
             finger = _Finger(
                 centre,
@@ -500,7 +535,14 @@ def solve(
                 positions, count = _relax(mesh, positions, finger)
                 iterations += count
             stuck = finger.touching(positions)
+        before_m = max(depth, before_m)
+        solved.append(_describe(mesh, positions, finger, iterations))
+    return solved
 
+
+def _describe(
+    mesh: _Mesh, positions: Floats, finger: _Finger | None, iterations: int
+) -> DeformedSheet:
     gradient, _ = mesh.forces(positions)
     at_nodes = gradient.reshape(*mesh.shape, 3)
     contact = np.zeros(3) if finger is None else -finger.forces(positions)[0].sum(axis=0)
