@@ -18,8 +18,10 @@ from flexsheet.launch.calibration.commission import (
     Commissioning,
     StepName,
     StepResult,
+    list_doubts,
 )
 from flexsheet.launch.calibration.hand_eye import BoardDetection, CornerView, calibrate_base
+from flexsheet.launch.calibration.prediction import Knowledge, draw_apparatus
 from flexsheet.launch.calibration.sheet_rows import simulate_rows
 from flexsheet.launch.calibration.touches import simulate_touches
 from flexsheet.launch.commands import capture
@@ -32,6 +34,8 @@ from flexsheet.launch.commands.commission_steps import (
     describe_sheet,
     open_laboratory,
 )
+from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
+from flexsheet.launch.experiments.robustness import summarize_commissioning
 from flexsheet.launch.experiments.trial import run_robustness_trial
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
@@ -57,6 +61,7 @@ DEMO = ROOT / "launch" / "demo.yaml"
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 OPTICS = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 SCENE = load_scene(SCENE_FILE)
+PREDICTED = {"typical": 0.3, "limit_95": 0.45, "tolerance": 0.5, "within": True}
 
 
 def matrix(pose: Any) -> Floats:
@@ -369,10 +374,81 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path, prepare: Any, wor
         open_lab(tmp_path)
 
 
+def test_a_seed_counts_from_the_scene_that_was_commissioned(tmp_path: Path) -> None:
+    """Any calibrated values give the same hardware as the apparatus file of the commissioning."""
+    lab, _ = open_laboratory(tmp_path / "lab", DEMO, None, "seed:3")
+    radius = {"finger.radius_m": 0.0085, "arms.left.flange_compliance_m_per_n": 5e-5}
+    lab.run(StepName.EDGES, lambda _: result(scene_values=radius))
+    drawn, stored = (
+        load_graph(lab.launch_copy, apparatus=text).apparatus_message()
+        for text in ("seed:3", str(tmp_path / "lab" / "apparatus.yaml"))
+    )
+    assert drawn is not None
+    assert stored is not None
+    scene = load_scene(lab.scene_copy)
+    true = [apply_apparatus(scene, one) for one in (drawn, stored)]
+    assert true[0].finger.radius_m == pytest.approx(true[1].finger.radius_m, abs=1e-9)
+    assert drawn.arms.left.flange_compliance_m_per_n == pytest.approx(
+        stored.arms.left.flange_compliance_m_per_n
+    )
+    # A draw of calibrated devices counts from the calibrated values.
+    calibrated = load_graph(lab.launch_copy, apparatus="seed:3,calibrated").apparatus_message()
+    assert calibrated is not None
+    assert apply_apparatus(scene, calibrated).finger.radius_m == pytest.approx(0.0085, abs=1e-3)
+    lab.state = lab.state.model_copy(update={"scene_file": str(tmp_path / "gone.yaml")})
+    (tmp_path / "lab" / "commission.json").write_text(lab.state.model_dump_json())
+    with pytest.raises(BadInputError, match=r"gone.yaml.*does not exist.*apparatus.yaml"):
+        load_graph(lab.launch_copy, apparatus="seed:3")
+
+
 def test_an_unknown_apparatus_leaves_no_folder(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="not a random sample"):
         open_laboratory(tmp_path / "lab", DEMO, None, "seed:x")
     assert not (tmp_path / "lab").exists()
+
+
+def test_a_laboratory_is_doubted_for_each_reason(tmp_path: Path) -> None:
+    lab = open_lab(tmp_path)
+    lab.run(StepName.CAMERA, lambda _: result())
+    figures = {"predicted": {"image_mm": PREDICTED}, "flagged": []}
+    assert list_doubts(lab.state.steps, figures, (0.2, 0.5)) == []
+    lab.run(StepName.ARMS, lambda _: result(0.7))
+    lab.skip(StepName.EDGES, "no marks")
+    figures = {
+        "predicted": {"image_mm": {**PREDICTED, "within": False, "limit_95": 0.9}},
+        "flagged": ["marker_offset"],
+    }
+    doubts = list_doubts(lab.state.steps, figures, (0.6, 0.5))
+    for doubt, words in zip(
+        doubts,
+        ("step arms: residual 0.7", "edges was skipped", "image_mm: 95 %", "marker", "0.6 mm"),
+        strict=True,
+    ):
+        assert words in doubt
+
+
+# Predicted errors
+
+
+def test_predicted_errors_match_errors_drawn_from_the_same_uncertainties() -> None:
+    """The reference draws fingertip errors without the evaluator: marker and timestamp."""
+    deviations_m = (2e-4, 1e-4, 3e-4)
+    marker = fit_marker(
+        simulate_touches(SCENE, nominal_apparatus(SCENE), calibration=None, seed=1), SCENE, "twin"
+    ).model_copy(update={"standard_deviations_m": deviations_m})
+    known = Knowledge(
+        scene=SCENE,
+        calibrations=NodeCalibrations(load_calibration(OPTICS), None, marker),
+        edges={},
+        projector_px2=np.zeros((2, 2)),
+        eyes_m2=np.zeros((3, 3)),
+        stamp_std_s=0.0,
+    )
+    random = np.random.default_rng(5)
+    believed = known.calibrations.find_marker_offset_m(SCENE)
+    drawn = np.array([find_marker_offset(draw_apparatus(known, random)) for _ in range(400)])
+    assert drawn.mean(axis=0) == pytest.approx(believed, abs=5e-5)
+    assert drawn.std(axis=0) == pytest.approx(deviations_m, rel=0.12)
 
 
 # The command
@@ -495,26 +571,24 @@ def test_an_apparatus_without_twin_is_refused() -> None:
 
 
 def test_a_robustness_trial_commissions_its_laboratory(
-    tmp_path: Path, quick_steps: list[StepName], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    strokes = []
-
-    def run_stroke(trial: Any, apparatus: str) -> dict[str, Any]:
-        strokes.append((trial["launch_file"], apparatus))
-        errors = {key: {"mean": 0.1} for key in ("true_delta_d_mm", "true_delta_theta_deg")}
-        rest = dict.fromkeys(("valid_ratio", "latency_ms", "drops", "bag", "flagged"))
-        return {**errors, "fingertip_mm": {"mean": 0.2}, **rest}
-
-    class Evaluator:
-        def __init__(self, *_: Any) -> None: ...
-
-        def evaluate(self, *_: Any) -> Any:
-            return type(
-                "Found", (), {"figures": lambda _: {"image_mm": 0.1, "force_percent": 2.0}}
-            )()
-
-    monkeypatch.setattr("flexsheet.launch.experiments.trial.run_stroke", run_stroke)
-    monkeypatch.setattr("flexsheet.launch.experiments.trial.OfflineEvaluator", Evaluator)
+    errors = {
+        key: {"mean": 0.1}
+        for key in ("true_delta_d_mm", "true_delta_theta_deg", "delta_d_mm", "fingertip_mm")
+    }
+    figures = {
+        "stroke": errors,
+        "at_rest": {"after": {"image_mm": 0.6, "force_percent": 2.0}},
+        "flagged": [],
+        "predicted": {"image_mm": PREDICTED},
+        "doubts": ["the image"],
+    }
+    monkeypatch.setattr(
+        Laboratory,
+        "steps",
+        property(lambda _: {name: lambda _: result(figures=figures) for name in StepName}),
+    )
     row = run_robustness_trial(
         {
             "seed": 3,
@@ -525,10 +599,15 @@ def test_a_robustness_trial_commissions_its_laboratory(
             "seconds": 1.0,
         }
     )
-    assert strokes == [(str(tmp_path / "lab/launch.yaml"), str(tmp_path / "lab/apparatus.yaml"))]
-    assert [one["name"] for one in row["commission"]["steps"]] == list(StepName)[:-1]
-    assert row["sheet_mm"] == 0.1
-    assert row["image_mm"] == 0.1
+    assert [one["name"] for one in row["commission"]["steps"]] == list(StepName)
+    assert (row["sheet_mm"], row["image_mm"]) == (0.1, 0.6)
+    assert row["out_of_tolerance"] == ["image_mm"]
+    summary = summarize_commissioning([row])
+    assert summary["confusion"]["doubted_and_exceeded"] == 1
+    found = summary["predictions"]["image_mm"]
+    assert found["stated_over_true"]["median"] == pytest.approx(0.3 / 0.6)
+    assert found["covered"] == 0.0
+    assert found["good_but_exceeded"] == 1
 
 
 def test_commissioned_and_calibrated_exclude_each_other() -> None:

@@ -42,8 +42,8 @@ CELLS = 16
 NORMAL_95 = 1.645
 """95 % quantile of the standard normal distribution."""
 
-RADIUS_STD_M = 3.3e-4
-"""Calliper on a soft fingertip, and rounding of the radius to half a millimetre."""
+RADIUS_STD_M = 3e-4
+"""Calliper on a soft fingertip."""
 
 EYE_STD_M = 5e-3
 """Head tracker, per axis, unless a step measures the eyes."""
@@ -121,10 +121,11 @@ def predict_errors(
         errors = np.array(values)
         if metric is Metric.SHEET:
             errors = np.hypot(errors, 1e3 * tracking_m)
-        logs = np.log(np.maximum(errors, 1e-6))
-        high = float(np.exp(logs.mean() + NORMAL_95 * logs.std(ddof=1)))
+        # The quantile of a length with normal components: of few draws, it is more certain than
+        # an empirical one.
+        high = float(errors.mean() + NORMAL_95 * errors.std(ddof=1))
         predicted[metric] = PredictedError(
-            typical=float(np.exp(logs.mean())),
+            typical=float(np.median(errors)),
             limit_95=high,
             tolerance=tolerances[metric],
             within=high <= tolerances[metric],

@@ -101,7 +101,7 @@ def open_laboratory(
         raise CommissionError(f'{launch_file}: missing key "scene"; add a scene file')
     base = scene_file or Path(plan.scene_file)
     # Check the apparatus before the folder is created.
-    true = calibrate.load_true_devices(apparatus, load_scene(base))
+    true = calibrate.load_true_devices(apparatus, load_scene(base), base)
     lab = Commissioning(folder, launch_file, base, apparatus)
     if true is not None:
         write_file(folder / APPARATUS_FILE, format_apparatus(true))
@@ -389,9 +389,7 @@ class Laboratory:
             touches = simulate_touches(scene, self.apparatus, calibration=optics, seed=self.seed)
             source = f"twin of {scene.name}"
             true_m = apply_apparatus(scene, self.apparatus).finger.radius_m
-            read_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
-            # Rounded, so that tables computed for this radius are used again for similar fingers.
-            radius_m = 5e-4 * round(read_m / 5e-4)
+            radius_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
         found = calibrate_marker.make_calibration(touches, scene, source)
         save_marker_calibration(found, lab.folder / MARKER)
         uncertainty = {

@@ -6,6 +6,7 @@ python -m flexsheet.launch.experiments.trial
 from __future__ import annotations
 
 import json
+import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -34,6 +35,9 @@ from flexsheet.messages.types import Status, SuspectedCause
 from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
 
 Row = dict[str, Any]
+
+NICENESS = 10
+"""Niceness of trials without a graph, so that other programs on the computer stay usable."""
 
 
 @contextmanager
@@ -125,6 +129,7 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
     from flexsheet.launch.commands.commission import summarize
     from flexsheet.launch.commands.commission_steps import open_laboratory
 
+    os.setpriority(os.PRIO_PROCESS, 0, max(os.getpriority(os.PRIO_PROCESS, 0), NICENESS))
     folder, base = Path(trial["commission_folder"]), Path(trial["launch_file"])
     plan = load_graph(base, settings=trial["settings"])
     assert plan.scene_file is not None

@@ -47,8 +47,9 @@ MAX_STEP_RADII = 0.7
 """Maximum advance of the finger per step, in radii; in a longer step it could cross the sheet."""
 
 MAX_ITERATIONS = 80
-MAX_FRICTION_ROUNDS = 12
-"""Maximum number of equilibria that are solved per step of the finger while nodes slip."""
+UNDAMPED_ROUNDS, MAX_FRICTION_ROUNDS = 6, 20
+"""Maximum number of equilibria that are solved per step of the finger while nodes slip, and the
+number after which the changes of the friction forces are halved, since they may alternate."""
 FRICTION_TOLERANCE = 0.01
 """Relative change of the friction forces between two equilibria below which they are accepted."""
 GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
@@ -384,11 +385,12 @@ class _Finger:
         derivative = pressed[:, None, None] * outward[:, :, None] * outward[:, None, :]
         return gradient, derivative + fixed[:, None, None] * np.eye(3)
 
-    def release(self, positions: Floats) -> bool:
+    def release(self, positions: Floats, share: float) -> bool:
         """Release the nodes whose friction exceeds the Coulomb limit, so that they slip.
 
         Return whether forces changed, so that a new equilibrium must be solved. The friction force
         of a slipping node keeps its direction; its size is the coefficient times the normal force.
+        share: fraction of the change of the friction forces that is applied.
         """
         if self._coefficient is None:
             return False
@@ -403,7 +405,8 @@ class _Finger:
         begins = self._stuck & (size_n > limit_n)
         moving = (slipping & (depth > 0.0)) | begins
         direction = tangential / np.maximum(size_n, 1e-15)[:, None]
-        self._friction_n = np.where(moving[:, None], limit_n[:, None] * direction, 0.0)
+        wanted = np.where(moving[:, None], limit_n[:, None] * direction, 0.0)
+        self._friction_n = before + share * (wanted - before)
         self._stuck = self._stuck & ~begins
         change = np.linalg.norm(self._friction_n - before)
         return bool(begins.any() or change > FRICTION_TOLERANCE * np.linalg.norm(before))
@@ -525,7 +528,7 @@ def solve_path(
             positions, count = _relax(mesh, positions, finger)
             iterations += count
             rounds = 0
-            while finger.release(positions):
+            while finger.release(positions, 1.0 if rounds < UNDAMPED_ROUNDS else 0.5):
                 rounds += 1
                 if rounds > MAX_FRICTION_ROUNDS:
                     raise NotConvergedError(
