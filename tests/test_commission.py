@@ -21,7 +21,7 @@ from flexsheet.launch.calibration.commission import (
     list_doubts,
 )
 from flexsheet.launch.calibration.hand_eye import BoardDetection, CornerView, calibrate_base
-from flexsheet.launch.calibration.prediction import Knowledge, draw_apparatus
+from flexsheet.launch.calibration.prediction import Knowledge, PredictedError, draw_apparatus
 from flexsheet.launch.calibration.sheet_rows import simulate_rows
 from flexsheet.launch.calibration.touches import simulate_touches
 from flexsheet.launch.commands import capture
@@ -36,11 +36,13 @@ from flexsheet.launch.commands.commission_steps import (
 )
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.robustness import summarize_commissioning
+from flexsheet.launch.experiments.stroke import SampledMotion, apply_compliance
 from flexsheet.launch.experiments.trial import run_robustness_trial
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, identify_scene, nominal_apparatus
 from flexsheet.messages.calibration import load_calibration
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
@@ -229,6 +231,24 @@ def test_a_measured_sheet_keeps_the_displacement_of_the_flanges() -> None:
             "arms.right.flange_compliance_m_per_n": 0.0,
         }
     )
+
+
+def test_the_reported_edges_yield_to_the_tension_of_the_sheet() -> None:
+    """The arms of a sheet of stretched width 0.252 m are further apart, as the bridge commands."""
+    arms = {
+        side: getattr(SCENE.arms, side).model_copy(update={"flange_compliance_m_per_n": 1e-4})
+        for side in ("left", "right")
+    }
+    scene = SCENE.model_copy(update={"arms": SCENE.arms.model_copy(update=arms)})
+    offsets_m = [ArmGeometry(scene, side).edge_offset_m(1.05) for side in ("left", "right")]
+    assert offsets_m[1] > 0.5 * 0.252 + 1e-3
+    rigid = tuple(
+        SampledMotion(np.array([0, 10]), np.tile([x, 0, 0, 0, 1, 0, 0, 0, 1], (2, 1)))
+        for x in offsets_m
+    )
+    left, right = apply_compliance(scene, (rigid[0], rigid[1]))
+    assert left.values[:, 0] == pytest.approx([-0.126] * 2, abs=1e-6)
+    assert right.values[:, 0] == pytest.approx([0.126] * 2, abs=1e-6)
 
 
 def test_the_marker_is_calibrated_in_the_usual_orientation_of_the_finger() -> None:
@@ -433,12 +453,15 @@ def test_a_laboratory_is_doubted_for_each_reason(tmp_path: Path) -> None:
 def test_predicted_errors_match_errors_drawn_from_the_same_uncertainties() -> None:
     """The reference draws fingertip errors without the evaluator: marker and timestamp."""
     deviations_m = (2e-4, 1e-4, 3e-4)
-    marker = fit_marker(
-        simulate_touches(SCENE, nominal_apparatus(SCENE), calibration=None, seed=1), SCENE, "twin"
-    ).model_copy(update={"standard_deviations_m": deviations_m})
+    optics = load_calibration(OPTICS)
+    given = changed("finger", marker_from_pad_m=[1e-3, -1e-3, 0.010])
+    touches = simulate_touches(SCENE, given, calibration=optics, seed=1)
+    marker = fit_marker(touches, SCENE, "twin").model_copy(
+        update={"standard_deviations_m": deviations_m}
+    )
     known = Knowledge(
         scene=SCENE,
-        calibrations=NodeCalibrations(load_calibration(OPTICS), None, marker),
+        calibrations=NodeCalibrations(optics, None, marker),
         edges={},
         projector_px2=np.zeros((2, 2)),
         eyes_m2=np.zeros((3, 3)),
@@ -505,7 +528,13 @@ def test_the_command_runs_skips_repeats_and_checks(
     assert quick_steps == list(StepName)[2:]
 
 
-def test_real_devices_stop_at_the_first_step_without_data(tmp_path: Path) -> None:
+def test_real_devices_stop_at_the_first_step_without_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predicted = {"image_mm": PredictedError(**PREDICTED)}
+    monkeypatch.setattr(
+        "flexsheet.launch.calibration.prediction.predict_errors", lambda *_: predicted
+    )
     folder = ("--output", str(tmp_path / "lab"))
     code, found, _ = invoke(*folder)
     assert code == 1
@@ -533,6 +562,8 @@ def test_real_devices_stop_at_the_first_step_without_data(tmp_path: Path) -> Non
     assert code == 0
     assert found["complete"]
     assert found["verification"]["repeat"] == ["marker"]
+    assert found["verification"]["predicted"] == {"image_mm": PREDICTED}
+    assert "a self-check suspects: marker_offset" in found["verification"]["doubts"]
 
 
 @pytest.mark.parametrize(

@@ -15,21 +15,30 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.optimize import brentq
 
 from flexsheet.launch.calibration.bundle import LEFT, RIGHT, STAND
 from flexsheet.launch.calibration.edge_fit import BASE, COMPLIANCE, EDGE, JOINTS
 from flexsheet.launch.calibration.uncertainty import compute_position_jacobian
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
-from flexsheet.launch.experiments.offline import Metric, OfflineEvaluator, metric_tolerances
+from flexsheet.launch.experiments.offline import (
+    ALL_METRICS,
+    Metric,
+    OfflineEvaluator,
+    metric_tolerances,
+)
 from flexsheet.messages.apparatus import Apparatus, ArmTruth, FingerTruth, nominal_apparatus
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Scene
+from flexsheet.messages.sheet_calibration import SheetCalibration
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, vector_from_rotation
+from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
+Random = np.random.Generator
 
 DRAWS = 12
 DRAW_SEED = 20_000
@@ -57,7 +66,10 @@ THICKNESS_GRADIENT_STD, DENSITY_STD_RATIO = 0.03, 0.04
 FRICTION, FRICTION_STD_LN = 1.24, 0.3
 """Friction coefficient between rubber and a finger at 1 N (Seo et al. 2009)."""
 
-CREEP_RATIO_PER_DECADE = 0.05
+CREEP_RATIO_PER_DECADE, CREEP_STD = 0.05, 0.02
+"""Relative decrease of the force of natural rubber per decade of time."""
+
+MAX_HYSTERESIS_RATIO = 0.9
 
 
 class PredictedError(LimitedModel):
@@ -108,17 +120,16 @@ def predict_errors(
         }  # fmt: skip
         given = NodeCalibrations(given.stereo.model_copy(update=exact), given.sheet, given.marker)
     evaluator = OfflineEvaluator(scene, given, metres_per_px=PIXEL_M, cells=CELLS)
-    found: dict[Metric, list[float]] = {metric: [] for metric in Metric}
-    for _ in range(draws):
-        figures = evaluator.evaluate(draw_apparatus(known, random)).figures()
-        for metric in Metric:
-            value = figures[metric]
-            if value is not None:
-                found[metric].append(value)
+    metrics = ALL_METRICS if scene.projector is not None else ALL_METRICS - {Metric.IMAGE}
+    drawn = [
+        evaluator.evaluate(draw_apparatus(known, random), metrics).figures() for _ in range(draws)
+    ]
     tolerances = metric_tolerances(scene)
     predicted = {}
-    for metric, values in found.items():
-        errors = np.array(values)
+    for metric in Metric:
+        errors = np.array([one[metric] for one in drawn if one[metric] is not None])
+        if not len(errors):
+            continue
         if metric is Metric.SHEET:
             errors = np.hypot(errors, 1e3 * tracking_m)
         # The quantile of a length with normal components: of few draws, it is more certain than
@@ -133,7 +144,7 @@ def predict_errors(
     return predicted
 
 
-def draw_apparatus(known: Knowledge, random: np.random.Generator) -> Apparatus:
+def draw_apparatus(known: Knowledge, random: Random) -> Apparatus:
     """Draw an apparatus that is consistent with what is known about the devices."""
     scene, given = known.scene, known.calibrations
     apparatus = nominal_apparatus(scene)
@@ -151,7 +162,9 @@ def draw_apparatus(known: Knowledge, random: np.random.Generator) -> Apparatus:
             * (1.0 + DENSITY_STD_RATIO * float(random.standard_normal())),
             "friction_coefficient": FRICTION
             * float(np.exp(FRICTION_STD_LN * random.standard_normal())),
-            "creep_ratio_per_decade": CREEP_RATIO_PER_DECADE,
+            "creep_ratio_per_decade": max(
+                CREEP_RATIO_PER_DECADE + CREEP_STD * float(random.standard_normal()), 0.0
+            ),
         }
         | draw_rubber(known, random)
     )
@@ -167,7 +180,7 @@ def draw_apparatus(known: Knowledge, random: np.random.Generator) -> Apparatus:
         update={"lens": projector.lens.model_copy(update={"centre_offset_px": _tuple(shift_px)})}
     )
     stamp_s = known.stamp_std_s * float(random.standard_normal())
-    return apparatus.model_copy(
+    drawn = apparatus.model_copy(
         update={
             "arms": apparatus.arms.model_copy(update=arms),
             "sheet": sheet,
@@ -179,10 +192,11 @@ def draw_apparatus(known: Knowledge, random: np.random.Generator) -> Apparatus:
             ),
         }
     )
+    return drawn if given.sheet is None else draw_hysteresis(drawn, given.sheet, random)
 
 
 def draw_camera_errors(
-    scene: Scene, calibration: StereoCalibration, random: np.random.Generator
+    scene: Scene, calibration: StereoCalibration, random: Random
 ) -> dict[str, Floats]:
     """Draw the errors (3,), m, of measured positions at the clamps, relative to the finger.
 
@@ -204,9 +218,7 @@ def draw_camera_errors(
     return {side: at - centre for side, at in zip(("left", "right"), clamps, strict=True)}
 
 
-def draw_arm(
-    arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: np.random.Generator
-) -> ArmTruth:
+def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: Random) -> ArmTruth:
     """Draw the true parameters of an arm; seen_m: error of its clamp's measured position."""
     if covariance is None:
         return arm
@@ -224,28 +236,44 @@ def draw_arm(
     )
 
 
-def draw_rubber(known: Knowledge, random: np.random.Generator) -> dict[str, float]:
-    """Draw modulus, width and hysteresis of the sheet; empty without a calibration."""
+def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
+    """Draw modulus and width of the sheet; empty without a calibration."""
     sheet = known.calibrations.sheet
     if sheet is None:
         return {}
-    modulus, width, lost = (
-        sheet.modulus_thickness_n_per_m, sheet.slack_width_m, sheet.hysteresis_ratio,
-    )  # fmt: skip
-    drawn = {
+    modulus, width = sheet.modulus_thickness_n_per_m, sheet.slack_width_m
+    return {
         "modulus_ratio": 1.0
         + modulus.standard_deviation / modulus.value * float(random.standard_normal()),
         "slack_width_offset_m": width.standard_deviation * float(random.standard_normal()),
     }
-    if lost is not None:
-        value = lost.value + lost.standard_deviation * float(random.standard_normal())
-        drawn["hysteresis_ratio"] = float(np.clip(value, 0.0, 0.9))
-    return drawn
 
 
-def draw_marker(
-    scene: Scene, given: NodeCalibrations, random: np.random.Generator
-) -> tuple[float, ...]:
+def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Random) -> Apparatus:
+    """Return the apparatus with the hysteresis whose forces differ as in the calibration.
+
+    The calibration compares the forces of a push in and out at the same depth. They differ by
+    hysteresis and by the creep of the apparatus.
+    """
+    if sheet.hysteresis_ratio is None:
+        return apparatus
+    measured = sheet.hysteresis_ratio
+    lost = measured.value + measured.standard_deviation * float(random.standard_normal())
+
+    def change(ratio: float) -> Apparatus:
+        rubber = apparatus.sheet.model_copy(update={"hysteresis_ratio": ratio})
+        return apparatus.model_copy(update={"sheet": rubber})
+
+    def excess(ratio: float) -> float:
+        moving_in, moving_out = compute_history_ratios(change(ratio))
+        return float(1.0 - moving_out / moving_in) - lost
+
+    if excess(0.0) >= 0.0:
+        return change(0.0)
+    return change(brentq(excess, 0.0, MAX_HYSTERESIS_RATIO, xtol=1e-4))
+
+
+def draw_marker(scene: Scene, given: NodeCalibrations, random: Random) -> tuple[float, ...]:
     """Draw the true marker in the finger's frame of the simulator, m."""
     world_m = given.find_marker_offset_m(scene)
     if given.marker is not None:
@@ -257,7 +285,7 @@ def draw_marker(
     return _tuple(np.linalg.solve(np.column_stack(axes), world_m))
 
 
-def _draw(covariance: Floats, random: np.random.Generator) -> Floats:
+def _draw(covariance: Floats, random: Random) -> Floats:
     """Draw from a normal distribution with mean 0; the covariance may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     scales = np.sqrt(np.maximum(values, 0.0))

@@ -160,7 +160,6 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
         "predicted": found["predicted"],
         "doubts": found["doubts"],
         "commission": {
-            "folder": str(folder),
             "steps": steps,
             "cpu_seconds": sum(one["cpu_seconds"] for one in steps),
             "above_limit": [one["name"] for one in steps if not one["within_limit"]],
