@@ -320,7 +320,7 @@ def format_report(state: State) -> str:
 def _format_verdict(figures: Mapping[str, Any]) -> list[str]:
     """Return the predicted errors as a table, and whether the laboratory is good, with reasons."""
     lines = ["", "## Predicted errors", ""]
-    lines += ["| metric | median | 95 % | tolerance |", "|---|---|---|---|"]
+    lines += ["| metric | root mean square | 95 % | tolerance |", "|---|---|---|---|"]
     lines += [
         f"| {metric} | {one['typical']:.3g} | {one['limit_95']:.3g} | {one['tolerance']:.3g} |"
         for metric, one in figures.get("predicted", {}).items()

@@ -75,7 +75,7 @@ MAX_HYSTERESIS_RATIO = 0.9
 class PredictedError(LimitedModel):
     """Predicted error of one metric, in the unit of the metric.
 
-    typical: median. limit_95: 95 % quantile. tolerance: tolerance of the scene.
+    typical: root mean square. limit_95: 95 % quantile. tolerance: tolerance of the scene.
     """
 
     typical: float
@@ -136,7 +136,7 @@ def predict_errors(
         # an empirical one.
         high = float(errors.mean() + NORMAL_95 * errors.std(ddof=1))
         predicted[metric] = PredictedError(
-            typical=float(np.median(errors)),
+            typical=float(np.sqrt(np.mean(errors**2))),
             limit_95=high,
             tolerance=tolerances[metric],
             within=high <= tolerances[metric],
@@ -278,11 +278,9 @@ def draw_marker(scene: Scene, given: NodeCalibrations, random: Random) -> tuple[
     world_m = given.find_marker_offset_m(scene)
     if given.marker is not None:
         world_m = world_m + np.array(given.marker.standard_deviations_m) * random.standard_normal(3)
-    axes = [
-        100.0 * Nail.of(FingerTruth(marker_from_pad_m=_tuple(axis))).marker_offset_m
-        for axis in 0.01 * np.eye(3)
-    ]
-    return _tuple(np.linalg.solve(np.column_stack(axes), world_m))
+    units = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
+    axes = [100.0 * Nail.of(FingerTruth(marker_from_pad_m=unit)).marker_offset_m for unit in units]
+    return tuple(np.linalg.solve(np.column_stack(axes), world_m).tolist())
 
 
 def _draw(covariance: Floats, random: Random) -> Floats:

@@ -133,9 +133,9 @@ def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
     """Compare what each laboratory's report predicts with its true errors.
 
     confusion: number of laboratories by report (good or not) and truth (within tolerance or not);
-    the same for each metric. stated_over_true: predicted median error over true error, quantiles
-    over the laboratories; for sheet and fingertip also at rest. covered: share of true errors below
-    the predicted 95 % quantile.
+    the same for each metric. stated_over_true: predicted root mean square over true error,
+    quantiles over the laboratories. covered: share of true errors below the predicted 95 %
+    quantile.
     """
     predictions = {}
     for metric in Metric:

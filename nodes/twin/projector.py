@@ -164,7 +164,9 @@ class LitSheet:
             level = np.where(inside, np.float32(LIT_LEVEL / 255.0) * light + DARK_LEVEL, ROOM_LEVEL)
             level = cv2.GaussianBlur(level.astype(np.float32), (0, 0), RAYS * self._sensor.blur_px)
             # This interpolation averages the rays of each pixel.
-            mean = cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA)
+            mean = np.asarray(
+                cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32
+            )
             noise = self._random.standard_normal(mean.shape, dtype=np.float32)
             picture = np.full(
                 (self._camera.height_px, self._camera.width_px), round(ROOM_LEVEL), np.uint8
