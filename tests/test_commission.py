@@ -18,8 +18,10 @@ from flexsheet.launch.calibration.commission import (
     Commissioning,
     StepName,
     StepResult,
+    list_doubts,
 )
 from flexsheet.launch.calibration.hand_eye import BoardDetection, CornerView, calibrate_base
+from flexsheet.launch.calibration.prediction import Knowledge, PredictedError, draw_apparatus
 from flexsheet.launch.calibration.sheet_rows import simulate_rows
 from flexsheet.launch.calibration.touches import simulate_touches
 from flexsheet.launch.commands import capture
@@ -29,14 +31,18 @@ from flexsheet.launch.commands.commission_steps import (
     BOARD,
     INSTRUCTIONS,
     Laboratory,
-    measured_stiffness,
+    describe_sheet,
     open_laboratory,
 )
+from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
+from flexsheet.launch.experiments.robustness import summarize_commissioning
+from flexsheet.launch.experiments.stroke import SampledMotion, apply_compliance
 from flexsheet.launch.experiments.trial import run_robustness_trial
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, identify_scene, nominal_apparatus
 from flexsheet.messages.calibration import load_calibration
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
@@ -58,6 +64,7 @@ DEMO = ROOT / "launch" / "demo.yaml"
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 OPTICS = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 SCENE = load_scene(SCENE_FILE)
+PREDICTED = {"typical": 0.3, "limit_95": 0.45, "tolerance": 0.5, "within": True}
 
 
 def matrix(pose: Any) -> Floats:
@@ -212,18 +219,37 @@ def test_a_stiffer_sheet_is_identified_from_pushes_between_the_true_arms() -> No
     assert found.hysteresis_ratio.value == pytest.approx(0.1, abs=0.03)
 
 
-def test_a_measured_modulus_keeps_the_displacement_of_the_flanges() -> None:
+def test_a_measured_sheet_keeps_the_displacement_of_the_flanges() -> None:
     arm = SCENE.arms.left.model_copy(update={"flange_compliance_m_per_n": 60e-6})
     scene = SCENE.model_copy(update={"arms": SCENE.arms.model_copy(update={"left": arm})})
     before = scene.sheet.young_modulus_pa * scene.sheet.thickness_m
-    values = measured_stiffness(scene, 1.2 * before)
+    values = describe_sheet(scene, 1.2 * before, scene.sheet.width_m)
     assert values == pytest.approx(
         {
             "sheet.young_modulus_pa": 1.2 * scene.sheet.young_modulus_pa,
+            "sheet.width_m": scene.sheet.width_m,
             "arms.left.flange_compliance_m_per_n": 50e-6,
             "arms.right.flange_compliance_m_per_n": 0.0,
         }
     )
+
+
+def test_the_reported_edges_yield_to_the_tension_of_the_sheet() -> None:
+    """The arms of a sheet of stretched width 0.252 m are further apart, as the bridge commands."""
+    arms = {
+        side: getattr(SCENE.arms, side).model_copy(update={"flange_compliance_m_per_n": 1e-4})
+        for side in ("left", "right")
+    }
+    scene = SCENE.model_copy(update={"arms": SCENE.arms.model_copy(update=arms)})
+    offsets_m = [ArmGeometry(scene, side).edge_offset_m(1.05) for side in ("left", "right")]
+    assert offsets_m[1] > 0.5 * 0.252 + 1e-3
+    rigid = tuple(
+        SampledMotion(np.array([0, 10]), np.tile([x, 0, 0, 0, 1, 0, 0, 0, 1], (2, 1)))
+        for x in offsets_m
+    )
+    left, right = apply_compliance(scene, (rigid[0], rigid[1]))
+    assert left.values[:, 0] == pytest.approx([-0.126] * 2, abs=1e-6)
+    assert right.values[:, 0] == pytest.approx([0.126] * 2, abs=1e-6)
 
 
 def test_the_marker_is_calibrated_in_the_usual_orientation_of_the_finger() -> None:
@@ -369,10 +395,84 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path, prepare: Any, wor
         open_lab(tmp_path)
 
 
+def test_a_seed_counts_from_the_scene_that_was_commissioned(tmp_path: Path) -> None:
+    """Any calibrated values give the same hardware as the apparatus file of the commissioning."""
+    lab, _ = open_laboratory(tmp_path / "lab", DEMO, None, "seed:3")
+    radius = {"finger.radius_m": 0.0085, "arms.left.flange_compliance_m_per_n": 5e-5}
+    lab.run(StepName.EDGES, lambda _: result(scene_values=radius))
+    drawn, stored = (
+        load_graph(lab.launch_copy, apparatus=text).apparatus_message()
+        for text in ("seed:3", str(tmp_path / "lab" / "apparatus.yaml"))
+    )
+    assert drawn is not None
+    assert stored is not None
+    scene = load_scene(lab.scene_copy)
+    true = [apply_apparatus(scene, one) for one in (drawn, stored)]
+    assert true[0].finger.radius_m == pytest.approx(true[1].finger.radius_m, abs=1e-9)
+    assert drawn.arms.left.flange_compliance_m_per_n == pytest.approx(
+        stored.arms.left.flange_compliance_m_per_n
+    )
+    # A draw of calibrated devices counts from the calibrated values.
+    calibrated = load_graph(lab.launch_copy, apparatus="seed:3,calibrated").apparatus_message()
+    assert calibrated is not None
+    assert apply_apparatus(scene, calibrated).finger.radius_m == pytest.approx(0.0085, abs=1e-3)
+    lab.state = lab.state.model_copy(update={"scene_file": str(tmp_path / "gone.yaml")})
+    (tmp_path / "lab" / "commission.json").write_text(lab.state.model_dump_json())
+    with pytest.raises(BadInputError, match=r"gone.yaml.*does not exist.*apparatus.yaml"):
+        load_graph(lab.launch_copy, apparatus="seed:3")
+
+
 def test_an_unknown_apparatus_leaves_no_folder(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="not a random sample"):
         open_laboratory(tmp_path / "lab", DEMO, None, "seed:x")
     assert not (tmp_path / "lab").exists()
+
+
+def test_a_laboratory_is_doubted_for_each_reason(tmp_path: Path) -> None:
+    lab = open_lab(tmp_path)
+    lab.run(StepName.CAMERA, lambda _: result())
+    figures = {"predicted": {"image_mm": PREDICTED}, "flagged": []}
+    assert list_doubts(lab.state.steps, figures, (0.2, 0.5)) == []
+    lab.run(StepName.ARMS, lambda _: result(0.7))
+    lab.skip(StepName.EDGES, "no marks")
+    figures = {
+        "predicted": {"image_mm": {**PREDICTED, "within": False, "limit_95": 0.9}},
+        "flagged": ["marker_offset"],
+    }
+    doubts = list_doubts(lab.state.steps, figures, (0.6, 0.5))
+    for doubt, words in zip(
+        doubts,
+        ("step arms: residual 0.7", "edges was skipped", "image_mm: 95 %", "marker", "0.6 mm"),
+        strict=True,
+    ):
+        assert words in doubt
+
+
+# Predicted errors
+
+
+def test_predicted_errors_match_errors_drawn_from_the_same_uncertainties() -> None:
+    """The reference draws fingertip errors without the evaluator: marker and timestamp."""
+    deviations_m = (2e-4, 1e-4, 3e-4)
+    optics = load_calibration(OPTICS)
+    given = changed("finger", marker_from_pad_m=[1e-3, -1e-3, 0.010])
+    touches = simulate_touches(SCENE, given, calibration=optics, seed=1)
+    marker = fit_marker(touches, SCENE, "twin").model_copy(
+        update={"standard_deviations_m": deviations_m}
+    )
+    known = Knowledge(
+        scene=SCENE,
+        calibrations=NodeCalibrations(optics, None, marker),
+        edges={},
+        projector_px2=np.zeros((2, 2)),
+        eyes_m2=np.zeros((3, 3)),
+        stamp_std_s=0.0,
+    )
+    random = np.random.default_rng(5)
+    believed = known.calibrations.find_marker_offset_m(SCENE)
+    drawn = np.array([find_marker_offset(draw_apparatus(known, random)) for _ in range(400)])
+    assert drawn.mean(axis=0) == pytest.approx(believed, abs=5e-5)
+    assert drawn.std(axis=0) == pytest.approx(deviations_m, rel=0.12)
 
 
 # The command
@@ -429,7 +529,13 @@ def test_the_command_runs_skips_repeats_and_checks(
     assert quick_steps == list(StepName)[2:]
 
 
-def test_real_devices_stop_at_the_first_step_without_data(tmp_path: Path) -> None:
+def test_real_devices_stop_at_the_first_step_without_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    predicted = {"image_mm": PredictedError(**PREDICTED)}
+    monkeypatch.setattr(
+        "flexsheet.launch.calibration.prediction.predict_errors", lambda *_: predicted
+    )
     folder = ("--output", str(tmp_path / "lab"))
     code, found, _ = invoke(*folder)
     assert code == 1
@@ -457,6 +563,8 @@ def test_real_devices_stop_at_the_first_step_without_data(tmp_path: Path) -> Non
     assert code == 0
     assert found["complete"]
     assert found["verification"]["repeat"] == ["marker"]
+    assert found["verification"]["predicted"] == {"image_mm": PREDICTED}
+    assert "a self-check suspects: marker_offset" in found["verification"]["doubts"]
 
 
 @pytest.mark.parametrize(
@@ -495,26 +603,24 @@ def test_an_apparatus_without_twin_is_refused() -> None:
 
 
 def test_a_robustness_trial_commissions_its_laboratory(
-    tmp_path: Path, quick_steps: list[StepName], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    strokes = []
-
-    def run_stroke(trial: Any, apparatus: str) -> dict[str, Any]:
-        strokes.append((trial["launch_file"], apparatus))
-        errors = {key: {"mean": 0.1} for key in ("true_delta_d_mm", "true_delta_theta_deg")}
-        rest = dict.fromkeys(("valid_ratio", "latency_ms", "drops", "bag", "flagged"))
-        return {**errors, "fingertip_mm": {"mean": 0.2}, **rest}
-
-    class Evaluator:
-        def __init__(self, *_: Any) -> None: ...
-
-        def evaluate(self, *_: Any) -> Any:
-            return type(
-                "Found", (), {"figures": lambda _: {"image_mm": 0.1, "force_percent": 2.0}}
-            )()
-
-    monkeypatch.setattr("flexsheet.launch.experiments.trial.run_stroke", run_stroke)
-    monkeypatch.setattr("flexsheet.launch.experiments.trial.OfflineEvaluator", Evaluator)
+    errors = {
+        key: {"mean": 0.1}
+        for key in ("true_delta_d_mm", "true_delta_theta_deg", "delta_d_mm", "fingertip_mm")
+    }
+    figures = {
+        "stroke": errors,
+        "at_rest": {"after": {"image_mm": 0.6, "force_percent": 2.0}},
+        "flagged": [],
+        "predicted": {"image_mm": PREDICTED},
+        "doubts": ["the image"],
+    }
+    monkeypatch.setattr(
+        Laboratory,
+        "steps",
+        property(lambda _: {name: lambda _: result(figures=figures) for name in StepName}),
+    )
     row = run_robustness_trial(
         {
             "seed": 3,
@@ -525,10 +631,15 @@ def test_a_robustness_trial_commissions_its_laboratory(
             "seconds": 1.0,
         }
     )
-    assert strokes == [(str(tmp_path / "lab/launch.yaml"), str(tmp_path / "lab/apparatus.yaml"))]
-    assert [one["name"] for one in row["commission"]["steps"]] == list(StepName)[:-1]
-    assert row["sheet_mm"] == 0.1
-    assert row["image_mm"] == 0.1
+    assert [one["name"] for one in row["commission"]["steps"]] == list(StepName)
+    assert (row["sheet_mm"], row["image_mm"]) == (0.1, 0.6)
+    assert row["out_of_tolerance"] == ["image_mm"]
+    summary = summarize_commissioning([row])
+    assert summary["confusion"]["doubted_and_exceeded"] == 1
+    found = summary["predictions"]["image_mm"]
+    assert found["stated_over_true"]["median"] == pytest.approx(0.3 / 0.6)
+    assert found["covered"] == 0.0
+    assert found["good_but_exceeded"] == 1
 
 
 def test_commissioned_and_calibrated_exclude_each_other() -> None:

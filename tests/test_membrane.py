@@ -20,6 +20,7 @@ from flexsheet.nodes.twin.membrane import (
     relaxed_energy,
     relaxed_stress,
     solve,
+    solve_path,
 )
 
 RUBBER = TrueRubber(width_m=0.24, height_m=0.24, thickness_m=0.001, young_modulus_pa=1e6)
@@ -117,6 +118,20 @@ def test_tilted_twisted_off_centre_push_is_in_balance(
     assert np.allclose(total, 0.0, atol=1e-3)
     from_tip = np.linalg.norm(sheet.positions - finger_tip, axis=-1).min()
     assert from_tip < 0.004 or tip[2] > -0.003
+
+
+def test_a_push_through_several_depths_finds_the_sheet_of_each() -> None:
+    depths = (0.004, 0.012, 0.02)
+    tips = [np.array([0.0, 0.0, -depth]) for depth in depths]
+    path = solve_path(RUBBER, *edges(1.04), finger_tips=tips, cells=16)
+    assert len(path) == len(depths)
+    for tip, pushed in zip(tips, path, strict=True):
+        alone = solve(RUBBER, *edges(1.04), finger_tip=tip, cells=16)
+        # Touched nodes stick, so that the positions of earlier contacts have a small effect.
+        assert pushed.finger_force_n[2] == pytest.approx(alone.finger_force_n[2], rel=0.02)
+        assert pushed.positions == pytest.approx(alone.positions, abs=1e-4)
+    (untouched,) = solve_path(RUBBER, *edges(1.04), finger_tips=(), cells=16)
+    assert not untouched.finger_force_n.any()
 
 
 def test_pose_carries_the_solution_along() -> None:

@@ -18,6 +18,8 @@ from flexsheet.messages.types import Correction, Display
 from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
 from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.models.sheet.indentation import IndentationBasis
+from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
 from flexsheet.nodes.renderer.scene_renderer import NO_SHAPES_NOTE, SceneRenderer
@@ -230,6 +232,34 @@ def test_indentation_shapes_are_cached(tmp_path: Path, monkeypatch: pytest.Monke
     assert load_cached(deflection_cache.shapes_cache(SCENE), tmp_path) is None
     deflection_cache.load_or_compute(SCENE, tmp_path)
     assert len(solves) == 2
+
+
+def test_shapes_of_another_finger_are_interpolated_and_of_another_width_scaled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved = []
+
+    def solve_few(rubber: Rubber, *, finger_radius_m: float, **_: object) -> IndentationBasis:
+        solved.append((finger_radius_m, rubber.width_m))
+        found = few_dents()
+        return replace(found, coefficients=found.coefficients * finger_radius_m / 0.007)
+
+    monkeypatch.setattr(deflection_cache, "solve_indentation_basis", solve_few)
+    finger = SCENE.finger.model_copy(update={"radius_m": 0.0075})
+    sheet = SCENE.sheet.model_copy(update={"width_m": 1.01 * SCENE.sheet.width_m})
+    scene = SCENE.model_copy(update={"finger": finger, "sheet": sheet})
+    assert deflection_cache.load(scene, tmp_path) is None
+    found = deflection_cache.load_or_compute(scene, tmp_path)
+    assert solved == [(0.007, SCENE.sheet.width_m), (0.009, SCENE.sheet.width_m)]
+    own = replace(few_dents(), deepest_m=found.deepest_m).offsets(1.05, (0.01, 0.02), 0.01)
+    scaled = found.offsets(1.05, (0.0101, 0.02), 0.01)
+    assert scaled == pytest.approx(7.5 / 7.0 * own * [1.01, 1.0, 1.0], abs=1e-7)
+    assert found.grid(1.05, (0.0101, 0.02))[..., 0] == pytest.approx(
+        1.01 * few_dents().grid(1.05, (0.01, 0.02))[..., 0], abs=1e-9
+    )
+    again = deflection_cache.load(scene, tmp_path)
+    assert again is not None
+    assert len(solved) == 2
 
 
 def test_another_sheet_or_finger_has_another_file_and_another_modulus_has_not(

@@ -9,13 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexsheet.launch.experiments.simulated_time import LoopSettings, follow_in_simulated_time
+from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
+from flexsheet.launch.experiments.simulated_time import (
+    LoopSettings,
+    follow_in_simulated_time,
+    stroke_in_simulated_time,
+)
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
+from flexsheet.messages.calibration import load_calibration
 from flexsheet.messages.types import FingerPath
 from flexsheet.nodes.twin.paths import map_to_surface
 
-SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+ROOT = Path(__file__).parent.parent
+SCENE = load_scene(ROOT / "launch" / "scenes" / "cylinder.yaml")
 
 
 def swing(amplitude_m: float, hz: float, seconds: float, hover_s: float = 0.0) -> FingerPath:
@@ -61,6 +68,22 @@ def test_the_bridges_measure_a_lag_that_the_scene_does_not_state() -> None:
     measured = follow(60.0)
     assert measured["servo_lag_ms"] == pytest.approx([60.0, 60.0], abs=4.0)
     assert mean_mm(measured) < 2.0 * mean_mm(follow(60.0, lag_known=True))
+
+
+def test_a_stroke_shows_the_error_of_the_marker_that_the_devices_do_not_report() -> None:
+    """The calibrated camera is exact but for its device; the marker is 0.5 mm beside its place."""
+    optics = load_calibration(ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml")
+    settings = LoopSettings(calibrations=NodeCalibrations(stereo=optics))
+    nominal = nominal_apparatus(SCENE)
+    finger = nominal.finger.model_copy(update={"marker_from_pad_m": (0.0, 5e-4, 0.0)})
+    exact, displaced = (
+        stroke_in_simulated_time(SCENE, one, settings, 2.0)
+        for one in (nominal, nominal.model_copy(update={"finger": finger}))
+    )
+    assert exact["true_delta_d_mm"]["mean"] < 0.2
+    assert exact["delta_d_mm"]["mean"] == pytest.approx(exact["true_delta_d_mm"]["mean"], abs=0.05)
+    assert displaced["fingertip_mm"]["mean"] == pytest.approx(0.5, abs=0.15)
+    assert displaced["delta_d_mm"]["mean"] < 0.2
 
 
 @pytest.mark.long

@@ -65,7 +65,8 @@ class StepResult(LimitedModel):
     residual: error of the fit in `unit`. advice: what to do if it is above `limit`. uncertainty:
     standard deviations, whose names end in their units. scene_values: values by dotted path in the
     scene. parameters: names of calibration files in the folder, by node type and parameter
-    (TYPE.PARAMETER). figures: further results.
+    (TYPE.PARAMETER). figures: further results. covariances: covariance matrices by name, from which
+    errors are predicted.
     """
 
     residual: float
@@ -76,6 +77,7 @@ class StepResult(LimitedModel):
     scene_values: dict[str, Any] = Field(default_factory=dict)
     parameters: dict[str, str] = Field(default_factory=dict)
     figures: dict[str, Any] = Field(default_factory=dict)
+    covariances: dict[str, list[list[float]]] = Field(default_factory=dict)
 
     @property
     def within_limit(self) -> bool:
@@ -88,6 +90,7 @@ class StepRecord(LimitedModel):
     name: StepName
     date: str
     seconds: float = 0.0
+    cpu_seconds: float = 0.0
     skipped_because: str | None = None
     result: StepResult | None = None
 
@@ -195,17 +198,22 @@ class Commissioning:
     def run(self, name: StepName, step: Step) -> StepResult:
         """Run a step with the results of the previous steps; invalidate all later steps."""
         self._invalidate_from(name)
-        started_s = time.monotonic()
+        started_s, cpu_started_s = time.monotonic(), time.process_time()
         result = step(self)
-        seconds = time.monotonic() - started_s
-        self._record(StepRecord(name=name, date=_now(), seconds=seconds, result=result))
+        seconds, cpu_seconds = time.monotonic() - started_s, time.process_time() - cpu_started_s
+        self._record(
+            StepRecord(
+                name=name, date=_now(), seconds=seconds, cpu_seconds=cpu_seconds, result=result
+            )
+        )
         return result
 
     def _invalidate_from(self, name: StepName) -> None:
-        # A verification changes nothing that another step uses.
-        for later in STEPS[STEPS.index(name) :]:
-            self.state.steps.pop(later, None)
-        self.write()
+        done = [later for later in STEPS[STEPS.index(name) :] if later in self.state.steps]
+        for later in done:
+            del self.state.steps[later]
+        if done or not self.scene_copy.exists():
+            self.write()
 
     def _record(self, record: StepRecord) -> None:
         self.state.steps[record.name] = record
@@ -300,12 +308,61 @@ def format_report(state: State) -> str:
                 advice.append(f"- {name}: above the limit. {result.advice}")
     verification = state.steps.get(StepName.VERIFICATION)
     if verification is not None and verification.result is not None:
+        lines += _format_verdict(verification.result.figures)
         lines += ["", "## Verification", "", "| figure | value |", "|---|---|"]
         lines += [f"| {key} | {value} |" for key, value in _flatten(verification.result.figures)]
     limits = _rank_uncertainties(state)
     lines += ["", "## What limits the accuracy", ""]
     lines += [f"- {text}" for text in limits] + advice + [f"- {MEASURED_IN_OPERATION}", ""]
     return "\n".join(lines)
+
+
+def _format_verdict(figures: Mapping[str, Any]) -> list[str]:
+    """Return the predicted errors as a table, and whether the laboratory is good, with reasons."""
+    lines = ["", "## Predicted errors", ""]
+    lines += ["| metric | root mean square | 95 % | tolerance |", "|---|---|---|---|"]
+    lines += [
+        f"| {metric} | {one['typical']:.3g} | {one['limit_95']:.3g} | {one['tolerance']:.3g} |"
+        for metric, one in figures.get("predicted", {}).items()
+    ]
+    doubts = figures.get("doubts", [])
+    if not doubts:
+        return [*lines, "", "The laboratory is good: all errors are expected within tolerance."]
+    return [*lines, "", "The laboratory is not good:", "", *(f"- {one}" for one in doubts)]
+
+
+def list_doubts(
+    steps: Mapping[StepName, StepRecord], figures: Mapping[str, Any], tracking: tuple[float, float]
+) -> list[str]:
+    """Return why a laboratory may exceed a tolerance; empty if all errors are expected within it.
+
+    figures: results of the verification. tracking: error of the sheet in the stroke as the devices
+    report it, and its tolerance, mm.
+    """
+    doubts = []
+    for name, record in steps.items():
+        if name is StepName.VERIFICATION:
+            continue
+        if record.result is None:
+            doubts.append(f"step {name} was skipped: {record.skipped_because}")
+        elif not record.result.within_limit:
+            doubts.append(
+                f"step {name}: residual {record.result.residual:.3g} {record.result.unit}, limit "
+                f"{record.result.limit:g} {record.result.unit}"
+            )
+    doubts += [
+        f"predicted {metric}: 95 % are below {one['limit_95']:.3g}, tolerance "
+        f"{one['tolerance']:.3g}"
+        for metric, one in figures["predicted"].items()
+        if not one["within"]
+    ]
+    doubts += [f"a self-check suspects: {cause}" for cause in figures["flagged"]]
+    if tracking[0] > tracking[1]:
+        doubts.append(
+            f"the devices report an error of the sheet of {tracking[0]:.3g} mm, tolerance "
+            f"{tracking[1]:.3g} mm"
+        )
+    return doubts
 
 
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:

@@ -94,12 +94,14 @@ class EdgeFit:
     residual_rms_m: root mean square distance of a mark from its fitted position.
     edge_std_m: root sum square over the axes of the standard deviation of a mark's fitted
     position in the measured poses. compliance_std_m_per_n: standard deviation of the compliance.
+    covariance: covariance (19, 19) of the unknowns.
     """
 
     arm: ArmSpec
     residual_rms_m: float
     edge_std_m: float
     compliance_std_m_per_n: float
+    covariance: Floats
     marks: int
     poses: int
 
@@ -212,10 +214,10 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
         )
     marks = off.size
     covariance = np.linalg.inv(found.jac.T @ found.jac)
-    spread = found.jac[:marks] @ covariance @ found.jac[:marks].T
     # The marks of one pose share the error of the joints, so each pose counts once.
     poses = len({tuple(row.joints_rad.tolist()) for row in rows})
-    spread *= len(rows) / poses
+    covariance *= len(rows) / poses
+    spread = found.jac[:marks] @ covariance @ found.jac[:marks].T
     base, clamp = model.transforms(unknowns)
     return EdgeFit(
         arm=arm.model_copy(
@@ -228,9 +230,8 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
         ),
         residual_rms_m=residual_rms_m,
         edge_std_m=float(sigma_m * np.sqrt(np.trace(spread) / len(rows))),
-        compliance_std_m_per_n=float(
-            np.sqrt(covariance[COMPLIANCE, COMPLIANCE] * len(rows) / poses)
-        ),
+        compliance_std_m_per_n=float(np.sqrt(covariance[COMPLIANCE, COMPLIANCE])),
+        covariance=covariance,
         marks=len(rows),
         poses=poses,
     )

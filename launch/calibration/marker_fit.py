@@ -21,8 +21,9 @@ Floats = NDArray[np.float64]
 TOUCH_NOISE_M = 2e-4
 """Expected standard deviation of a touch along one axis, from camera, hand and orientation."""
 
-POINT_ERROR_M = 3e-4
-"""Expected standard deviation of the error that all touched points share; it limits accuracy."""
+POINT_ERROR_M = 1e-4
+"""Expected standard deviation per axis of the error that all touched points share, for a point
+whose position the stereo camera measures; it limits accuracy."""
 
 MIN_TOUCHES, MIN_ORIENTATIONS = 4, 3
 MIN_ANGLE_RAD = np.radians(8.0)

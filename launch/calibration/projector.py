@@ -7,7 +7,7 @@ measure. The poses of the sheet on which the points lie therefore need not be kn
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -75,7 +75,8 @@ class ProjectorFit:
 
     held_out_rms_px: rms residual of poses that were excluded from the fit. before_rms_px: rms
     residual of the initial projector. coverage_ratio: fraction of the image's cells that contain
-    points.
+    points. shift_covariance_px2: covariance (2, 2) of the mean displacement of the image, from the
+    fits without one pose each (delete-one jackknife).
     """
 
     projector: Projector
@@ -88,6 +89,7 @@ class ProjectorFit:
     poses: int
     points: int
     outliers: int
+    shift_covariance_px2: Floats = field(default_factory=lambda: np.zeros((2, 2)))
 
 
 def measure_points(
@@ -189,17 +191,16 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
             f"{rms:.2f} px rms and {int((~inliers).sum())} outliers of {len(inliers)} points; keep "
             "the sheet still during each pose, and check the cameras (flexsheet calibrate check)"
         )
-    held_out = [
-        np.linalg.norm(
-            project_points(
-                _fit_projector(points, inliers & (points.pose != pose), guess), points.world[here]
-            )
-            - points.pixels[here],
-            axis=1,
-        )
-        for pose in np.unique(points.pose)
-        if (here := inliers & (points.pose == pose)).any()
-    ]
+    held_out, shifts = [], []
+    for pose in np.unique(points.pose):
+        here = inliers & (points.pose == pose)
+        if not here.any():
+            continue
+        refit = _fit_projector(points, inliers & (points.pose != pose), guess)
+        found = project_points(refit, points.world)
+        held_out.append(np.linalg.norm(found[here] - points.pixels[here], axis=1))
+        shifts.append((found - project_points(projector, points.world))[inliers].mean(axis=0))
+    scatter = np.array(shifts) - np.mean(shifts, axis=0)
     position = projector.world_from_projector.position_m
     distance_m = float(np.median(np.linalg.norm(points.world - position, axis=1)))
     before = np.linalg.norm(project_points(guess, points.world) - points.pixels, axis=1)
@@ -214,6 +215,7 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
         poses=poses,
         points=int(inliers.sum()),
         outliers=int((~inliers).sum()),
+        shift_covariance_px2=(len(shifts) - 1) / len(shifts) * scatter.T @ scatter,
     )
 
 

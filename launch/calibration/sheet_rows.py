@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -214,39 +215,37 @@ def simulate_rows(
     radius_m = scene.finger.radius_m
     pushes: list[MeasuredPush] = []
     cases = list(_simulated_cases(scene, places))
-    for done, (stretch, depth_m, point_m) in enumerate(cases, start=1):
+    most_m = scene.working_range.push_depth_m + 1e-9
+    depths_m = [depth_m for depth_m in SIMULATED_DEPTHS_M if depth_m <= most_m]
+    for done, (stretch, point_m) in enumerate(cases, start=1):
         distance_m = stretch * scene.sheet.width_m
-        forces_n, edge_force_n = sheet.push(distance_m, depth_m, point_m, radius_m)
-        hysteresis = forces_n[0] != forces_n[1]
-        for force_n, unloading in zip(forces_n, (False, True), strict=True):
-            if unloading and not hysteresis:
-                continue
-            pushes.append(
-                MeasuredPush(
-                    edge_distance_m=distance_m,
-                    depth_m=depth_m,
-                    force_n=force_n + float(rng.normal(0.0, noise_n)),
-                    finger_radius_m=radius_m,
-                    position_m=point_m,
-                    edge_force_n=edge_force_n + float(rng.normal(0.0, 10.0 * noise_n)),
-                    unloading=unloading if hysteresis else None,
+        pushed = sheet.push(distance_m, depths_m, point_m, radius_m)
+        for depth_m, (forces_n, edge_force_n) in zip(depths_m, pushed, strict=True):
+            hysteresis = forces_n[0] != forces_n[1]
+            for force_n, unloading in zip(forces_n, (False, True), strict=True):
+                if unloading and not hysteresis:
+                    continue
+                pushes.append(
+                    MeasuredPush(
+                        edge_distance_m=distance_m,
+                        depth_m=depth_m,
+                        force_n=force_n + float(rng.normal(0.0, noise_n)),
+                        finger_radius_m=radius_m,
+                        position_m=point_m,
+                        edge_force_n=edge_force_n + float(rng.normal(0.0, 10.0 * noise_n)),
+                        unloading=unloading if hysteresis else None,
+                    )
                 )
-            )
         progress(done, len(cases))
     return pushes
 
 
-def _simulated_cases(
-    scene: Scene, places: bool
-) -> Iterator[tuple[float, float, tuple[float, float]]]:
+def _simulated_cases(scene: Scene, places: bool) -> Iterator[tuple[float, tuple[float, float]]]:
+    """Yield each combination of a stretch ratio and a pushed point (x, y), m."""
     sheet = scene.sheet
     stretches = np.linspace(
         max(sheet.min_stretch_ratio, 1.005), sheet.max_stretch_ratio, SIMULATED_STRETCHES
     )
     xs, ys = (SIMULATED_XS, SIMULATED_YS) if places else ((0.0,), (0.0,))
-    for stretch in stretches:
-        for x in xs:
-            for y in ys:
-                for depth in SIMULATED_DEPTHS_M:
-                    if depth <= scene.working_range.push_depth_m + 1e-9:
-                        yield float(stretch), depth, (x * sheet.width_m, y * sheet.height_m)
+    for stretch, x, y in product(stretches, xs, ys):
+        yield float(stretch), (x * sheet.width_m, y * sheet.height_m)

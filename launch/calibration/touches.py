@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.marker_fit import Touch
+from flexsheet.launch.calibration.marker_fit import POINT_ERROR_M, Touch
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
@@ -144,7 +144,7 @@ SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20),
                        (10, -10), (-10, -10), (-10, 0), (25, 10), (25, -10), (0, 18),
                        (30, 0), (20, 20), (-25, 10), (8, 25))  # fmt: skip
 """Orientations that are tried until MAX_TOUCHES show the marker, as a person would do."""
-MAX_TOUCHES = 9
+MAX_TOUCHES = 15
 SIMULATED_POINT_M = np.array([0.01, 0.02, 0.01])
 SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, math.radians(1.0)
 """Standard deviations of the simulated pad's position and of the finger's angles."""
@@ -169,6 +169,7 @@ def simulate_touches(
     true_scene = apply_apparatus(scene, apparatus)
     random = np.random.default_rng(seed)
     usual = Nail.of(apparatus.finger)
+    measured_point = SIMULATED_POINT_M + random.normal(0.0, POINT_ERROR_M, 3)
     touches = []
     for number, tilt_deg in enumerate(SIMULATED_TILTS_DEG):
         tilt_rad = np.radians(tilt_deg)
@@ -188,7 +189,7 @@ def simulate_touches(
         seen = _see_marker(camera, scene, geometry, pad)
         if seen is not None:
             turned = world_from_finger(scene.finger.direction_world, tilt_rad)
-            touches.append(Touch(seen, SIMULATED_POINT_M, turned))
+            touches.append(Touch(seen, measured_point, turned))
         if len(touches) == MAX_TOUCHES:
             break
     return touches

@@ -87,7 +87,7 @@ def show(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.nodes.twin.tolerance_table import NOT_SIMULATED, list_differences
 
-    loaded = load_apparatus(apparatus, load_scene(scene))
+    loaded = load_apparatus(apparatus, load_scene(scene), scene)
     rows: list[dict[str, Any]] = [
         {
             "parameter": path,

@@ -455,7 +455,9 @@ def require_twin(apparatus: str | None, *, simulated: bool) -> None:
         raise CommandError(f"--apparatus {apparatus}: the option is for --twin only; remove it")
 
 
-def load_true_devices(text: str | None, scene: Scene) -> Apparatus | None:
+def load_true_devices(
+    text: str | None, scene: Scene, scene_file: Path | None = None
+) -> Apparatus | None:
     """Load the apparatus of a simulated calibration; None without a text.
 
     It is described in the world frame that the stereo camera defines, to which all calibrations
@@ -464,7 +466,9 @@ def load_true_devices(text: str | None, scene: Scene) -> Apparatus | None:
     from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.nodes.twin.truth import align_world_to_camera
 
-    return None if text is None else align_world_to_camera(scene, load_apparatus(text, scene))
+    if text is None:
+        return None
+    return align_world_to_camera(scene, load_apparatus(text, scene, scene_file))
 
 
 def round_digits(value: float) -> float:

@@ -213,6 +213,7 @@ def summarize(lab: Commissioning) -> dict[str, Any]:
             {
                 "name": record.name,
                 "seconds": record.seconds,
+                "cpu_seconds": record.cpu_seconds,
                 "residual": None if result is None else result.residual,
                 "unit": None if result is None else result.unit,
                 "limit": None if result is None else result.limit,

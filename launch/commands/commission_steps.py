@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from flexsheet.launch.calibration.commission import (
     Step,
     StepName,
     StepResult,
+    list_doubts,
 )
 from flexsheet.launch.commands import (
     calibrate,
@@ -41,7 +42,11 @@ from flexsheet.messages.calibration import Board, load_calibration, save_calibra
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Pose, Scene, require_projector
 from flexsheet.nodes.models.rigid import rpy_from_rotation, transform_from_rpy
+from flexsheet.nodes.models.sheet import edge_force_n
 from flexsheet.nodes.twin.truth import apply_apparatus
+
+if TYPE_CHECKING:
+    from flexsheet.launch.calibration.prediction import Knowledge
 
 STEREO, ARMS, SHEET, MARKER = "stereo.yaml", "arms.yaml", "sheet.yaml", "marker.yaml"
 BOARD = Board(kind="chessboard", columns=9, rows=6, square_m=0.025)
@@ -96,7 +101,7 @@ def open_laboratory(
         raise CommissionError(f'{launch_file}: missing key "scene"; add a scene file')
     base = scene_file or Path(plan.scene_file)
     # Check the apparatus before the folder is created.
-    true = calibrate.load_true_devices(apparatus, load_scene(base))
+    true = calibrate.load_true_devices(apparatus, load_scene(base), base)
     lab = Commissioning(folder, launch_file, base, apparatus)
     if true is not None:
         write_file(folder / APPARATUS_FILE, format_apparatus(true))
@@ -110,8 +115,9 @@ class Laboratory:
 
     apparatus: true parameters of simulated devices, in the world frame of the camera; None for real
     devices. data: file or folder with the captured data of each step. finger_radius_m: measured
-    radius for real devices. seconds: duration of the verification. pairs, arm_poses, sheet_poses:
-    numbers of simulated observations.
+    radius for real devices. seconds: duration of the verification. simulated_time: verify simulated
+    devices without a running graph. pairs, arm_poses, sheet_poses: numbers of simulated
+    observations.
     """
 
     apparatus: Apparatus | None
@@ -121,6 +127,7 @@ class Laboratory:
     finger_radius_m: float | None = None
     seconds: float = 10.0
     seed: int = 1
+    simulated_time: bool = False
     pairs: int = 20
     arm_poses: int = 16
     sheet_poses: int = 6
@@ -257,8 +264,17 @@ class Laboratory:
             )
         except SheetModelFitError as error:
             raise CommissionError(f"step sheet, {source}: {error}") from error
+        modulus, width_m = found.modulus_thickness_n_per_m, round(found.slack_width_m.value, 6)
+        wider = width_m / scene.sheet.width_m
+        # Stretch ratios refer to the width of the scene, which becomes the measured one.
+        found = found.model_copy(
+            update={
+                "nominal_width_m": width_m,
+                "min_stretch_ratio": found.min_stretch_ratio / wider,
+                "max_stretch_ratio": found.max_stretch_ratio / wider,
+            }
+        )
         save_sheet_calibration(found, lab.folder / SHEET)
-        modulus = found.modulus_thickness_n_per_m
         return StepResult(
             residual=100.0 * found.residual_rms_ratio,
             unit="%",
@@ -268,7 +284,7 @@ class Laboratory:
                 "modulus_percent": 100.0 * modulus.standard_deviation / modulus.value,
                 "slack_width_mm": 1e3 * found.slack_width_m.standard_deviation,
             },
-            scene_values=measured_stiffness(scene, modulus.value),
+            scene_values=describe_sheet(scene, modulus.value, width_m),
             parameters={"planner.sheet_calibration": SHEET},
         )
 
@@ -318,6 +334,7 @@ class Laboratory:
                 "on_sheet_mm": 1e3 * fit.held_out_rms_px * fit.rms_m / max(fit.rms_px, 1e-9),
             },
             scene_values=values,
+            covariances={"shift_px2": fit.shift_covariance_px2.tolist()},
         )
 
     def calibrate_edges(self, lab: Commissioning) -> StepResult:
@@ -348,6 +365,7 @@ class Laboratory:
             uncertainty[f"{side}_edge_mm"] = 1e3 * fit.edge_std_m
             uncertainty[f"{side}_compliance_um_per_n"] = 1e6 * fit.compliance_std_m_per_n
         return StepResult(
+            covariances={side: fit.covariance.tolist() for side, fit in fits.items()},
             residual=1e3 * max(fit.residual_rms_m for fit in fits.values()),
             unit="mm",
             limit=0.4,
@@ -371,9 +389,7 @@ class Laboratory:
             touches = simulate_touches(scene, self.apparatus, calibration=optics, seed=self.seed)
             source = f"twin of {scene.name}"
             true_m = apply_apparatus(scene, self.apparatus).finger.radius_m
-            read_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
-            # Rounded, so that tables computed for this radius are used again for similar fingers.
-            radius_m = 5e-4 * round(read_m / 5e-4)
+            radius_m = true_m + np.random.default_rng(self.seed).normal(0.0, CALLIPER_M)
         found = calibrate_marker.make_calibration(touches, scene, source)
         save_marker_calibration(found, lab.folder / MARKER)
         uncertainty = {
@@ -394,44 +410,87 @@ class Laboratory:
 
     def verify(self, lab: Commissioning) -> StepResult:
         """Measure the errors of the calibrated system in a stroke, and at rest if simulated."""
+        from flexsheet.launch.calibration.prediction import predict_errors
+
+        scene = load_scene(lab.scene_copy)
         if self.apparatus is None:
             stroke = _read_stroke(self._find_data(StepName.VERIFICATION))
             figures: dict[str, Any] = {"stroke": stroke, "flagged": stroke.get("flagged", [])}
         else:
-            figures = run_verification(lab, self.seconds)
+            figures = run_verification(
+                lab, self.seconds, self.seed, simulated_time=self.simulated_time
+            )
+        tracking_mm = figures["stroke"]["delta_d_mm"]["mean"]
+        limit_mm = 1e3 * scene.tolerances.sheet_position_m
+        predicted = predict_errors(collect_knowledge(lab), 1e-3 * tracking_mm)
+        figures["predicted"] = {name: one.model_dump() for name, one in predicted.items()}
+        figures["doubts"] = list_doubts(lab.state.steps, figures, (tracking_mm, limit_mm))
         figures["repeat"] = [REPEAT[one] for one in figures["flagged"] if one in REPEAT]
-        tolerance_m = load_scene(lab.scene_copy).tolerances.sheet_position_m
         return StepResult(
-            residual=figures["stroke"]["delta_d_mm"]["mean"],
+            residual=tracking_mm,
             unit="mm",
-            limit=1e3 * tolerance_m,
+            limit=limit_mm,
             advice="Repeat the steps that the verification names.",
             figures=figures,
         )
 
 
-def run_verification(lab: Commissioning, seconds: float) -> dict[str, Any]:
-    """Run a stroke of a simulated laboratory; compare errors at rest before and after calibration.
+def collect_knowledge(lab: Commissioning) -> Knowledge:
+    """Return what the finished steps know about the devices."""
+    from flexsheet.launch.calibration.prediction import EYE_STD_M, STAMP_STD_S, Knowledge
+    from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 
-    `stated_mm` are the errors that the uncertainties of the steps predict. They can be compared
-    with the true errors of sheet and fingertip at rest.
-    """
-    from flexsheet.launch.experiments.offline import (
-        NodeCalibrations,
-        OfflineEvaluator,
-        exceeded_tolerances,
+    covariances: dict[StepName, dict[str, Any]] = {
+        name: {key: np.array(one) for key, one in record.result.covariances.items()}
+        for name, record in lab.state.steps.items()
+        if record.result is not None
+    }
+    named = {key: one for found in covariances.values() for key, one in found.items()}
+    plan = load_graph(lab.launch_copy)
+    return Knowledge(
+        scene=load_scene(lab.scene_copy),
+        calibrations=NodeCalibrations.of(plan),
+        edges=covariances.get(StepName.EDGES, {}),
+        projector_px2=named.get("shift_px2", np.zeros((2, 2))),
+        eyes_m2=named.get("eyes_m2", EYE_STD_M**2 * np.eye(3)),
+        stamp_std_s=float(np.sqrt(named.get("stamp_s2", np.array(STAMP_STD_S**2)).item())),
     )
+
+
+def run_verification(
+    lab: Commissioning, seconds: float, seed: int, *, simulated_time: bool
+) -> dict[str, Any]:
+    """Run a stroke of a simulated laboratory, and evaluate its true errors at rest.
+
+    simulated_time: run the stroke without a graph, and omit the errors before the calibration. No
+    self-checks run then.
+    """
+    from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
+    from flexsheet.launch.experiments.offline import OfflineEvaluator, exceeded_tolerances
     from flexsheet.launch.experiments.run import require_scene
+    from flexsheet.launch.experiments.simulated_time import LoopSettings, stroke_in_simulated_time
     from flexsheet.launch.experiments.trial import run_stroke
 
     file = str(lab.folder / APPARATUS_FILE)
-    trial = {"launch_file": str(lab.launch_copy), "seconds": seconds}
-    stroke = run_stroke(trial, file)
+    if simulated_time:
+        plan = load_graph(lab.launch_copy, apparatus=file)
+        scene, apparatus = require_scene(plan), plan.apparatus_message()
+        assert apparatus is not None
+        settings = LoopSettings(seed=seed, calibrations=NodeCalibrations.of(plan))
+        stroke: dict[str, Any] = {
+            **stroke_in_simulated_time(scene, apparatus, settings, seconds),
+            "flagged": [],
+        }
+        folders = {"after": (lab.launch_copy, lab.scene_copy)}
+    else:
+        trial = {"launch_file": str(lab.launch_copy), "seconds": seconds}
+        stroke = run_stroke(trial, file)
+        folders = {
+            "before": (lab.launch_file, lab.scene_file),
+            "after": (lab.launch_copy, lab.scene_copy),
+        }
     at_rest = {}
-    for name, launch_file, scene_file in (
-        ("before", lab.launch_file, lab.scene_file),
-        ("after", lab.launch_copy, lab.scene_copy),
-    ):
+    for name, (launch_file, scene_file) in folders.items():
         plan = load_graph(launch_file, settings=[f"scene={scene_file}"], apparatus=file)
         scene, apparatus = require_scene(plan), plan.apparatus_message()
         assert apparatus is not None
@@ -440,31 +499,9 @@ def run_verification(lab: Commissioning, seconds: float) -> dict[str, Any]:
     return {
         "stroke": stroke,
         "at_rest": at_rest,
-        "stated_mm": _state_errors(lab),
         "out_of_tolerance": exceeded_tolerances(scene, at_rest["after"]),
         "flagged": stroke["flagged"],
     }
-
-
-def _state_errors(lab: Commissioning) -> dict[str, float]:
-    """Return the errors (mm) of sheet and fingertip that the steps' uncertainties predict."""
-
-    def collect(step: StepName, *keys: str) -> list[float]:
-        record = lab.state.steps.get(step)
-        if record is None or record.result is None:
-            return []
-        return [record.result.uncertainty[key] for key in keys]
-
-    tip = [
-        *collect(StepName.CAMERA, "depth_mm", "lateral_mm"),
-        *collect(StepName.MARKER, "x_mm", "y_mm", "z_mm"),
-    ]
-    arms = collect(StepName.EDGES, "left_edge_mm", "right_edge_mm") or collect(
-        StepName.ARMS, "left_position_mm", "right_position_mm"
-    )
-    # The centre of the sheet moves by half the error of each edge.
-    sheet = [0.5 * one for one in arms]
-    return {"fingertip": float(np.linalg.norm(tip)), "sheet": float(np.linalg.norm(sheet))}
 
 
 def _find_images(folder: Path, side: str) -> list[Path]:
@@ -500,16 +537,31 @@ def _read_stroke(path: Path) -> dict[str, Any]:
     return found
 
 
-def measured_stiffness(scene: Scene, modulus_thickness_n_per_m: float) -> dict[str, float]:
-    """Return the values of the scene for a measured product of modulus and thickness.
+def describe_sheet(
+    scene: Scene, modulus_thickness_n_per_m: float, width_m: float
+) -> dict[str, float]:
+    """Return the values of the scene for a measured sheet.
 
-    The step `edges` measured how far the tension displaces the flanges. Their compliances change so
-    that this displacement stays the same with the other tension.
+    modulus_thickness_n_per_m: product of modulus and thickness. width_m: width without tension. The
+    step `edges` measured how far the tension displaces the flanges. Their compliances change so
+    that this displacement stays the same with the other tension, at the middle stretch.
     """
     sheet = scene.sheet
-    stiffer = modulus_thickness_n_per_m / (sheet.young_modulus_pa * sheet.thickness_m)
-    values = {"sheet.young_modulus_pa": stiffer * sheet.young_modulus_pa}
+    modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m
+    measured = sheet.model_copy(update={"young_modulus_pa": modulus_pa, "width_m": width_m})
+    distance_m = 0.5 * (sheet.min_stretch_ratio + sheet.max_stretch_ratio) * sheet.width_m
+    before_n, after_n = (
+        edge_force_n(
+            distance_m / one.width_m,
+            young_modulus_pa=one.young_modulus_pa,
+            width_m=one.width_m,
+            height_m=one.height_m,
+            thickness_m=one.thickness_m,
+        )
+        for one in (sheet, measured)
+    )
+    values = {"sheet.young_modulus_pa": modulus_pa, "sheet.width_m": width_m}
     for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
-        compliance = arm.flange_compliance_m_per_n / stiffer
+        compliance = arm.flange_compliance_m_per_n * before_n / after_n
         values[f"arms.{side}.flange_compliance_m_per_n"] = compliance
     return values

@@ -77,7 +77,8 @@ def robustness(
         bool,
         typer.Option(
             "--commissioned",
-            help="Commission each simulated laboratory first, as `flexsheet commission` does.",
+            help="Commission each simulated laboratory first, as `flexsheet commission` does, and "
+            "evaluate it in simulated time.",
         ),
     ] = False,
     seconds: StrokeOption = 10.0,
@@ -135,9 +136,24 @@ def robustness(
         values = [_shown(result["summary"][metric][statistic]) for metric in experiment.METRICS]
         rows.append([statistic, *values, "", ""])
     print_table(["seed", *experiment.METRICS, "out of tolerance", "flagged"], rows)
+    if "commissioning" in result:
+        _print_predictions(result["commissioning"])
     for one in result["failed"]:
         words.print(f"seed {one['seed']} failed: {one['error']}")
     words.print(f"rows: {folder}")
+
+
+def _print_predictions(found: dict[str, Any]) -> None:
+    """Print how often the reports of the laboratories are right, overall and by metric."""
+    cases = ("good_and_within", "good_but_exceeded", "doubted_but_within", "doubted_and_exceeded")
+    every = {"all": {**found["confusion"], "stated_over_true": {"median": None}}}
+    print_table(
+        ["report", *(case.replace("_", " ") for case in cases), "stated / true error, median"],
+        [
+            [name, *(one[case] for case in cases), _shown(one["stated_over_true"]["median"])]
+            for name, one in (every | found["predictions"]).items()
+        ],
+    )
 
 
 def sensitivity(

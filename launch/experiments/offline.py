@@ -13,23 +13,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.stroke import project_presented_point
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
-from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.apparatus import Apparatus
-from flexsheet.messages.calibration import StereoCalibration, load_calibration
-from flexsheet.messages.marker_calibration import MarkerCalibration, load_marker_calibration
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
-from flexsheet.nodes import node_class
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.sheet.force_models import SheetPush
@@ -45,7 +39,7 @@ from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import HALF_WINDOW_M, eye_rays, first_hits, seen
 from flexsheet.nodes.twin.force_history import compute_history_ratios
-from flexsheet.nodes.twin.membrane import NotConvergedError, solve
+from flexsheet.nodes.twin.membrane import CELLS, NotConvergedError, solve, solve_path
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
@@ -81,32 +75,6 @@ class Metric(StrEnum):
 
 
 ALL_METRICS = frozenset(Metric)
-
-
-@dataclass(frozen=True, slots=True)
-class NodeCalibrations:
-    """Calibrations that the nodes use in addition to the scene."""
-
-    stereo: StereoCalibration | None = None
-    sheet: SheetCalibration | None = None
-    marker: MarkerCalibration | None = None
-
-    @staticmethod
-    def of(plan: ResolvedGraph) -> NodeCalibrations:
-        """Read the calibration files that the plan's triangulator and planner use."""
-        stereo: StereoCalibration | None = None
-        sheet: SheetCalibration | None = None
-        marker: MarkerCalibration | None = None
-        for node in plan.nodes.values():
-            kind = node_class(node.type)
-            if issubclass(kind, node_class("triangulator")):
-                if path := node.parameters["calibration"]:
-                    stereo = load_calibration(Path(path))
-                if path := node.parameters["marker_calibration"]:
-                    marker = load_marker_calibration(Path(path))
-            if issubclass(kind, node_class("planner")) and node.parameters["sheet_calibration"]:
-                sheet = load_sheet_calibration(Path(node.parameters["sheet_calibration"]))
-        return NodeCalibrations(stereo, sheet, marker)
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,18 +165,26 @@ class Contact:
 class OfflineEvaluator:
     """Evaluator of apparatuses of one scene.
 
+    metres_per_px: resolution of the images. cells: number of node intervals per side of the mesh of
+    the true sheet.
+
     Its methods raise ExperimentError if the equations of the sheet or the arms have no solution.
     """
 
-    def __init__(self, scene: Scene, calibrations: NodeCalibrations | None = None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        calibrations: NodeCalibrations | None = None,
+        *,
+        metres_per_px: float = METRES_PER_PX,
+        cells: int = CELLS,
+    ) -> None:
+        self._metres_per_px, self._cells = metres_per_px, cells
         given = calibrations or NodeCalibrations()
         self._scene = scene
         self._geometry = StereoGeometry.of(scene.camera, given.stereo)
         self._force_model = make_force_model(scene.sheet, given.sheet)
-        marker = scene.finger if given.marker is None else given.marker
-        self._marker_from_pad = world_from_finger(scene.finger.direction_world) @ np.array(
-            marker.marker_from_pad_m
-        )
+        self._marker_from_pad = given.find_marker_offset_m(scene)
         self._shape = make_shape(dict(scene.object.geometry))
         self._world_from_object = pose_matrix(scene.object.world_from_object)
         low, high = scene.sheet.min_stretch_ratio, scene.sheet.max_stretch_ratio
@@ -369,20 +345,24 @@ class OfflineEvaluator:
         left, right = arms.hold(self._edges(contact))
         most_m = self._scene.working_range.push_depth_m
         history_ratios = compute_history_ratios(apparatus)
+        depths_m = [
+            min(depth_m, limit_m)
+            for depth_m, limit_m in zip(MAX_FORCE_DEPTHS_M, (0.5 * most_m, most_m), strict=True)
+        ]
+        path = solve_path(
+            true_rubber(scene.sheet, apparatus),
+            left,
+            right,
+            finger_tips=[contact.point - depth_m * contact.normal for depth_m in depths_m],
+            finger_radius_m=scene.finger.radius_m,
+            friction_coefficient=true_friction(apparatus),
+            cells=self._cells,
+        )
         felt: list[float] = []
         expected: list[float] = []
-        for depth_m, limit_m in zip(MAX_FORCE_DEPTHS_M, (0.5 * most_m, most_m), strict=True):
-            true_m = min(depth_m, limit_m)
-            pushed = solve(
-                true_rubber(scene.sheet, apparatus),
-                left,
-                right,
-                finger_tip=contact.point - true_m * contact.normal,
-                finger_radius_m=scene.finger.radius_m,
-                friction_coefficient=true_friction(apparatus),
-            )
+        for depth_m, pushed in zip(depths_m, path, strict=True):
             felt.extend((history_ratios * (pushed.finger_force_n @ contact.normal)).tolist())
-            believed_m = true_m - float(tip_error @ contact.normal)
+            believed_m = depth_m - float(tip_error @ contact.normal)
             model = self._force_model.evaluate(
                 SheetPush(self._stretch_ratio, self._scene.finger.radius_m),
                 np.array([max(believed_m, 1e-4)]),
@@ -428,10 +408,13 @@ class OfflineEvaluator:
             finger_tip=tip,
             finger_radius_m=scene.finger.radius_m,
             friction_coefficient=true_friction(apparatus),
+            cells=self._cells,
         )
         eye = scene.eyes.centre_world_m
-        x, y = (seen(one, sheet, scene, eye=eye, metres_per_px=METRES_PER_PX) for one in ramps)
-        errors = error_map(x, y, METRES_PER_PX).errors_m
+        x, y = (
+            seen(one, sheet, scene, eye=eye, metres_per_px=self._metres_per_px) for one in ramps
+        )
+        errors = error_map(x, y, self._metres_per_px).errors_m
         return self._correct_parallax(errors, eye)
 
     def _correct_parallax(self, errors_m: Floats, eye: Floats) -> Floats:
@@ -445,12 +428,12 @@ class OfflineEvaluator:
             return errors_m
         shifts = self._parallax(eye)
         size = len(errors_m)
-        at = (np.arange(size) + 0.5 * (1 - size)) * METRES_PER_PX
+        at = (np.arange(size) + 0.5 * (1 - size)) * self._metres_per_px
         x, y = np.meshgrid(at, -at)
         drawn = np.stack([x, y], axis=-1) - errors_m
         known = np.isfinite(drawn).all(axis=2)
-        column = np.rint(drawn[known][:, 0] / METRES_PER_PX + 0.5 * (size - 1)).astype(int)
-        row = np.rint(0.5 * (size - 1) - drawn[known][:, 1] / METRES_PER_PX).astype(int)
+        column = np.rint(drawn[known][:, 0] / self._metres_per_px + 0.5 * (size - 1)).astype(int)
+        row = np.rint(0.5 * (size - 1) - drawn[known][:, 1] / self._metres_per_px).astype(int)
         inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
         found = np.full((len(row), 2), np.nan)
         found[inside] = shifts[row[inside], column[inside]]
@@ -475,10 +458,10 @@ class OfflineEvaluator:
         The measuring camera is at the scene's eye position. Returns points on the screen plane
         (rows, columns, 2) and on the object (rows, columns, 3); NaN where the ray misses it.
         """
-        size = round(2.0 * HALF_WINDOW_M / METRES_PER_PX)
+        size = round(2.0 * HALF_WINDOW_M / self._metres_per_px)
         rays = eye_rays(
             self._scene.eyes.centre_world_m,
-            metres_per_px=METRES_PER_PX,
+            metres_per_px=self._metres_per_px,
             size=size,
             box=(0, 0, size, size),
             samples=1,

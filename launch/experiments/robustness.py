@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.offline import Metric
 from flexsheet.launch.experiments.run import require_scene
 from flexsheet.launch.experiments.sweep import (
     Progress,
@@ -65,8 +66,8 @@ def run_robustness(
     """Run one trial per seed; return the results of `experiment robustness --json`.
 
     commissioned: calibrate each simulated laboratory first, in a folder of its own, and evaluate it
-    with the resulting scene and launch file. The apparatus is then that of hardware that nobody has
-    calibrated, described in the world frame that the calibrated camera defines.
+    in simulated time with the resulting scene and launch file. The apparatus is then that of
+    hardware that nobody has calibrated, in the world frame that the calibrated camera defines.
     """
     if commissioned and calibrated:
         raise ExperimentError(
@@ -112,11 +113,11 @@ def run_robustness(
         "failed": failed,
         "summary": summarize(found),
         "measured": {
-            "sheet_mm": "graph",
-            "sheet_deg": "graph",
-            "fingertip_mm": "graph",
-            "image_mm": "offline",
-            "force_percent": "offline",
+            **dict.fromkeys(
+                ("sheet_mm", "sheet_deg", "fingertip_mm"),
+                "simulated time" if commissioned else "graph",
+            ),
+            **dict.fromkeys(("image_mm", "force_percent"), "offline"),
         },
         "out_of_tolerance": [row["seed"] for row in found if row["out_of_tolerance"]],
         "flagged": [row["seed"] for row in found if row["flagged"]],
@@ -124,6 +125,67 @@ def run_robustness(
             row["seed"] for row in found if row["out_of_tolerance"] and not row["flagged"]
         ],
         "folder": str(folder),
+        **({"commissioning": summarize_commissioning(found)} if commissioned else {}),
+    }
+
+
+def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
+    """Compare what each laboratory's report predicts with its true errors.
+
+    confusion: number of laboratories by report (good or not) and truth (within tolerance or not);
+    the same for each metric. stated_over_true: predicted root mean square over true error,
+    quantiles over the laboratories. covered: share of true errors below the predicted 95 %
+    quantile.
+    """
+    predictions = {}
+    for metric in Metric:
+        cases = [
+            (row["predicted"][metric], row[metric], metric in row["out_of_tolerance"])
+            for row in rows
+            if metric in row["predicted"] and row[metric]
+        ]
+        if not cases:
+            continue
+        ratios = [stated["typical"] / true for stated, true, _ in cases]
+        predictions[metric.value] = {
+            "stated_over_true": {
+                "p05": float(np.quantile(ratios, 0.05)),
+                "median": float(np.median(ratios)),
+                "p95": float(np.quantile(ratios, 0.95)),
+            },
+            "covered": float(np.mean([true <= stated["limit_95"] for stated, true, _ in cases])),
+            "predicted_limit_95": float(np.median([stated["limit_95"] for stated, _, _ in cases])),
+            **_count_confusion([(stated["within"], not bad) for stated, _, bad in cases]),
+        }
+    steps = [step for row in rows for step in row["commission"]["steps"]]
+    names = dict.fromkeys(step["name"] for step in steps)
+    return {
+        "confusion": _count_confusion(
+            [(not row["doubts"], not row["out_of_tolerance"]) for row in rows]
+        ),
+        "predictions": predictions,
+        "cpu_seconds": float(np.median([row["commission"]["cpu_seconds"] for row in rows])),
+        "steps": {
+            name: {
+                "cpu_seconds": float(
+                    np.median([one["cpu_seconds"] for one in steps if one["name"] == name])
+                ),
+                "above_limit": [
+                    row["seed"] for row in rows if name in row["commission"]["above_limit"]
+                ],
+            }
+            for name in names
+        },
+    }
+
+
+def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
+    """Count cases (reported as good, truly good)."""
+    return {
+        "good_and_within": cases.count((True, True)),
+        "good_but_exceeded": cases.count((True, False)),
+        "doubted_but_within": cases.count((False, True)),
+        "doubted_and_exceeded": cases.count((False, False)),
     }
 
 

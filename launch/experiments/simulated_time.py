@@ -20,15 +20,19 @@ from typing import Any
 import numpy as np
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
+from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
     make_edge_row,
     make_motion,
     object_pose,
     sheet_errors,
+    stroke_path,
+    stroke_window_s,
+    summary,
 )
-from flexsheet.launch.experiments.true_geometry import ArmModel
-from flexsheet.messages.apparatus import Apparatus, ArmTruth, nominal_apparatus
+from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges
+from flexsheet.messages.apparatus import Apparatus, ArmTruth, CameraTruth, nominal_apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, Phase, Side, SoftBody
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
@@ -51,8 +55,9 @@ from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.arms import ArmMechanics, Servo
-from flexsheet.nodes.twin.finger import validate_path
+from flexsheet.nodes.twin.finger import FingerMotion, find_tremor_m, validate_path
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, VoluntaryPath
+from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
@@ -82,7 +87,9 @@ class LoopSettings:
 
     tracking: tracking method. planner: parameters of the planner by name. lag_known: whether the
     bridges know the true servo lag of the arms, as a reference for runs in which they measure it.
-    computing_s: time from the end of the read-out to the published target.
+    computing_s: time from the end of the read-out to the published target. calibrations: those of
+    the nodes, with which they see the finger through the true camera; None: they know camera,
+    marker and exposure times exactly.
     """
 
     tracking: str = "adaptive"
@@ -90,14 +97,23 @@ class LoopSettings:
     planner: Mapping[str, Any] = field(default_factory=dict)
     lag_known: bool = False
     computing_s: float = COMPUTING_S
+    calibrations: NodeCalibrations | None = None
 
 
 class MeasuredFinger:
     """Simulated camera with pixel noise, and the triangulator's tracking of the finger."""
 
-    def __init__(self, scene: Scene, settings: LoopSettings) -> None:
-        self._camera, self._geometry = scene.camera, StereoGeometry.of(scene.camera, None)
-        self._left_from_world = inverse(pose_matrix(scene.camera.world_from_left))
+    def __init__(self, scene: Scene, apparatus: Apparatus, settings: LoopSettings) -> None:
+        given, self._truth = settings.calibrations, apparatus.camera
+        self._geometry = StereoGeometry.of(scene.camera, None if given is None else given.stereo)
+        if given is None:
+            self._camera, self._truth = scene.camera, CameraTruth()
+            self._marker_m = self._believed_marker_m = np.zeros(3)
+        else:
+            self._camera = rig.make_true_camera(apply_apparatus(scene, apparatus).camera)
+            self._marker_m = Nail.of(apparatus.finger).marker_offset_m
+            self._believed_marker_m = given.find_marker_offset_m(scene)
+        self._left_from_world = inverse(pose_matrix(self._camera.world_from_left))
         self._random = np.random.default_rng(settings.seed)
         speed_m_per_s = scene.finger.max_speed_m_per_s
         self._tracker = Tracker(
@@ -105,19 +121,31 @@ class MeasuredFinger:
         )
         self._horizons_s = np.arange(0.0, PREDICTION_S + 1.5 * PREDICTION_STEP_S, PREDICTION_STEP_S)
 
-    def predict_path(self, at_ns: int, position_world: Floats) -> Floats:
-        """Measure the finger at its true position (3,); return its predicted path (n, 3)."""
-        in_left = apply(self._left_from_world, position_world)
+    def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
+        """Measure the finger, whose true position and velocity at the timestamp are given, (3,).
+
+        Returns its predicted path (n, 3). The images are exposed slightly after the timestamp.
+        """
+        truth, random = self._truth, self._random
+        late_s = truth.stamp_offset_s
+        if truth.exposure_jitter_s:
+            late_s += truth.exposure_jitter_s * float(random.standard_normal())
+        marker = position_world + self._marker_m
+        markers = marker + np.array([[late_s], [late_s + truth.skew_s]]) * velocity
+        in_left = apply(self._left_from_world, markers)
         in_right = apply(self._camera.right_from_left, in_left)
         pixels = [
-            rig.pixels_of(lens, point[:2] / point[2])
-            + PIXEL_NOISE_PX * self._random.standard_normal(2)
-            for lens, point in ((self._camera.left, in_left), (self._camera.right, in_right))
+            rig.pixels_of(lens, point[:2] / point[2]) + PIXEL_NOISE_PX * random.standard_normal(2)
+            for lens, point in (
+                (self._camera.left, in_left[0]),
+                (self._camera.right, in_right[1]),
+            )
         ]
         covariance = PIXEL_NOISE_PX**2 * np.eye(2)
         found = measure(self._geometry, *pixels, covariance=covariance)
         if found is not None:
-            self._tracker.update(at_ns, found.point_world, found.covariance)
+            pad = found.point_world - self._believed_marker_m
+            self._tracker.update(at_ns, pad, found.covariance)
         return self._tracker.predict_at(at_ns, self._horizons_s).path
 
 
@@ -143,6 +171,11 @@ class SimulatedArm:
             self._known_lag_s = lag_s + truth.command_latency_s + waits_s
         self._pending: deque[tuple[float, Floats]] = deque()
         self._now_s = 0.0
+
+    def sheet_to(self, other: SimulatedArm) -> SheetMotion:
+        """Return the sheet between both arms, as a bridge computes it from the measured joints."""
+        edges = [arm._geometry.world_from_edge(arm._servo.joints_rad) for arm in (self, other)]
+        return self._geometry.sheet_between(*edges)
 
     @property
     def lag_s(self) -> float:
@@ -210,7 +243,9 @@ class SimulatedSheet:
         )
         self._models = ArmModel.of(true_scene.arms.left), ArmModel.of(true_scene.arms.right)
         self._pull = SheetPull.of(true_scene.sheet, apparatus)
+        self._width_m = scene.sheet.width_m
         self.rows: tuple[list[tuple[int, Floats]], ...] = ([], [])
+        self.reported_rows: tuple[list[tuple[int, Floats]], ...] = ([], [])
         self.on_edges: Callable[[float, Floats, Floats], None] | None = None
 
     def record(self, now_s: float) -> None:
@@ -224,6 +259,10 @@ class SimulatedSheet:
             flanges = list(self._pull.displace(*flanges, *clamps, time_s=now_s))
         for rows, flange, clamp in zip(self.rows, flanges, clamps, strict=True):
             rows.append((round(1e9 * now_s), make_edge_row(flange, clamp)))
+        sheet = self.arms[0].sheet_to(self.arms[1])
+        reported = place_edges(sheet.world_from_sheet, sheet.stretch_ratio * self._width_m)
+        for rows, edge in zip(self.reported_rows, reported, strict=True):
+            rows.append((round(1e9 * now_s), make_edge_row(edge, np.eye(4))))
         if self.on_edges is not None:
             left, right = (flange @ clamp for flange, clamp in zip(flanges, clamps, strict=True))
             self.on_edges(now_s, left, right)
@@ -245,7 +284,8 @@ class SimulatedLoop:
         self.sheet = SimulatedSheet(
             scene, apparatus, self.planner.motion, lag_known=settings.lag_known
         )
-        self._tracked = MeasuredFinger(scene, settings)
+        self._tracked = MeasuredFinger(scene, apparatus, settings)
+        self.fingertip = np.zeros(3)
         self.period_s = 1.0 / (apparatus.camera.rate_hz or scene.camera.rate_hz)
         read_out_s = apparatus.camera.read_out_s
         read_out_s = READ_OUT_S if read_out_s is None else read_out_s
@@ -264,9 +304,18 @@ class SimulatedLoop:
             self._commanded_s += CYCLE_S
             self._run_cycle(self._commanded_s, CYCLE_S)
 
-    def step(self, exposed_s: float, position: Floats) -> PlannedStep:
-        """Measure the finger at its true position (3,) at an exposure, plan and move the arms."""
-        predicted = self._tracked.predict_path(round(1e9 * exposed_s), position)
+    def step(
+        self, exposed_s: float, position: Floats, velocity: Floats | None = None
+    ) -> PlannedStep:
+        """Measure the finger at an exposure, plan and move the arms.
+
+        position, velocity: true position and velocity (3,) of the finger at the timestamp. The
+        filtered position is stored in `fingertip`.
+        """
+        predicted = self._tracked.predict_path(
+            round(1e9 * exposed_s), position, np.zeros(3) if velocity is None else velocity
+        )
+        self.fingertip = predicted[0]
         arms = self.sheet.arms
         needed_s = self._age_s + SENDING_S + 0.5 * (arms[0].lag_s + arms[1].lag_s)
         before_s = self._horizon_s
@@ -333,6 +382,56 @@ def follow_in_simulated_time(
     found = FollowedFinger()
     found.add(*errors, heights_m, np.array(following))
     return {**found.figures(), "servo_lag_ms": [1e3 * arm.lag_s for arm in loop.sheet.arms]}
+
+
+def stroke_in_simulated_time(
+    scene: Scene, apparatus: Apparatus, settings: LoopSettings, seconds: float
+) -> dict[str, dict[str, float]]:
+    """Simulate the experiment `stroke`; return its errors in mm and degrees as `stroke_result`.
+
+    The settings must have calibrations. The errors delta_d_mm are those that the devices report.
+    """
+    given, path = settings.calibrations, stroke_path(scene, seconds)
+    force_model = make_force_model(scene.sheet, None if given is None else given.sheet)
+    compliance = ComplianceController(scene, force_model, "force_curve")
+    loop = SimulatedLoop(scene, apparatus, settings, compliance)
+    motion = FingerMotion.of(apparatus.finger, path.positions_world_m[0], seed=settings.seed)
+    motion = motion.followed_by(
+        0.0,
+        times_s=path.times_s,
+        points=path.positions_world_m,
+        wander_m=path.wander_m,
+        tremor_m=find_tremor_m(apparatus.finger, path.tremor_m),
+        max_speed_m_per_s=scene.finger.max_speed_m_per_s,
+    )
+    begin_s, end_s = stroke_window_s(seconds)
+    rows: list[tuple[int, Floats]] = []
+    number, done = 0, False
+    while not done:
+        number += 1
+        exposed_s = number * loop.period_s
+        finger = motion.at(max(exposed_s - SETTLING_S, 0.0))
+        loop.step(exposed_s, finger.position, finger.velocity)
+        done = finger.path_done
+        if begin_s <= finger.path_time_s <= end_s:
+            rows.append((round(1e9 * exposed_s), np.concatenate([finger.position, loop.fingertip])))
+    samples = make_motion(rows, "fingertip")
+    true, measured = (
+        SampledMotion(samples.times_ns, samples.values[:, columns])
+        for columns in (slice(0, 3), slice(3, 6))
+    )
+    results = {}
+    for prefix, tip, edge_rows, given_truth in (
+        ("true_", true, loop.sheet.rows, apparatus),
+        ("", measured, loop.sheet.reported_rows, None),
+    ):
+        left, right = (make_motion(list(one), "edge") for one in edge_rows)
+        surface = SheetSurface.of(scene, given_truth)
+        errors = sheet_errors(scene, tip, (left, right), samples.times_ns, surface=surface)
+        results[f"{prefix}delta_d_mm"] = summary(errors[0], 1e3)
+        results[f"{prefix}delta_theta_deg"] = summary(errors[1], math.degrees(1.0))
+    off = np.linalg.norm(measured.values - true.values, axis=1)
+    return {**results, "fingertip_mm": summary(off, 1e3)}
 
 
 @dataclass(frozen=True, slots=True)

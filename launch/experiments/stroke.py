@@ -35,6 +35,7 @@ from flexsheet.messages.types import (
     TwinArms,
     TwinFinger,
 )
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape, principal_curvatures
@@ -359,7 +360,9 @@ def read_recording(bag: Path) -> StrokeRecording:
         measured=make_motion(measured, "fingertip"),
         finger=make_motion(finger, "twin/finger"),
         windows_ns=_find_windows_ns(times_by_label),
-        measured_edges=(make_edges("left", scene.arms.left), make_edges("right", scene.arms.right)),
+        measured_edges=apply_compliance(
+            scene, (make_edges("left", scene.arms.left), make_edges("right", scene.arms.right))
+        ),
         true_edges=(
             make_edges("true_left", true_arms.left),
             make_edges("true_right", true_arms.right),
@@ -371,6 +374,29 @@ def read_recording(bag: Path) -> StrokeRecording:
         surface=SheetSurface.of(scene),
         true_surface=SheetSurface.of(scene, apparatus),
     )
+
+
+def apply_compliance(
+    scene: Scene, edges: tuple[SampledMotion, SampledMotion]
+) -> tuple[SampledMotion, SampledMotion]:
+    """Displace the left and right edge as the sheet's tension displaces the flanges of the scene.
+
+    The arms report the poses of rigid arms.
+    """
+    limits = ArmGeometry(scene, "left").sheet_limits
+    moved = []
+    for own, other, arm in (
+        (edges[0], edges[1], scene.arms.left),
+        (edges[1], edges[0], scene.arms.right),
+    ):
+        across = other.interpolate(own.times_ns)[:, :3] - own.values[:, :3]
+        distances_m = np.linalg.norm(across, axis=1)
+        forces_n = np.array([limits.force_n(limits.sheet_length_m(one)) for one in distances_m])
+        values = own.values.copy()
+        shifts_m = arm.flange_compliance_m_per_n * forces_n
+        values[:, :3] += (shifts_m / distances_m)[:, None] * across
+        moved.append(SampledMotion(own.times_ns, values))
+    return moved[0], moved[1]
 
 
 def compute_sheet_planes(

@@ -7,12 +7,14 @@ which contains the parameters that the other nodes assume.
 from __future__ import annotations
 
 import io
+import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 from ruamel.yaml import YAML
 
+from flexsheet.launch.objects.meshes import make_scene
 from flexsheet.launch.plans.documents import (
     BadInputError,
     Document,
@@ -26,11 +28,14 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import find_role
 from flexsheet.nodes.twin.tolerance_table import Profile, sample_apparatus
-from flexsheet.nodes.twin.truth import SimulatorParameters, check_truth
+from flexsheet.nodes.twin.truth import SimulatorParameters, align_world_to_camera, check_truth
 
 TOPIC = "twin/apparatus"
 _SEED = re.compile(r"seed:(?P<seed>\d{1,18})(?P<words>(?:,[a-z]+)*)")
 CALIBRATED = "calibrated"
+COMMISSION_STATE = "commission.json"
+"""File beside a scene that states the scene from which its commissioning started."""
+
 PROFILES = tuple(one.value for one in Profile)
 
 
@@ -67,15 +72,22 @@ def parse_draw(text: str) -> Draw | None:
     return Draw(int(match["seed"]), profile, CALIBRATED in words)
 
 
-def load_apparatus(text: str, scene: Scene) -> Apparatus:
+def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> Apparatus:
     """Read an apparatus from a file, or sample it from a text such as "seed:7".
+
+    scene_file: file of the scene. If a commissioning wrote it, hardware that is not calibrated is
+    sampled around the scene from which the commissioning started, in the world frame of the camera.
 
     Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.
     """
     draw = parse_draw(text)
     if draw is not None:
-        return sample_apparatus(scene, draw.seed, profile=draw.profile, calibrated=draw.calibrated)
+        base = None if draw.calibrated else _load_base(scene_file)
+        drawn = sample_apparatus(
+            base or scene, draw.seed, profile=draw.profile, calibrated=draw.calibrated
+        )
+        return drawn if base is None else align_world_to_camera(base, drawn)
     document = read_document(Path(text))
     apparatus = validate(Apparatus, document)
     problems = _compare_scenes(apparatus, scene, document)
@@ -86,6 +98,22 @@ def load_apparatus(text: str, scene: Scene) -> Apparatus:
     if problems:
         raise BadInputError(problems)
     return apparatus
+
+
+def _load_base(scene_file: Path | None) -> Scene | None:
+    """Return the scene from which the commissioning that wrote a scene file started, or None."""
+    state = None if scene_file is None else scene_file.parent / COMMISSION_STATE
+    if state is None or not state.is_file():
+        return None
+    try:
+        named = str(json.loads(state.read_text(encoding="utf-8"))["scene_file"])
+    except (OSError, ValueError, KeyError, TypeError):
+        named = ""
+    if not Path(named).is_file():
+        what = f'the scene from which the commissioning started, "{named}", does not exist'
+        remedy = f"restore it, or use --apparatus {state.parent / 'apparatus.yaml'}"
+        raise BadInputError([Problem(str(state), ("scene_file",), what, remedy)])
+    return make_scene(read_document(Path(named)))
 
 
 def _compare_scenes(apparatus: Apparatus, scene: Scene, document: Document) -> list[Problem]:

@@ -104,7 +104,8 @@ def load_graph(
     entries = collect_entries(spec, document)
     for entry in entries:
         resolve_entry(entry, document)
-    truth = _load_apparatus(apparatus, scene, document)
+    scene_file = None if scene_document is None else scene_document.path
+    truth = _load_apparatus(apparatus, scene, scene_file, document)
     give_apparatus(entries, truth, document)
     entries, omitted = omit_unneeded(entries, scene, needed)
     writers = list_writers(
@@ -179,7 +180,9 @@ def _load_scene(spec: LaunchFile, document: Document) -> tuple[Document | None, 
         return None, None
 
 
-def _load_apparatus(text: str | None, scene: Scene | None, document: Document) -> Apparatus | None:
+def _load_apparatus(
+    text: str | None, scene: Scene | None, scene_file: Path | None, document: Document
+) -> Apparatus | None:
     if text is None:
         return None
     if scene is None and document.problems:  # the scene has errors, which are reported
@@ -189,7 +192,7 @@ def _load_apparatus(text: str | None, scene: Scene | None, document: Document) -
         document.problems.append(Problem("--apparatus", (), what, 'name a scene file in "scene"'))
         return None
     try:
-        return load_apparatus(text, scene)
+        return load_apparatus(text, scene, scene_file)
     except BadInputError as error:
         document.problems.extend(error.problems)
         return None

@@ -67,7 +67,8 @@ def precompute_deflection_shapes(
         deflection_cache.load_or_compute(scene, folder, on_progress)
     except NoEquilibriumError as error:
         progress(f"no deflection shapes for this sheet: {error}")
-    return deflection_cache.shapes_cache(scene).path(folder)
+    _, stored = deflection_cache.list_stored(scene)[0]
+    return deflection_cache.shapes_cache(stored).path(folder)
 
 
 def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:

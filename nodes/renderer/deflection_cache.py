@@ -1,20 +1,21 @@
 """Compute and cache the deflection shapes of the pushed sheet.
 
-The computation takes half a minute. Its result depends only on the scene.
+The computation takes half a minute. Shapes are stored for a few radii of the finger and widths of
+the sheet. Shapes between two stored radii are interpolated, and shapes of another width are scaled.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.background import enter_background
-from flexsheet.nodes.cache import Specification, cached
+from flexsheet.nodes.cache import Specification, cached, load_cached
 from flexsheet.nodes.models.sheet.indentation import (
     IndentationBasis,
     IndentationCase,
@@ -36,6 +37,12 @@ FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
 MAX_DEPTH_RATIO = 1.2
 """Ratio of the maximum push depth in the computation to the scene's push depth."""
 
+RADIUS_STEP_M, FIRST_RADIUS_M = 0.002, 0.003
+"""Difference between successive stored radii of the finger, and their minimum."""
+
+WIDTH_STEP_M = 0.005
+"""Difference between successive stored widths of the sheet."""
+
 Progress = Callable[[int, int], None]
 
 
@@ -52,7 +59,7 @@ def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
 
 
 def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
-    """Return how the scene's deflection shapes are cached: key, computation inputs and format.
+    """Return how the shapes of a scene of `list_stored` are cached: key, inputs and format.
 
     The shapes do not depend on the sheet's thickness and Young's modulus.
     """
@@ -81,14 +88,69 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
     )
 
 
+def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
+    """Return the scenes whose shapes are stored, each with its weight in the scene's shapes."""
+    width_m = WIDTH_STEP_M * max(round(scene.sheet.width_m / WIDTH_STEP_M), 1)
+    sheet = scene.sheet.model_copy(update={"width_m": round(width_m, 6)})
+    steps = max(scene.finger.radius_m - FIRST_RADIUS_M, 0.0) / RADIUS_STEP_M
+    below = int(np.floor(steps + 1e-6))
+    above = steps - below
+    weights = [(below, 1.0 - above), (below + 1, above)] if above > 1e-6 else [(below, 1.0)]
+    found = []
+    for number, weight in weights:
+        radius_m = round(FIRST_RADIUS_M + number * RADIUS_STEP_M, 6)
+        finger = scene.finger.model_copy(update={"radius_m": radius_m})
+        found.append((weight, scene.model_copy(update={"sheet": sheet, "finger": finger})))
+    return found
+
+
+def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> IndentationBasis:
+    """Return the shapes of a scene from the weighted shapes of `list_stored`."""
+    rubber, _ = required_shapes(scene)
+    stored = parts[0][1]
+    wider = rubber.width_m / stored.rubber.width_m
+    modes = np.concatenate([basis.modes for _, basis in parts])
+    return replace(
+        stored,
+        rubber=rubber,
+        finger_radius_m=scene.finger.radius_m,
+        xs_m=wider * stored.xs_m,
+        modes=modes * np.array([wider, 1.0, 1.0]),
+        coefficients=np.concatenate(
+            [weight * basis.coefficients for weight, basis in parts], axis=-1
+        ),
+    )
+
+
+def load(scene: Scene, cache_dir: Path | None) -> IndentationBasis | None:
+    """Return the scene's deflection shapes from the cache; None if they are not stored."""
+    parts = []
+    for weight, stored in list_stored(scene):
+        basis = load_cached(shapes_cache(stored), cache_dir)
+        if basis is None:
+            return None
+        parts.append((weight, basis))
+    return _combine(scene, parts)
+
+
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> IndentationBasis:
-    """Load the scene's deflection shapes from the cache; if absent, compute and store them.
+    """Return the scene's deflection shapes; compute and store those that are not in the cache.
 
     The computation uses all cores. cache_dir: folder of the cache; None: the user's cache.
     progress: called with the number of solved pushes and their total number.
     """
+    return _combine(
+        scene,
+        [
+            (weight, _load_or_solve(stored, cache_dir, progress))
+            for weight, stored in list_stored(scene)
+        ],
+    )
+
+
+def _load_or_solve(scene: Scene, cache_dir: Path | None, progress: Progress) -> IndentationBasis:
     rubber, within = required_shapes(scene)
 
     def solve_all(pushes: Sequence[IndentationCase]) -> Iterator[Floats]:

@@ -19,7 +19,6 @@ from flexsheet.messages.types import (
     SoftBody,
 )
 from flexsheet.nodes import NodeRole, OmissionReason
-from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
@@ -95,7 +94,7 @@ class Renderer(Node):
             self._output.context,
             spacing_m=given.spacing_m,
             samples=given.samples,
-            basis=load_cached(deflection_cache.shapes_cache(scene), given.cache_dir),
+            basis=deflection_cache.load(scene, given.cache_dir),
             sheet_shape=resolve_method(
                 given.sheet_shape, scene.methods.sheet_shape, "reduced_order"
             ),

@@ -190,8 +190,9 @@ class TwinBoard:
     def _through_lens(self, fine: Singles) -> Singles:
         spread = RAYS * self.sensor.blur_px
         smooth = cv2.GaussianBlur(fine, (0, 0), spread, borderType=cv2.BORDER_REPLICATE)
-        height, width = fine.shape[0] // RAYS, fine.shape[1] // RAYS
-        return np.asarray(smooth.reshape(height, RAYS, width, RAYS).mean(axis=(1, 3)), np.float32)
+        size = fine.shape[1] // RAYS, fine.shape[0] // RAYS
+        # This interpolation averages the rays of each pixel.
+        return np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_AREA), np.float32)
 
     def _seen(self, rays: Singles, eye_from_board: Floats) -> tuple[Singles, Singles]:
         board = self.board
@@ -201,13 +202,12 @@ class TwinBoard:
         squares = np.asarray(in_squares + np.float32(1.0), dtype=np.float32)
         counts = (board.columns + 1, board.rows + 1)
         signs = []
-        inside = printed = np.ones(rays.shape[:2], dtype=np.float64)
+        inside = printed = np.ones(rays.shape[:2], dtype=np.float32)
         for axis, count in enumerate(counts):
             place = squares[..., axis]
-            rise = np.gradient(place)
-            width = np.hypot(rise[0], rise[1])
+            width = _measure_rise(place)
             line = np.clip(np.rint(place), 1, count - 1)
-            flip = 1.0 - 2.0 * np.mod(line, 2.0)
+            flip = 1.0 - 2.0 * (line.astype(np.int8) & 1).astype(np.float32)
             signs.append(flip * np.clip(2.0 * (place - line) / width, -1.0, 1.0))
             edge = np.minimum(place, count - place)
             printed = printed * np.clip(0.5 + edge / width, 0.0, 1.0)
@@ -266,8 +266,8 @@ class TwinBoard:
         while not self._shown(posed(out)):
             depth_m *= 1.1
         for axis in range(2):
-            tries = [np.where(np.arange(2) == axis, share, out) for share in np.linspace(0, 1, 41)]
-            out = [shares for shares in tries if self._shown(posed(shares))][-1]
+            tries = [np.where(np.arange(2) == axis, share, out) for share in np.linspace(1, 0, 41)]
+            out = next(shares for shares in tries if self._shown(posed(shares)))
         return posed(out)
 
     def _shown(self, left_from_board: Floats) -> bool:
@@ -284,6 +284,18 @@ class TwinBoard:
             np.mean(((view >= MARGIN_PX) & (view <= size - 1 - MARGIN_PX)).all(axis=1)) >= needed
             for view in views
         )
+
+
+def _measure_rise(place: Singles) -> Singles:
+    """Return by how much values on rays (rows, columns) change from one ray to the next.
+
+    The change varies little within a pixel, so that it is computed at one ray of each pixel.
+    """
+    rows, columns = place.shape
+    step = RAYS if min(rows, columns) >= 2 * RAYS else 1
+    rise = np.gradient(place[::step, ::step])
+    width = np.hypot(rise[0], rise[1]) / np.float32(step)
+    return np.repeat(np.repeat(width, step, axis=0), step, axis=1)
 
 
 def _markers(board: Board) -> NDArray[np.bool_]:

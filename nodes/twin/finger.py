@@ -8,12 +8,14 @@ the path was given, unless stated otherwise.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import numpy as np
 import scipy
 
+from flexsheet.messages.apparatus import FingerTruth
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import PathJoin
 from flexsheet.nodes.arrays import Floats
@@ -294,6 +296,19 @@ class FingerMotion:
             tremor=SineSum.drawn(tremor_band_hz, generator),
         )
 
+    @staticmethod
+    def of(finger: FingerTruth | None, position: Floats, *, seed: int) -> FingerMotion:
+        """Make a finger that rests at `position`, with the tremor of an apparatus if given."""
+        if finger is None:
+            return FingerMotion.resting(position, seed=seed)
+        middle_hz, half_hz = finger.tremor_frequency_hz, 0.5 * finger.tremor_width_hz
+        return FingerMotion.resting(
+            position,
+            seed=seed,
+            wander_band_hz=(WANDER_BAND_HZ[0], finger.voluntary_bandwidth_hz),
+            tremor_band_hz=(middle_hz - half_hz, middle_hz + half_hz),
+        )
+
     def followed_by(
         self,
         at_s: float,
@@ -372,6 +387,13 @@ class FingerMotion:
             path_time_s=path_time_s,
             path_done=path_time_s >= self.path.duration_s,
         )
+
+
+def find_tremor_m(finger: FingerTruth | None, path_tremor_m: float) -> float:
+    """Return the tremor amplitude on a path: that of the apparatus if both state a tremor."""
+    if finger is None or finger.tremor_rms_m is None or not path_tremor_m:
+        return path_tremor_m
+    return math.sqrt(2.0) * finger.tremor_rms_m
 
 
 def minimum_jerk_profile(s: Real) -> tuple[Real, Real]:

@@ -7,7 +7,6 @@ other nodes assume.
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -18,6 +17,7 @@ import numpy as np
 import scipy
 from pydantic import Field
 
+from flexsheet.messages.apparatus import FingerTruth
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
 from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
@@ -26,7 +26,7 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
-from flexsheet.nodes.twin.finger import WANDER_BAND_HZ, FingerMotion, FingerState
+from flexsheet.nodes.twin.finger import FingerMotion, FingerState, find_tremor_m
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, HandImpedance, TrueSheet
 from flexsheet.nodes.twin.lit_marks import LitMarks
 from flexsheet.nodes.twin.nail import Nail
@@ -131,7 +131,7 @@ class TwinFingerNode(Node):
         true_scene = apply_apparatus(scene, truth)
         if self.camera is None:
             rest = np.array(self.parameters.rest_world_m)
-            self.motion = self._make_resting(rest)
+            self.motion = FingerMotion.of(self._true_finger, rest, seed=self.parameters.seed)
             self.motion_from_ns = self.clock.now_ns()
         self.camera = TwinCamera(
             make_true_camera(true_scene.camera),
@@ -197,25 +197,16 @@ class TwinFingerNode(Node):
         if self.lit_marks is not None:
             self.lit_marks.on_frame(frame)
 
-    def _make_resting(self, rest: Floats) -> FingerMotion:
-        """Make a finger that rests at `rest`, with the tremor of the apparatus."""
-        given = self.parameters
-        if given.apparatus is None:
-            return FingerMotion.resting(rest, seed=given.seed)
-        finger = given.apparatus.finger
-        middle_hz, half_hz = finger.tremor_frequency_hz, 0.5 * finger.tremor_width_hz
-        return FingerMotion.resting(
-            rest,
-            seed=given.seed,
-            wander_band_hz=(WANDER_BAND_HZ[0], finger.voluntary_bandwidth_hz),
-            tremor_band_hz=(middle_hz - half_hz, middle_hz + half_hz),
-        )
-
     def on_twin__finger_path(self, path: FingerPath, header: Header) -> None:
         coupled = self.parameters.hand == "prescribed" or self.coupled is not None
         self.waiting = path
         if self.camera is not None and coupled:
             self._follow_waiting()
+
+    @property
+    def _true_finger(self) -> FingerTruth | None:
+        apparatus = self.parameters.apparatus
+        return None if apparatus is None else apparatus.finger
 
     def _follow(self, path: FingerPath) -> None:
         """Start to follow a path now.
@@ -230,19 +221,12 @@ class TwinFingerNode(Node):
             times_s=path.times_s,
             points=path.positions_world_m,
             wander_m=path.wander_m,
-            tremor_m=self._tremor_m(path),
+            tremor_m=find_tremor_m(self._true_finger, path.tremor_m),
             max_speed_m_per_s=self.max_speed_m_per_s,
             joined_by=path.joined_by,
         )
         self.motion_from_ns, self.path_label = now_ns, path.label
         self.path_stroke_s = path.stroke_s
-
-    def _tremor_m(self, path: FingerPath) -> float:
-        """Return the tremor amplitude on a path: that of the apparatus if both state a tremor."""
-        given = self.parameters.apparatus
-        if given is None or given.finger.tremor_rms_m is None or not path.tremor_m:
-            return path.tremor_m
-        return math.sqrt(2.0) * given.finger.tremor_rms_m
 
     def truth(self, at_ns: int) -> FingerState:
         """Return the true state of the fingertip at a time of this node's clock."""

@@ -17,6 +17,7 @@ the limit of Coulomb friction is exceeded.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,8 +45,9 @@ MAX_STEP_RADII = 0.7
 """Maximum advance of the finger per step, in radii; in a longer step it could cross the sheet."""
 
 MAX_ITERATIONS = 80
-MAX_FRICTION_ROUNDS = 12
-"""Maximum number of equilibria that are solved per step of the finger while nodes slip."""
+UNDAMPED_ROUNDS, MAX_FRICTION_ROUNDS = 6, 20
+"""Maximum number of equilibria that are solved per step of the finger while nodes slip, and the
+number after which the changes of the friction forces are halved, since they may alternate."""
 FRICTION_TOLERANCE = 0.01
 """Relative change of the friction forces between two equilibria below which they are accepted."""
 GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
@@ -383,11 +385,12 @@ class _Finger:
         derivative = pressed[:, None, None] * outward[:, :, None] * outward[:, None, :]
         return gradient, derivative + fixed[:, None, None] * np.eye(3)
 
-    def release(self, positions: Floats) -> bool:
+    def release(self, positions: Floats, share: float) -> bool:
         """Release the nodes whose friction exceeds the Coulomb limit, so that they slip.
 
         Return whether forces changed, so that a new equilibrium must be solved. The friction force
         of a slipping node keeps its direction; its size is the coefficient times the normal force.
+        share: fraction of the change of the friction forces that is applied.
         """
         if self._coefficient is None:
             return False
@@ -402,7 +405,8 @@ class _Finger:
         begins = self._stuck & (size_n > limit_n)
         moving = (slipping & (depth > 0.0)) | begins
         direction = tangential / np.maximum(size_n, 1e-15)[:, None]
-        self._friction_n = np.where(moving[:, None], limit_n[:, None] * direction, 0.0)
+        wanted = np.where(moving[:, None], limit_n[:, None] * direction, 0.0)
+        self._friction_n = before + share * (wanted - before)
         self._stuck = self._stuck & ~begins
         change = np.linalg.norm(self._friction_n - before)
         return bool(begins.any() or change > FRICTION_TOLERANCE * np.linalg.norm(before))
@@ -421,10 +425,40 @@ def solve(
 ) -> DeformedSheet:
     """Solve the equilibrium of the sheet between its edges, pushed by a fingertip.
 
+    finger_tip: the point (3,) of the fingertip sphere that is farthest from the user. Without it,
+    or if it lies in front of or beside the sheet, there is no contact. The other arguments, and the
+    errors, are those of `solve_path`.
+    """
+    return solve_path(
+        rubber,
+        world_from_left_edge,
+        world_from_right_edge,
+        finger_tips=() if finger_tip is None else (finger_tip,),
+        finger_radius_m=finger_radius_m,
+        friction_coefficient=friction_coefficient,
+        cells=cells,
+        slack_tension=slack_tension,
+    )[-1]
+
+
+def solve_path(
+    rubber: TrueRubber,
+    world_from_left_edge: Floats,
+    world_from_right_edge: Floats,
+    *,
+    finger_tips: Sequence[Floats],
+    finger_radius_m: float = 0.007,
+    friction_coefficient: float | None = None,
+    cells: int = CELLS,
+    slack_tension: float = SLACK_TENSION,
+) -> list[DeformedSheet]:
+    """Solve the equilibria of the sheet while a fingertip advances through the given positions.
+
+    Returns the sheet at each position; without any, the sheet that nothing touches.
+
     world_from_left_edge, world_from_right_edge: (4, 4) poses of the clamped edges; the origin is
     the centre of the edge, y points along it.
-    finger_tip: the point (3,) of the fingertip sphere that is farthest from the user. Without it,
-    or if it lies in front of or beside the sheet, there is no contact.
+    finger_tips: positions (3,) on one normal of the sheet, in the order of their depths.
     friction_coefficient: Coulomb coefficient between finger and sheet; None: touched nodes stick.
     cells: number of intervals between nodes along each side; even.
     slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a barely
@@ -445,14 +479,13 @@ def solve(
     y_axis = np.cross(normal, x_axis)
     middle = 0.5 * (left[:3, 3] + right[:3, 3])
 
-    depth = 0.0
     focus: tuple[float | None, float | None] = (None, None)
-    if finger_tip is not None:
-        offset = finger_tip - middle
+    tips = list(finger_tips)
+    if tips:
+        offset = tips[-1] - middle
         across, along_edge = float(offset @ x_axis / distance), float(offset @ y_axis)
         over = abs(across) < 0.5 and abs(along_edge) < 0.5 * rubber.height_m
-        depth = float(-offset @ normal) if over else 0.0
-        if depth > 0.0:
+        if over and offset @ normal < 0.0:
             focus = (
                 (across + 0.5) * rubber.width_m,
                 along_edge + 0.5 * rubber.height_m,
@@ -470,14 +503,19 @@ def solve(
     )
     positions, iterations = _relax(mesh, flat.reshape(-1, 3), None)
 
-    finger = None
-    if finger_tip is not None and depth > 0.0:
-        steps = int(np.ceil(depth / (MAX_STEP_RADII * finger_radius_m)))
-        advance = -(depth / steps) * normal
-        carried = _cone(mesh, focus, rubber)
-        stuck = np.zeros(len(positions), bool)
+    if focus[0] is None:
+        return [_describe(mesh, positions, None, iterations)] * max(len(tips), 1)
+    carried = _cone(mesh, focus, rubber)
+    stuck = np.zeros(len(positions), bool)
+    finger: _Finger | None = None
+    solved = []
+    before_m = 0.0
+    for tip in tips:
+        depth = float((middle - tip) @ normal)
+        steps = int(np.ceil((depth - before_m) / (MAX_STEP_RADII * finger_radius_m)))
+        advance = -((depth - before_m) / max(steps, 1)) * normal
         for step in range(1, steps + 1):
-            centre = finger_tip + finger_radius_m * normal - (steps - step) * advance
+            centre = tip + finger_radius_m * normal - (steps - step) * advance
             positions = positions + np.where(stuck, 1.0, carried)[:, None] * advance
             finger = _Finger(
                 centre,
@@ -490,7 +528,7 @@ def solve(
             positions, count = _relax(mesh, positions, finger)
             iterations += count
             rounds = 0
-            while finger.release(positions):
+            while finger.release(positions, 1.0 if rounds < UNDAMPED_ROUNDS else 0.5):
                 rounds += 1
                 if rounds > MAX_FRICTION_ROUNDS:
                     raise NotConvergedError(
@@ -500,7 +538,14 @@ def solve(
                 positions, count = _relax(mesh, positions, finger)
                 iterations += count
             stuck = finger.touching(positions)
+        before_m = max(depth, before_m)
+        solved.append(_describe(mesh, positions, finger, iterations))
+    return solved
 
+
+def _describe(
+    mesh: _Mesh, positions: Floats, finger: _Finger | None, iterations: int
+) -> DeformedSheet:
     gradient, _ = mesh.forces(positions)
     at_nodes = gradient.reshape(*mesh.shape, 3)
     contact = np.zeros(3) if finger is None else -finger.forces(positions)[0].sum(axis=0)

@@ -36,6 +36,9 @@ the level where black is projected."""
 SPREAD_PX = 0.5
 """Blur (standard deviation) of a projected pixel on the sheet, due to lens and rubber."""
 
+WINDOW_MARGIN = 0.05
+"""Margin about the sheet's outline in an image, as slopes x/z and y/z of the rays."""
+
 FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
 OFFSET_DEVIATION_M, ROTATION_DEVIATION_RAD = 0.004, 0.006
 RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
@@ -147,18 +150,47 @@ class LitSheet:
         sheet: Floats,
         bend: Floats | None,
     ) -> list[Image]:
-        x, y, inside = self._lit_by(rays, world_from_eye, sheet, bend)
-        height, width = self._camera.height_px, self._camera.width_px
-        pictures = []
+        window = self._find_window(rays, world_from_eye, sheet)
+        fine = tuple(slice(RAYS * side.start, RAYS * side.stop) for side in window)
+        x, y, inside = self._lit_by(rays[fine], world_from_eye, sheet, bend)
+        height, width = (side.stop - side.start for side in window)
+        pictures: list[Image] = []
         for pattern in patterns:
             thrown = cv2.GaussianBlur(pattern.astype(np.float32), (0, 0), SPREAD_PX)
             light = cv2.remap(thrown, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-            level = np.where(inside, DARK_LEVEL + LIT_LEVEL / 255.0 * light, ROOM_LEVEL)
+            level = np.where(inside, np.float32(LIT_LEVEL / 255.0) * light + DARK_LEVEL, ROOM_LEVEL)
             level = cv2.GaussianBlur(level.astype(np.float32), (0, 0), RAYS * self._sensor.blur_px)
-            mean = level.reshape(height, RAYS, width, RAYS).mean(axis=(1, 3), dtype=np.float32)
+            # This interpolation averages the rays of each pixel.
+            mean = np.asarray(
+                cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32
+            )
             noise = self._random.standard_normal(mean.shape, dtype=np.float32)
-            pictures.append(quantize(mean + self._sensor.noise(mean) * noise))
+            picture = np.full(
+                (self._camera.height_px, self._camera.width_px), round(ROOM_LEVEL), np.uint8
+            )
+            picture[window] = quantize(mean + self._sensor.noise(mean) * noise)
+            pictures.append(picture)
         return pictures
+
+    def _find_window(
+        self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats
+    ) -> tuple[slice, slice]:
+        """Return the rows and columns of the image that can show the sheet; all if it is behind."""
+        height, width = self._camera.height_px, self._camera.width_px
+        half = 0.5 * np.array([self._scene.sheet.width_m, self._scene.sheet.height_m])
+        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0.0]
+        in_eye = apply(inverse(world_from_eye) @ world_from_sheet, corners)
+        if in_eye[:, 2].min() <= 0.0:
+            return slice(0, height), slice(0, width)
+        slopes = in_eye[:, :2] / in_eye[:, 2:]
+        # The margin covers the bend of the sheet and the blur of the lens.
+        low, high = slopes.min(axis=0) - WINDOW_MARGIN, slopes.max(axis=0) + WINDOW_MARGIN
+        middle = rays[RAYS // 2 :: RAYS, RAYS // 2 :: RAYS]
+        seen = ((middle >= low) & (middle <= high)).all(axis=2)
+        rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+        if not len(rows):
+            return slice(0, 1), slice(0, 1)
+        return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
     def _lit_by(
         self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats, bend: Floats | None

@@ -1,0 +1,51 @@
+"""Read the calibrations that the nodes of a graph use in addition to the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.launch.plans.plan_model import ResolvedGraph
+from flexsheet.messages.calibration import StereoCalibration, load_calibration
+from flexsheet.messages.marker_calibration import MarkerCalibration, load_marker_calibration
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
+from flexsheet.nodes import node_class
+from flexsheet.nodes.models.finger_frame import world_from_finger
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class NodeCalibrations:
+    """Calibrations that the nodes use in addition to the scene."""
+
+    stereo: StereoCalibration | None = None
+    sheet: SheetCalibration | None = None
+    marker: MarkerCalibration | None = None
+
+    @staticmethod
+    def of(plan: ResolvedGraph) -> NodeCalibrations:
+        """Read the calibration files that the plan's triangulator and planner use."""
+        stereo: StereoCalibration | None = None
+        sheet: SheetCalibration | None = None
+        marker: MarkerCalibration | None = None
+        for node in plan.nodes.values():
+            kind = node_class(node.type)
+            if issubclass(kind, node_class("triangulator")):
+                if path := node.parameters["calibration"]:
+                    stereo = load_calibration(Path(path))
+                if path := node.parameters["marker_calibration"]:
+                    marker = load_marker_calibration(Path(path))
+            if issubclass(kind, node_class("planner")) and node.parameters["sheet_calibration"]:
+                sheet = load_sheet_calibration(Path(node.parameters["sheet_calibration"]))
+        return NodeCalibrations(stereo, sheet, marker)
+
+    def find_marker_offset_m(self, scene: Scene) -> Floats:
+        """Return the vector (3,) from the finger's pad to its marker in the world, as measured."""
+        marker = scene.finger if self.marker is None else self.marker
+        turned = world_from_finger(scene.finger.direction_world)
+        return np.asarray(turned @ np.array(marker.marker_from_pad_m))
