@@ -475,15 +475,3 @@ async def test_slow_cameras_are_tracked(seed: int) -> None:
     tip = tracker.messages(Fingertip)[-1][0]
     assert (tip.valid, tip.state) == (True, "tracking"), tip.reason
     assert np.linalg.norm(tip.position_world_m - truth) < 1.5e-3
-
-
-def test_a_flat_marker_lies_on_the_surface_of_the_finger() -> None:
-    """A marker in front of the finger would appear beside its outline, where it is not detected."""
-    for seed in range(8):
-        apparatus = sample_apparatus(SCENE, seed)
-        nail = Nail.of(apparatus.finger)
-        radius_m = apply_apparatus(SCENE, apparatus).finger.radius_m
-        from_axis = nail.marker_offset_m - nail.find_axis_shift_m(radius_m)
-        along = nail.direction / np.linalg.norm(nail.direction)
-        assert np.linalg.norm(np.cross(from_axis, along)) == pytest.approx(radius_m)
-    assert not Nail().find_axis_shift_m(0.007).any()

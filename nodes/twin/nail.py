@@ -51,21 +51,6 @@ class Nail:
             direction=direction,
         )
 
-    def find_axis_shift_m(self, finger_radius_m: float) -> Floats:
-        """Return the vector (3,) from the fingertip to the start of the finger's axis.
-
-        The surface of a round finger with this axis passes through a flat marker, so that the
-        marker lies on the nail, as in reality, and not in front of or inside the finger.
-        """
-        if self.marker_normal is None:
-            return np.zeros(3)
-        along = self.direction / np.linalg.norm(self.direction)
-        across = self.marker_offset_m - (self.marker_offset_m @ along) * along
-        height_m = float(np.linalg.norm(across))
-        if height_m < 1e-6:
-            return np.zeros(3)
-        return np.asarray((1.0 - finger_radius_m / height_m) * across)
-
     @property
     def knuckle_shift_m(self) -> Floats:
         """Return the vector (3,) by which the finger's tilt displaces the knuckle and the hand."""

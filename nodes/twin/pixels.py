@@ -337,8 +337,7 @@ class TwinCamera:
             radii_m = (limb.start_radius_m, limb.end_radius_m)
             moved = way if limb.carried else np.zeros(3)
             windows.append(self._limb(eye, ends, radii_m, limb.level, moved, lit=True))
-        start = tip + self.nail.find_axis_shift_m(self.finger_radius_m)
-        ends = np.stack([start, start + FINGER_LENGTH_M * self.nail.direction])
+        ends = np.stack([tip, tip + FINGER_LENGTH_M * self.nail.direction])
         radii_m = (self.finger_radius_m, 1.2 * self.finger_radius_m)
         windows.append(self._limb(eye, ends, radii_m, sensor.finger_level, way, lit=True))
         if marker:
