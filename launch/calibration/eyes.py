@@ -13,6 +13,7 @@ import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -157,7 +158,7 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
         """Return the vectors (n, 3) from the lines of sight through the beads to the crosses."""
         directions, far = beads - eye, crosses - eye
         directions /= np.linalg.norm(directions, axis=1)[:, None]
-        return far - np.einsum("ni,ni->n", far, directions)[:, None] * directions
+        return np.asarray(far - np.einsum("ni,ni->n", far, directions)[:, None] * directions)
 
     scale_m = 1e-3
     for _ in range(2):
@@ -224,6 +225,10 @@ def _parse(where: str, name: str, text: str | None, problems: list[Problem]) -> 
     return value
 
 
+def _rest(position: Floats, _time_s: float) -> Floats:
+    return position
+
+
 def simulate_alignments(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> list[Alignment]:
@@ -253,7 +258,7 @@ def simulate_alignments(
         if cross is None:
             continue
         images = camera.picture(
-            lambda _, at=bead: at, exposure_s=scene.camera.exposure_s, lit_points=cross[None]
+            partial(_rest, bead), exposure_s=scene.camera.exposure_s, lit_points=cross[None]
         )
         seen = [detector.find(*images, near_world_m=point) for point in (bead, cross)]
         if seen[0] is not None and seen[1] is not None:

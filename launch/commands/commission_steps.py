@@ -515,6 +515,7 @@ def run_verification(lab: Commissioning, seconds: float) -> dict[str, Any]:
         assert apparatus is not None
         evaluator = OfflineEvaluator(scene, NodeCalibrations.of(plan))
         at_rest[name] = evaluator.evaluate(apparatus).figures()
+    assert apparatus is not None
     crosses = evaluator.compare_crosses(apparatus)
     draw_cross_errors(crosses, lab.folder / CROSSES_FILE)
     return {
