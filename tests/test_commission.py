@@ -16,10 +16,12 @@ from flexsheet.launch.calibration.arm_poses import SimulatedArm, make_lens_rig
 from flexsheet.launch.calibration.commission import (
     CommissionError,
     Commissioning,
+    NodeValue,
     StepName,
     StepResult,
     list_doubts,
 )
+from flexsheet.launch.calibration.delays import DelaysError, MeasuredLag, read_measured_lags
 from flexsheet.launch.calibration.hand_eye import BoardDetection, CornerView, calibrate_base
 from flexsheet.launch.calibration.prediction import Knowledge, PredictedError, draw_apparatus
 from flexsheet.launch.calibration.sheet_rows import simulate_rows
@@ -41,7 +43,11 @@ from flexsheet.launch.experiments.trial import run_robustness_trial
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, identify_scene, nominal_apparatus
+from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.base import Header
 from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import ArmState
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.models.rigid import (
     apply,
@@ -55,6 +61,7 @@ from flexsheet.nodes.twin import projector as twin_projector
 from flexsheet.nodes.twin.rig import make_true_camera, pixels_of
 from flexsheet.nodes.twin.tolerance_table import sample_apparatus
 from flexsheet.nodes.twin.truth import align_world_to_camera, apply_apparatus
+from tests.arm_states import arm_state
 from tests.rv_1a import CENTRE_RAD
 
 Floats = NDArray[np.float64]
@@ -541,7 +548,7 @@ def test_real_devices_stop_at_the_first_step_without_data(
     assert code == 1
     assert not found["complete"]
     assert INSTRUCTIONS[StepName.CAMERA] in found["next"]
-    steps = ("camera", "arms", "sheet", "projector", "edges")
+    steps = ("camera", "arms", "sheet", "projector", "edges", "eyes", "delays")
     skips = [part for name in steps for part in ("--skip", f"{name}=as in the data sheet")]
     header = "marker_x_mm,marker_y_mm,marker_z_mm,point_x_mm,point_y_mm,point_z_mm"
     rows = []
@@ -554,7 +561,8 @@ def test_real_devices_stop_at_the_first_step_without_data(
     data = ("--data", f"marker={file}", "--finger-radius-mm", "8.5")
     code, found, _ = invoke(*folder, *skips, *data)
     assert code == 1
-    assert found["steps"][-1]["name"] == "marker"
+    marker = next(one for one in found["steps"] if one["name"] == "marker")
+    assert marker["within_limit"]
     assert INSTRUCTIONS[StepName.VERIFICATION] in found["next"]
     assert load_scene(Path(found["scene_file"])).finger.radius_m == 0.0085
     stroke = tmp_path / "stroke.json"
@@ -657,3 +665,39 @@ def test_a_simulated_laboratory_is_commissioned_end_to_end(tmp_path: Path) -> No
     at_rest = found["verification"]["at_rest"]
     for metric in ("sheet_mm", "image_mm", "force_percent", "fingertip_mm"):
         assert at_rest["after"][metric] < 0.5 * at_rest["before"][metric], metric
+
+
+# Servo lags
+
+
+def test_measured_lags_go_to_the_bridge_of_each_arm(tmp_path: Path) -> None:
+    lab = open_lab(tmp_path)
+    values = tuple(
+        NodeValue(node_type="arm_bridge", parameter="servo_lag_s", value=value, side=side)
+        for side, value in (("left", 0.041), ("right", 0.052))
+    )
+    lab.run(StepName.DELAYS, lambda _: result(node_values=values))
+    nodes = load_graph(lab.launch_copy).nodes
+    lags = [nodes[f"arm_{side}_bridge"].parameters["servo_lag_s"] for side in ("left", "right")]
+    assert lags == [0.041, 0.052]
+
+
+def test_lags_are_read_from_the_bag_of_a_stroke(tmp_path: Path) -> None:
+    def write(path: Path, *states: ArmState) -> Path:
+        with BagWriter(path) as writer:
+            for number, state in enumerate(states, start=1):
+                header = Header(number, number, number, "test", "bridge", 1)
+                writer.write(TOPICS[f"arm_{state.side}"], state, header, number)
+        return path
+
+    known = {"servo_lag_uncertainty_s": 0.001}
+    states = [
+        arm_state("left", servo_lag_s=0.030),
+        arm_state("left", servo_lag_s=0.040, **known),
+        arm_state("left", servo_lag_s=0.041, **known),
+        arm_state("right", servo_lag_s=0.052, **known),
+    ]
+    found = read_measured_lags(write(tmp_path / "stroke.mcap", *states))
+    assert found == {"left": MeasuredLag(0.041, 0.001), "right": MeasuredLag(0.052, 0.001)}
+    with pytest.raises(DelaysError, match="the right arm's bridge measured no servo lag"):
+        read_measured_lags(write(tmp_path / "short.mcap", *states[:3]))

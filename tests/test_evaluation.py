@@ -25,6 +25,7 @@ from flexsheet.launch.experiments.follow import (
     find_least_deviation,
 )
 from flexsheet.launch.experiments.offline import (
+    CROSS_RATIOS,
     Evaluation,
     Metric,
     NodeCalibrations,
@@ -48,6 +49,7 @@ from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import SelfCheck, Status, SuspectedCause
 from flexsheet.nodes.twin.force_history import compute_history_ratios
+from flexsheet.nodes.twin.paths import touchable
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
     TOLERANCES,
@@ -229,6 +231,28 @@ def test_a_late_stamp_moves_the_fingertip_by_speed_times_time(
     late = evaluator.evaluate(changed(scene, "camera", stamp_offset_s=0.005), FINGERTIP)
     expected_mm = 1e3 * 0.005 * scene.working_range.speed_m_per_s
     assert late.change_from(nominal)[Metric.FINGERTIP] == pytest.approx(expected_mm, rel=0.05)
+
+
+def test_crosses_are_seen_where_they_are_touched_unless_the_eyes_are_elsewhere(
+    scene: Scene, evaluator: OfflineEvaluator
+) -> None:
+    nominal = evaluator.compare_crosses(nominal_apparatus(scene))
+    assert nominal.errors_m.shape == (15, 2, 2)
+    assert nominal.figures()["max_mm"] < 0.2
+    # Eyes 10 mm further right see a point at the depth d behind the screen, and at the distance D
+    # from them, 10 mm d / (D + d) further right, but the cross on the sheet almost unmoved.
+    moved = evaluator.compare_crosses(changed(scene, "eyes", centre_offset_m=[0.01, 0.0, 0.0]))
+    radius_m = require_cylinder(scene).radius_m
+    angles = np.repeat(np.array(CROSS_RATIOS), 3) * 0.5 * touchable(scene)[1] / radius_m
+    depths_m = radius_m * (1.0 - np.cos(angles))
+    expected_m = -0.01 * depths_m / (scene.eyes.centre_world_m[2] + depths_m)
+    for eye in (0, 1):
+        change_m = moved.errors_m[:, eye] - nominal.errors_m[:, eye]
+        np.testing.assert_allclose(change_m[:, 0], expected_m, atol=3e-5)
+        np.testing.assert_allclose(change_m[:, 1], 0.0, atol=3e-5)
+    wider = evaluator.compare_crosses(changed(scene, "eyes", interocular_offset_m=0.01))
+    disparity_m = np.diff(wider.errors_m - nominal.errors_m, axis=1)[:, 0, 0]
+    np.testing.assert_allclose(disparity_m, expected_m, atol=3e-5)
 
 
 def test_the_nominal_sheet_is_tangent_and_a_shifted_pair_of_arms_is_not(

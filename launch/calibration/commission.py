@@ -24,11 +24,12 @@ from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.types import Side
 from flexsheet.nodes import node_class
 from flexsheet.nodes.twin.tolerance_table import set_value
 
 STATE_FILE, SCENE_FILE, LAUNCH_FILE = "commission.json", "scene.yaml", "launch.yaml"
-REPORT_FILE, APPARATUS_FILE = "report.md", "apparatus.yaml"
+REPORT_FILE, APPARATUS_FILE, CROSSES_FILE = "report.md", "apparatus.yaml", "co-location.png"
 
 
 class CommissionError(FlexsheetError, ValueError):
@@ -44,7 +45,8 @@ class StepName(StrEnum):
     camera: optics of the stereo camera. arms: poses of the arm bases in the frame of the camera.
     edges: pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of
     the flanges. sheet: force model of the sheet. projector: pose and lens of the projector. marker:
-    position of the marker on the finger. verification: errors during a stroke of the finger.
+    position of the marker on the finger. eyes: positions of the viewer's eyes. delays: servo lags
+    of the arms. verification: errors during a stroke of the finger.
     """
 
     CAMERA = "camera"
@@ -53,10 +55,21 @@ class StepName(StrEnum):
     SHEET = "sheet"
     PROJECTOR = "projector"
     MARKER = "marker"
+    EYES = "eyes"
+    DELAYS = "delays"
     VERIFICATION = "verification"
 
 
 STEPS = tuple(StepName)
+
+
+class NodeValue(LimitedModel):
+    """Measured value of a parameter, for all nodes of a type, or only for the one of an arm."""
+
+    node_type: str
+    parameter: str
+    value: float
+    side: Side | None = None
 
 
 class StepResult(LimitedModel):
@@ -66,7 +79,7 @@ class StepResult(LimitedModel):
     standard deviations, whose names end in their units. scene_values: values by dotted path in the
     scene. parameters: names of calibration files in the folder, by node type and parameter
     (TYPE.PARAMETER). figures: further results. covariances: covariance matrices by name, from which
-    errors are predicted.
+    errors are predicted. node_values: other measured parameters of nodes.
     """
 
     residual: float
@@ -76,6 +89,7 @@ class StepResult(LimitedModel):
     uncertainty: dict[str, float] = Field(default_factory=dict)
     scene_values: dict[str, Any] = Field(default_factory=dict)
     parameters: dict[str, str] = Field(default_factory=dict)
+    node_values: tuple[NodeValue, ...] = ()
     figures: dict[str, Any] = Field(default_factory=dict)
     covariances: dict[str, list[list[float]]] = Field(default_factory=dict)
 
@@ -242,8 +256,10 @@ class Commissioning:
     def _write_launch_file(self) -> None:
         graph = load_graph(self.launch_file)
         measured: dict[str, str] = {}
+        values: list[NodeValue] = []
         for result in self._results(STEPS):
             measured |= result.parameters
+            values += result.node_values
         with edit_yaml(self.launch_file, self.launch_copy) as tree:
             tree["scene"] = SCENE_FILE
             for name, spec in tree["nodes"].items():
@@ -256,6 +272,11 @@ class Commissioning:
                     kind, _, parameter = key.partition(".")
                     if issubclass(node_class(graph.nodes[name].type), node_class(kind)):
                         spec.setdefault("parameters", {})[parameter] = value
+                for one in values:
+                    node = graph.nodes[name]
+                    same = issubclass(node_class(node.type), node_class(one.node_type))
+                    if same and one.side in (None, node.parameters.get("side")):
+                        spec.setdefault("parameters", {})[one.parameter] = one.value
         read_document(self.launch_copy)
 
 
@@ -273,8 +294,8 @@ def _now() -> str:
 
 
 MEASURED_IN_OPERATION = (
-    "Servo lag and actuation delay of each arm, the camera's rate and the age of its images are "
-    "measured while the graph runs. The position of the eyes comes from the head tracker. No step "
+    "The actuation delay of each arm, the camera's rate and the age of its images are measured "
+    "while the graph runs. The positions of a head tracker replace the measured eyes. No step "
     "measures the delay of the projector and the time between exposure and timestamp."
 )
 
@@ -311,6 +332,8 @@ def format_report(state: State) -> str:
         lines += _format_verdict(verification.result.figures)
         lines += ["", "## Verification", "", "| figure | value |", "|---|---|"]
         lines += [f"| {key} | {value} |" for key, value in _flatten(verification.result.figures)]
+        if "co_location" in verification.result.figures:
+            lines += ["", f"![Seen crosses relative to touched points]({CROSSES_FILE})"]
     limits = _rank_uncertainties(state)
     lines += ["", "## What limits the accuracy", ""]
     lines += [f"- {text}" for text in limits] + advice + [f"- {MEASURED_IN_OPERATION}", ""]

@@ -122,7 +122,7 @@ def commission(
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate camera, arms, sheet, projector and marker in sequence, and verify the result.
+    """Calibrate camera, arms, sheet, projector, marker and eyes in sequence; verify the result.
 
     Finished steps are not repeated. With --apparatus, all devices are simulated. Otherwise the
     command stops at a step whose data are missing, with exit code 1, and states how to capture

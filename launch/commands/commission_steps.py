@@ -8,6 +8,7 @@ angles, the forces of a gauge, and the finger's radius.
 from __future__ import annotations
 
 import json
+import math
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,9 +20,11 @@ import numpy as np
 
 from flexsheet.launch.calibration.commission import (
     APPARATUS_FILE,
+    CROSSES_FILE,
     CommissionError,
     Commissioning,
     MissingDataError,
+    NodeValue,
     Step,
     StepName,
     StepResult,
@@ -72,6 +75,10 @@ INSTRUCTIONS: dict[StepName, str] = {
     "edges-capture`, and give --data edges=CSV",
     StepName.MARKER: "touch known points as for `flexsheet calibrate marker --rows`, and give "
     "--data marker=CSV; give the finger's radius with --finger-radius-mm",
+    StepName.EYES: "align a bead with projected crosses, with one eye closed, record the positions "
+    "of both, and give --data eyes=CSV",
+    StepName.DELAYS: "run `flexsheet experiment stroke --launch FOLDER/launch.yaml --json` with "
+    "the launch file of this folder, and give the bag that its output names with --data delays=BAG",
     StepName.VERIFICATION: "run `flexsheet experiment stroke --launch FOLDER/launch.yaml --json` "
     "with the launch file of this folder, and give its output with --data verification=JSON",
 }
@@ -142,6 +149,8 @@ class Laboratory:
             StepName.PROJECTOR: self.calibrate_projector,
             StepName.EDGES: self.calibrate_edges,
             StepName.MARKER: self.calibrate_marker,
+            StepName.EYES: self.calibrate_eyes,
+            StepName.DELAYS: self.measure_delays,
             StepName.VERIFICATION: self.verify,
         }
 
@@ -408,6 +417,74 @@ class Laboratory:
             parameters={"triangulator.marker_calibration": MARKER},
         )
 
+    def calibrate_eyes(self, lab: Commissioning) -> StepResult:
+        from flexsheet.launch.calibration.eyes import fit_eyes, read_alignments, simulate_alignments
+
+        scene = load_scene(lab.scene_copy)
+        stereo = lab.find_file(STEREO)
+        if self.apparatus is None:
+            alignments = read_alignments(self._find_data(StepName.EYES))
+        else:
+            optics = None if stereo is None else load_calibration(stereo)
+            alignments = simulate_alignments(
+                scene, self.apparatus, calibration=optics, seed=self.seed
+            )
+        found = fit_eyes(alignments, scene.eyes)
+        centre = [calibrate.round_digits(one) for one in found.eyes.centre_world_m]
+        std_mm = 1e3 * np.sqrt(np.diag(found.covariance_m2))
+        lateral_mm, depth_mm = float(np.linalg.norm(std_mm[:2])), float(std_mm[2])
+        # An error of the eyes displaces what lies behind the screen, here by the depth of a push.
+        behind_m, distance_m = scene.working_range.push_depth_m, found.eyes.centre_world_m[2]
+        across_m = 0.25 * scene.sheet.width_m
+        shift_mm = behind_m * math.hypot(lateral_mm, depth_mm * across_m / distance_m)
+        return StepResult(
+            residual=1e3 * found.angle_rms_rad,
+            unit="mrad",
+            limit=6.0,
+            advice="Use a chin rest, and align again with the bead at other positions.",
+            uncertainty={
+                "image_mm": float(shift_mm / (behind_m + distance_m)),
+            },
+            figures={
+                "eyes_lateral_std_mm": lateral_mm,
+                "eyes_depth_std_mm": depth_mm,
+                "interocular_std_mm": 1e3 * found.interocular_std_m,
+            },
+            scene_values={
+                "eyes.centre_world_m": centre,
+                "eyes.interocular_m": calibrate.round_digits(found.eyes.interocular_m),
+            },
+            covariances={"eyes_m2": found.covariance_m2.tolist()},
+        )
+
+    def measure_delays(self, lab: Commissioning) -> StepResult:
+        from flexsheet.launch.calibration.delays import (
+            measure_lags_in_simulation,
+            read_measured_lags,
+        )
+
+        if self.apparatus is None:
+            lags = read_measured_lags(self._find_data(StepName.DELAYS))
+        else:
+            lags = measure_lags_in_simulation(load_scene(lab.scene_copy), self.apparatus)
+        return StepResult(
+            residual=1e3 * max(lag.uncertainty_s for lag in lags.values()),
+            unit="ms",
+            limit=4.0,
+            advice="Repeat the stroke at the speed of use, and check that both arms follow it.",
+            uncertainty={f"{side}_lag_ms": 1e3 * lag.uncertainty_s for side, lag in lags.items()},
+            node_values=tuple(
+                NodeValue(
+                    node_type="arm_bridge",
+                    parameter="servo_lag_s",
+                    value=round(lag.lag_s, 4),
+                    side=side,
+                )
+                for side, lag in lags.items()
+            ),
+            figures={f"{side}_lag_ms": 1e3 * lag.lag_s for side, lag in lags.items()},
+        )
+
     def verify(self, lab: Commissioning) -> StepResult:
         """Measure the errors of the calibrated system in a stroke, and at rest if simulated."""
         from flexsheet.launch.calibration.prediction import predict_errors
@@ -465,6 +542,7 @@ def run_verification(
     simulated_time: run the stroke without a graph, and omit the errors before the calibration. No
     self-checks run then.
     """
+    from flexsheet.launch.experiments.maps import draw_cross_errors
     from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
     from flexsheet.launch.experiments.offline import OfflineEvaluator, exceeded_tolerances
     from flexsheet.launch.experiments.run import require_scene
@@ -496,9 +574,13 @@ def run_verification(
         assert apparatus is not None
         evaluator = OfflineEvaluator(scene, NodeCalibrations.of(plan))
         at_rest[name] = evaluator.evaluate(apparatus).figures()
+    assert apparatus is not None
+    crosses = evaluator.compare_crosses(apparatus)
+    draw_cross_errors(crosses, lab.folder / CROSSES_FILE)
     return {
         "stroke": stroke,
         "at_rest": at_rest,
+        "co_location": crosses.figures(),
         "out_of_tolerance": exceeded_tolerances(scene, at_rest["after"]),
         "flagged": stroke["flagged"],
     }

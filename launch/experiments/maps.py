@@ -15,11 +15,15 @@ from flexsheet.launch.experiments.image import (
     make_error_map,
     summarize_map,
 )
+from flexsheet.launch.experiments.offline import CrossErrors
 from flexsheet.launch.experiments.pictures import CORRECTION_NAMES
 from flexsheet.nodes.twin.error_map import ErrorMap
 
 MIN_MM, MAX_MM = 0.01, 10.0
 """Limits of the logarithmic colour scale."""
+
+CROSS_MAGNIFICATION = 20.0
+"""Factor by which the arrows of `draw_cross_errors` are longer than the errors."""
 
 
 def draw_error_maps(images: dict[str, EyeImage], series: Series, path: Path) -> None:
@@ -57,3 +61,33 @@ def _find_box(maps: list[ErrorMap]) -> tuple[slice, slice]:
         return slice(None), slice(None)
     rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+
+
+def draw_cross_errors(errors: CrossErrors, path: Path) -> None:
+    """Draw where both eyes see the projected crosses, relative to the touched points."""
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    axes = figure.subplots()
+    places_mm, errors_mm = 1e3 * errors.places_m, 1e3 * errors.errors_m
+    axes.plot(*places_mm.T, "+", color="0.3", label="touched point")
+    for number, (eye, colour) in enumerate((("left", "tab:blue"), ("right", "tab:orange"))):
+        axes.quiver(
+            *places_mm.T,
+            *errors_mm[:, number].T,
+            angles="xy",
+            scale_units="xy",
+            scale=1.0 / CROSS_MAGNIFICATION,
+            width=0.004,
+            color=colour,
+            label=f"{eye} eye",
+        )
+    axes.set_aspect("equal")
+    axes.margins(0.15)
+    axes.set_xlabel("x on the screen, mm")
+    axes.set_ylabel("y on the screen, mm")
+    axes.legend(fontsize=8)
+    found = errors.figures()
+    axes.set_title(
+        f"Seen crosses minus touched points, x {CROSS_MAGNIFICATION:g}: mean "
+        f"{found['mean_mm']:.2f} mm, disparity {found['disparity_mm']:.2f} mm"
+    )
+    figure.savefig(path, dpi=110)

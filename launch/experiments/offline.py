@@ -17,12 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from flexsheet.launch.calibration.projector import project_points
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.stroke import project_presented_point
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.messages.apparatus import Apparatus
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
@@ -31,13 +32,14 @@ from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.benchmarks import draw_coordinate_ramps
+from flexsheet.nodes.renderer.check_marks import intersect
 from flexsheet.nodes.renderer.gl import headless_context
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import estimate_sheet
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.error_map import error_map
-from flexsheet.nodes.twin.eye import HALF_WINDOW_M, eye_rays, first_hits, seen
+from flexsheet.nodes.twin.eye import HALF_WINDOW_M, TrueProjector, eye_rays, first_hits, seen
 from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.membrane import CELLS, NotConvergedError, solve, solve_path
 from flexsheet.nodes.twin.nail import Nail
@@ -75,6 +77,10 @@ class Metric(StrEnum):
 
 
 ALL_METRICS = frozenset(Metric)
+
+
+CROSS_RATIOS, CROSS_ASIDES_M = (-1.0, -0.5, 0.0, 0.5, 1.0), (-0.03, 0.0, 0.03)
+"""Places of the crosses: fractions of the stroke along the object, and distances to the right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +154,31 @@ def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
     squares = np.concatenate([np.sum(one**2, axis=2).ravel() for one in maps_m])
     squares = squares[np.isfinite(squares)]
     return 1e3 * float(np.sqrt(squares.mean())) if len(squares) else None
+
+
+@dataclass(frozen=True, slots=True)
+class CrossErrors:
+    """Crosses that are projected where touches are expected, compared with the touches.
+
+    places_m: (n, 2) positions on the screen plane of the points at which touches are expected, as
+    the point between the true eyes sees them. errors_m: (n, 2, 2) positions (x, y) on the screen
+    plane at which the left and the right eye see the cross, minus those of the touched point.
+    """
+
+    places_m: Floats
+    errors_m: Floats
+
+    def figures(self) -> dict[str, float]:
+        """Return lengths of the errors, mm: of each eye and of both, and of their disparity."""
+        left, right = np.moveaxis(1e3 * self.errors_m, 1, 0)
+        both = np.linalg.norm(0.5 * (left + right), axis=1)
+        return {
+            "mean_mm": float(both.mean()),
+            "max_mm": float(both.max()),
+            "left_mm": float(np.linalg.norm(left, axis=1).mean()),
+            "right_mm": float(np.linalg.norm(right, axis=1).mean()),
+            "disparity_mm": float(np.abs(right[:, 0] - left[:, 0]).mean()),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,14 +260,14 @@ class OfflineEvaluator:
         fingertip = tip_errors if Metric.FINGERTIP in metrics else None
         return Evaluation(fingertip, sheet, image, felt, expected)
 
-    def _touch(self, around_m: float) -> Contact:
+    def _touch(self, around_m: float, aside_m: float = 0.0) -> Contact:
         """Return the sheet after rolling without slip from the object's front.
 
-        around_m: arc length to its new contact point.
+        around_m, aside_m: arc length to its new contact point, and distance to the right.
         """
-        places = np.array([[0.0, around_m, 0.0], [0.0, around_m, 1e-3]])
-        point, above = map_to_surface(self._scene, places)
-        return self._lay_sheet(point, (above - point) / 1e-3, np.array([0.0, around_m, 0.0]))
+        place = np.array([aside_m, around_m, 0.0])
+        point, above = map_to_surface(self._scene, place + np.outer([0.0, 1e-3], [0, 0, 1]))
+        return self._lay_sheet(point, (above - point) / 1e-3, place)
 
     @staticmethod
     def _lay_sheet(point: Floats, normal: Floats, on_sheet_m: Floats) -> Contact:
@@ -417,6 +448,67 @@ class OfflineEvaluator:
         errors = error_map(x, y, self._metres_per_px).errors_m
         return self._correct_parallax(errors, eye)
 
+    def compare_crosses(self, apparatus: Apparatus) -> CrossErrors:
+        """Compare crosses that are projected where touches are expected with the felt touches.
+
+        The crosses lie on the object, and are drawn for each eye of the scene on the sheet in front
+        of it. The sheet then moves to the finger, which touches it where the tracker measures the
+        position of the cross. Raises ExperimentError without a solution.
+        """
+        scene = apply_apparatus(self._scene, apparatus)
+        arms = ArmPair(self._scene, apparatus)
+        surface = SheetSurface.of(self._scene, apparatus)
+        contacts = [
+            self._touch(ratio * self._places_m[-1], aside_m)
+            for ratio in CROSS_RATIOS
+            for aside_m in CROSS_ASIDES_M
+        ]
+        tip_errors = self._measure_fingertips(scene, apparatus, contacts)
+        touched = np.array(
+            [
+                contact.point - self._sheet_error(arms, surface, contact, error)
+                for contact, error in zip(contacts, tip_errors, strict=True)
+            ]
+        )
+        targets = np.array([contact.point for contact in contacts])
+        edges = self._edges(self._touch(0.0))
+        believed = estimate_sheet(
+            *edges,
+            height_m=self._scene.sheet.height_m,
+            twist_world=np.zeros(6),
+            ahead_s=0.0,
+            finger_tip=None,
+        )
+        assert believed is not None
+        mesh = self._renderer.sheet_mesh(believed)
+        corners = mesh.vertices[mesh.triangles].astype(np.float64)
+        sheet = solve(true_rubber(scene.sheet, apparatus), *arms.hold(edges))
+        lamp = TrueProjector(
+            require_projector(scene), sheet.positions.reshape(-1, 3), sheet.triangles()
+        )
+        errors = []
+        for side in (-0.5, 0.5):
+            believed_eye, eye = (
+                one.eyes.centre_world_m + side * one.eyes.interocular_m * np.eye(3)[0]
+                for one in (self._scene, scene)
+            )
+            triangles, weights = intersect(believed_eye, targets - believed_eye, corners)
+            drawn = np.einsum("nk,nki->ni", weights, corners[triangles])
+            lit, lands = lamp.intersect_surface(
+                project_points(require_projector(self._scene), np.nan_to_num(drawn))
+            )
+            lit[~lands | np.isnan(drawn[:, 0])] = np.nan
+            errors.append(_on_screen(eye, lit) - _on_screen(eye, touched))
+        found = np.stack(errors, axis=1)
+        seen_by_both = np.isfinite(found).all(axis=(1, 2))
+        if not seen_by_both.any():
+            raise ExperimentError(
+                f"apparatus {apparatus.origin}: none of the projected crosses is on the sheet; "
+                "check the poses of projector and eyes"
+            )
+        places = _on_screen(scene.eyes.centre_world_m, targets)
+        return CrossErrors(places[seen_by_both], found[seen_by_both])
+
     def _correct_parallax(self, errors_m: Floats, eye: Floats) -> Floats:
         """Return the errors relative to what the true eye should see.
 
@@ -473,6 +565,12 @@ class OfflineEvaluator:
         points = np.full((size, size, 3), np.nan)
         points[hit] = rays.origin + directions[hit] / hits.inverse_range[hit][:, None]
         return (rays.origin + directions)[..., :2], points
+
+
+def _on_screen(eye: Floats, points: Floats) -> Floats:
+    """Return where an eye (3,) sees points (n, 3) on the screen plane z = 0, (n, 2), m."""
+    to_screen = eye[2] / (eye[2] - points[:, 2:])
+    return np.asarray(eye[:2] + (points[:, :2] - eye[:2]) * to_screen)
 
 
 def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:

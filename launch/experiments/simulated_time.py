@@ -182,6 +182,11 @@ class SimulatedArm:
         """Return the servo lag that the bridge has measured or was given, s."""
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
+    @property
+    def lag_uncertainty_s(self) -> float | None:
+        """Return the standard deviation of the measured servo lag, s; None before it is known."""
+        return None if self._lag.estimate is None else self._lag.estimate.uncertainty_s
+
     def advance(self, until_s: float) -> Floats:
         """Advance the servo to a time, and return the true joint angles (6,), rad."""
         while self._pending and self._pending[0][0] <= until_s:
@@ -349,7 +354,8 @@ def follow_in_simulated_time(
 ) -> dict[str, Any]:
     """Simulate the sheet for a finger path; return its errors as `FollowedFinger.figures` does.
 
-    The key `servo_lag_ms` has the servo lags that the two bridges have measured at the end.
+    The keys `servo_lag_ms` and `servo_lag_uncertainty_ms` have the servo lags that the two bridges
+    have measured at the end, and their standard deviations.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
@@ -381,7 +387,12 @@ def follow_in_simulated_time(
     heights_m = shape.closest(apply(inverse(object_pose(scene)), points)).height_m
     found = FollowedFinger()
     found.add(*errors, heights_m, np.array(following))
-    return {**found.figures(), "servo_lag_ms": [1e3 * arm.lag_s for arm in loop.sheet.arms]}
+    deviations_s = [arm.lag_uncertainty_s for arm in loop.sheet.arms]
+    return {
+        **found.figures(),
+        "servo_lag_ms": [1e3 * arm.lag_s for arm in loop.sheet.arms],
+        "servo_lag_uncertainty_ms": [None if one is None else 1e3 * one for one in deviations_s],
+    }
 
 
 def stroke_in_simulated_time(

@@ -1,0 +1,266 @@
+"""Measure the positions of the viewer's eyes from points that an eye sees behind one another.
+
+The projector shows a cross on the sheet. The viewer closes one eye and moves a bead, which stands
+between the eye and the sheet, until it covers the cross. The stereo camera measures both points, so
+that the eye lies on the straight line through them. Lines through beads at several positions meet
+at the eye. Augmented reality calls this active alignment (Tuceryan and Navab 2000). It measures the
+eye's own centre of projection, and neither the projector nor the sheet has to be calibrated.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from flexsheet.launch.calibration.edge_marks import MarkDetector
+from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
+from flexsheet.launch.plans.documents import BadInputError, Problem
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.calibration import StereoCalibration
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.scene import Eyes, Scene
+from flexsheet.messages.types import Side
+from flexsheet.nodes.twin.head import HeadSway
+from flexsheet.nodes.twin.membrane import solve
+from flexsheet.nodes.twin.pixels import TwinCamera
+from flexsheet.nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.truth import apply_apparatus
+from flexsheet.nodes.twin.viewer import Viewer
+
+Floats = NDArray[np.float64]
+
+SIDES: tuple[Side, Side] = ("left", "right")
+POINTS = ("bead", "cross")
+COLUMNS = ("eye", *(f"{point}_{axis}_mm" for point in POINTS for axis in "xyz"))
+"""Columns of the CSV file, which has one row for each alignment: eye, and measured positions of
+bead and cross in the world."""
+
+MIN_ALIGNMENTS = 6
+OUTLIER_RATIO = 2.0
+"""Multiple of the robust standard deviation above which the influence of an angle no longer grows
+(Huber 1964)."""
+
+MAX_ANGLE_RAD = 0.02
+"""Maximum root mean square of the angles; a larger one indicates exchanged eyes or points."""
+
+MAX_SHIFT_M = 0.3
+"""Maximum distance of a measured eye from that of the scene."""
+
+MIN_DISTANCE_M = 0.05
+"""Minimum distance between bead and cross."""
+
+BEADS_M = tuple((x, y, z) for z in (0.10, 0.15) for y in (-0.05, 0.0, 0.05)
+                for x in (-0.05, 0.0, 0.05))  # fmt: skip
+"""Simulated positions of the bead, which the viewer uses with each eye."""
+ALIGNMENT_S = 6.0
+"""Time from one simulated alignment to the next."""
+
+HEAD_REST_SWAY_M = 1.5e-3
+"""Maximum standard deviation of the head's motion on a chin rest, which the procedure requires."""
+
+
+class EyesError(FlexsheetError, ValueError):
+    """Raised for alignments that do not determine the positions of the eyes."""
+
+    code = "eyes-calibration"
+    remedy = (
+        "Align at least six positions of the bead with each eye, spread over the sheet and at two "
+        "distances from it, with the head on a rest."
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Bead and cross (3,), m, that one eye sees as one point."""
+
+    eye: Side
+    bead_m: Floats
+    cross_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class EyesFit:
+    """Measured eyes of a scene.
+
+    angle_rms_rad: root mean square of the angle between bead and cross at the measured eye.
+    covariance_m2: (3, 3) of the point between the eyes. interocular_std_m: standard deviation of
+    the eyes' distance.
+    """
+
+    eyes: Eyes
+    angle_rms_rad: float
+    covariance_m2: Floats
+    interocular_std_m: float
+
+
+def fit_eyes(alignments: Sequence[Alignment], guess: Eyes) -> EyesFit:
+    """Fit both eyes to alignments; raises EyesError if they do not determine the eyes.
+
+    For each eye, the sum of the squared distances of the crosses from the lines of sight through
+    their beads is smallest. (Angles would not do: they become zero for an eye at infinity.)
+    """
+    positions, covariances, angles = [], [], []
+    for sign, side in zip((-0.5, 0.5), SIDES, strict=True):
+        given = [one for one in alignments if one.eye == side]
+        if len(given) < MIN_ALIGNMENTS:
+            raise EyesError(
+                f"{len(given)} alignments of the {side} eye; at least {MIN_ALIGNMENTS} are needed"
+            )
+        start = guess.centre_world_m + sign * guess.interocular_m * np.eye(3)[0]
+        position, covariance, rms_rad = _fit_eye(given, start)
+        if np.linalg.norm(position - start) > MAX_SHIFT_M:
+            raise EyesError(
+                f"the lines of the {side} eye meet {np.linalg.norm(position - start):.2g} m from "
+                f"the eye of the scene, at most {MAX_SHIFT_M:g} m are expected; check "
+                "eyes.centre_world_m in the scene, and the columns of the file"
+            )
+        if rms_rad > MAX_ANGLE_RAD:
+            raise EyesError(
+                f"bead and cross of the {side} eye differ by {1e3 * rms_rad:.1f} mrad, at most "
+                f"{1e3 * MAX_ANGLE_RAD:.0f} mrad are expected; check the columns eye, bead, cross"
+            )
+        positions.append(position)
+        covariances.append(covariance)
+        angles.append(rms_rad)
+    left, right = positions
+    across = right - left
+    distance_m = float(np.linalg.norm(across))
+    both = covariances[0] + covariances[1]
+    along = across / distance_m
+    return EyesFit(
+        eyes=Eyes(centre_world_m=0.5 * (left + right), interocular_m=distance_m),
+        angle_rms_rad=math.hypot(*angles) / math.sqrt(2.0),
+        covariance_m2=0.25 * both,
+        interocular_std_m=float(np.sqrt(along @ both @ along)),
+    )
+
+
+def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Floats, float]:
+    """Return an eye's position (3,), its covariance (3, 3) and the rms angle, rad."""
+    beads = np.array([one.bead_m for one in alignments])
+    crosses = np.array([one.cross_m for one in alignments])
+    if np.linalg.norm(beads - crosses, axis=1).min() < MIN_DISTANCE_M:
+        raise EyesError(
+            f"a bead is closer than {1e3 * MIN_DISTANCE_M:.0f} mm to its cross; move it towards "
+            "the viewer"
+        )
+
+    def offsets(eye: Floats) -> Floats:
+        """Return the vectors (n, 3) from the lines of sight through the beads to the crosses."""
+        directions, far = beads - eye, crosses - eye
+        directions /= np.linalg.norm(directions, axis=1)[:, None]
+        return np.asarray(far - np.einsum("ni,ni->n", far, directions)[:, None] * directions)
+
+    scale_m = 1e-3
+    for _ in range(2):
+        solved = least_squares(
+            lambda eye: offsets(eye).ravel(),
+            start,
+            loss="huber",
+            f_scale=scale_m,
+            x_scale=1e-2,
+            gtol=1e-15,
+            ftol=1e-12,
+        )
+        lengths_m = np.linalg.norm(offsets(solved.x), axis=1)
+        scale_m = OUTLIER_RATIO * max(float(np.median(lengths_m)), 1e-5)
+        start = solved.x
+    # An offset has two components across the line of sight; the eye has three unknowns.
+    variance_m2 = float((lengths_m**2).sum()) / (2 * len(lengths_m) - 3)
+    covariance = variance_m2 * np.linalg.pinv(solved.jac.T @ solved.jac)
+    angles = lengths_m / np.linalg.norm(crosses - solved.x, axis=1)
+    return solved.x, covariance, float(np.sqrt(np.mean(angles**2)))
+
+
+def read_alignments(path: Path) -> list[Alignment]:
+    """Read alignments from a CSV file with the columns `COLUMNS`.
+
+    Raises BadInputError with file, line, column, value and remedy.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            rows = [(reader.line_num, row) for row in reader]
+            columns = tuple(reader.fieldnames or ())
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise BadInputError(
+            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
+        ) from error
+    missing = [name for name in COLUMNS if name not in columns]
+    if missing:
+        raise BadInputError([Problem(str(path), (x,), "missing column", "add it") for x in missing])
+    problems: list[Problem] = []
+    found = []
+    for number, row in rows:
+        where = f"{path}:{number}"
+        side = next((one for one in SIDES if one == (row["eye"] or "").strip()), None)
+        if side is None:
+            what = f'expected left or right, found "{row["eye"]}"'
+            problems.append(Problem(where, ("eye",), what, "name the open eye"))
+            continue
+        values = [_parse(where, name, row[name], problems) for name in COLUMNS[1:]]
+        found.append(Alignment(side, 1e-3 * np.array(values[:3]), 1e-3 * np.array(values[3:])))
+    if problems:
+        raise BadInputError(problems)
+    return found
+
+
+def _parse(where: str, name: str, text: str | None, problems: list[Problem]) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        what = f'expected a finite number, found "{text}"'
+        problems.append(Problem(where, (name,), what, "measure this point again, or remove it"))
+    return value
+
+
+def _rest(position: Floats, _time_s: float) -> Floats:
+    return position
+
+
+def simulate_alignments(
+    scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
+) -> list[Alignment]:
+    """Simulate alignments of a viewer, as the simulated stereo camera sees them.
+
+    The arms hold the flat sheet at the screen. Alignments are left out if the sheet is not behind
+    the bead, or if the detector rejects one of the points. calibration: camera parameters that the
+    detector uses; None: those of the scene.
+    """
+    random = np.random.default_rng(seed)
+    true_scene = apply_apparatus(scene, apparatus)
+    spec = scene.sheet
+    distance_m = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio) * spec.width_m
+    edges = ArmPair(scene, apparatus).hold(place_edges(np.eye(4), distance_m))
+    sheet = solve(true_rubber(true_scene.sheet, apparatus), *edges)
+    sway_m = min(apparatus.eyes.sway_m, HEAD_REST_SWAY_M)
+    on_rest = apparatus.eyes.model_copy(update={"sway_m": sway_m})
+    viewer = Viewer(true_scene, HeadSway.drawn(on_rest, seed), random)
+    camera = TwinCamera(
+        make_true_camera(true_scene.camera), finger_radius_m=true_scene.finger.radius_m, seed=seed
+    )
+    detector = MarkDetector(scene, calibration)
+    found = []
+    for number, (side, place) in enumerate((side, bead) for side in SIDES for bead in BEADS_M):
+        bead = np.array(place)
+        cross = viewer.align(side, bead, sheet, number * ALIGNMENT_S)
+        if cross is None:
+            continue
+        images = camera.picture(
+            partial(_rest, bead), exposure_s=scene.camera.exposure_s, lit_points=cross[None]
+        )
+        seen = [detector.find(*images, near_world_m=point) for point in (bead, cross)]
+        if seen[0] is not None and seen[1] is not None:
+            found.append(Alignment(side, seen[0], seen[1]))
+    return found
