@@ -632,16 +632,7 @@ def describe_sheet(
     modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m
     measured = sheet.model_copy(update={"young_modulus_pa": modulus_pa, "width_m": width_m})
     distance_m = 0.5 * (sheet.min_stretch_ratio + sheet.max_stretch_ratio) * sheet.width_m
-    before_n, after_n = (
-        edge_force_n(
-            distance_m / one.width_m,
-            young_modulus_pa=one.young_modulus_pa,
-            width_m=one.width_m,
-            height_m=one.height_m,
-            thickness_m=one.thickness_m,
-        )
-        for one in (sheet, measured)
-    )
+    before_n, after_n = (edge_force_n(distance_m / one.width_m, one) for one in (sheet, measured))
     values = {"sheet.young_modulus_pa": modulus_pa, "sheet.width_m": width_m}
     for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
         compliance = arm.flange_compliance_m_per_n * before_n / after_n

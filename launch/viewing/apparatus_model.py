@@ -161,10 +161,10 @@ def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
     mount = Joint(f"{side}_mount", WORLD, names[0], pose_matrix(arm.world_from_base))
     yield mount, Link(names[0], tuple(boxes[0]))
     for i, name in enumerate(list_joints(side)):
-        axis = chain.axes[i]
+        x, y, z = chain.axes[i].tolist()
         # The encoder reads zero where the joint is at its offset.
-        offset = rotation_from_vector(arm.joint_offsets_rad[i] * np.array(axis))
-        limit = JointLimit(axis, chain.min_rad[i], chain.max_rad[i], chain.speed_rad_per_s[i])
+        offset = rotation_from_vector(arm.joint_offsets_rad[i] * chain.axes[i])
+        limit = JointLimit((x, y, z), chain.min_rad[i], chain.max_rad[i], chain.speed_rad_per_s[i])
         pose = pose_matrix(chain.origins[i]) @ transform(offset, np.zeros(3))
         yield (
             Joint(name, names[i], names[i + 1], pose, limit),
