@@ -15,9 +15,9 @@ from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
 from flexsheet.launch.plans.plan import load_scene
+from flexsheet.launch.ros2.mapping import list_joints
 from flexsheet.launch.viewing.apparatus_model import (
     ApparatusModel,
-    list_joints,
     make_model,
     solve_rest_joints,
 )

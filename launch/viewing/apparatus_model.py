@@ -14,6 +14,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.ros2.mapping import list_joints
 from flexsheet.messages.scene import ClosedFormArm, Projector, Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
@@ -100,11 +101,6 @@ class ApparatusModel:
         for joint in self.joints:
             found[joint.child] = found[joint.parent] @ joint.pose(angles_rad.get(joint.name, 0.0))
         return found
-
-
-def list_joints(side: Side) -> tuple[str, ...]:
-    """Return the names of an arm's joints."""
-    return tuple(f"{side}_joint_{number}" for number in range(1, 7))
 
 
 def make_model(scene: Scene) -> ApparatusModel:
