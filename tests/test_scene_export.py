@@ -26,8 +26,8 @@ from flexsheet.launch.viewing.urdf import make_urdf
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.kinematics import JOINT_MAX_RAD, JOINT_MIN_RAD
 from flexsheet.nodes.models.rigid import pose_matrix
+from tests.rv_1a import JOINT_MAX_RAD, JOINT_MIN_RAD
 from tests.scenes import load_cylinder
 
 CYLINDER = load_cylinder()

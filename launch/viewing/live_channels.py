@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flexsheet.launch.bags.export import list_images
+from flexsheet.launch.ros2.mapping import list_joints
 from flexsheet.launch.viewing.apparatus_model import (
     WORLD,
     ApparatusModel,
     Colour,
     Joint,
-    list_joints,
     make_model,
 )
 from flexsheet.launch.viewing.json_channel import make_schema, to_json
