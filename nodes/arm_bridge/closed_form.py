@@ -425,7 +425,7 @@ class ClosedFormKinematics:
         }
 
     def _out(self, joints: Floats) -> Floats:
-        """Return how far (m) the wrist centre is in front of the axis of J1; negative: behind it."""
+        """Return how far (m) the wrist centre is in front of the axis of J1; negative: behind."""
         q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
         return np.asarray(
             self._upper_m * np.sin(q2) - self._shift_m * np.cos(q23) + self._forearm_m * np.sin(q23)

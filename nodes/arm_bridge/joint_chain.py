@@ -89,7 +89,7 @@ class SerialChain:
         return self._frames(joints_rad)[-1]
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the Jacobian (..., 6, 6) at joints (..., 6): flange velocity, then angular velocity."""
+        """Return the Jacobian (..., 6, 6): linear, then angular flange velocity per joint speed."""
         return self.pose_and_jacobian(joints_rad)[1]
 
     def pose_and_jacobian(self, joints_rad: Floats) -> tuple[Floats, Floats]:
