@@ -458,7 +458,7 @@ def solve_path(
 
     world_from_left_edge, world_from_right_edge: (4, 4) poses of the clamped edges; the origin is
     the centre of the edge, y points along it.
-    finger_tips: positions (3,) on one normal of the sheet, in the order of their depths.
+    finger_tips: positions (3,) on one normal of the sheet, sorted by depth.
     friction_coefficient: Coulomb coefficient between finger and sheet; None: touched nodes stick.
     cells: number of intervals between nodes along each side; even.
     slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a barely
