@@ -64,7 +64,7 @@ STEPS = tuple(StepName)
 
 
 class NodeValue(LimitedModel):
-    """Measured value of a parameter, for all nodes of a type, or only for the one of an arm."""
+    """Measured value of a node parameter, for all nodes of a type or for that of one arm."""
 
     node_type: str
     parameter: str
@@ -341,7 +341,7 @@ def format_report(state: State) -> str:
 
 
 def _format_verdict(figures: Mapping[str, Any]) -> list[str]:
-    """Return the predicted errors as a table, and whether the laboratory is good, with reasons."""
+    """Format the predicted errors as a table, and the verdict on the laboratory with reasons."""
     lines = ["", "## Predicted errors", ""]
     lines += ["| metric | root mean square | 95 % | tolerance |", "|---|---|---|---|"]
     lines += [
@@ -357,7 +357,7 @@ def _format_verdict(figures: Mapping[str, Any]) -> list[str]:
 def list_doubts(
     steps: Mapping[StepName, StepRecord], figures: Mapping[str, Any], tracking: tuple[float, float]
 ) -> list[str]:
-    """Return why a laboratory may exceed a tolerance; empty if all errors are expected within it.
+    """List reasons why a laboratory may exceed a tolerance; empty if none is expected.
 
     figures: results of the verification. tracking: error of the sheet in the stroke as the devices
     report it, and its tolerance, mm.

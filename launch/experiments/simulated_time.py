@@ -124,7 +124,7 @@ class MeasuredFinger:
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
         """Measure the finger, whose true position and velocity at the timestamp are given, (3,).
 
-        Returns its predicted path (n, 3). The images are exposed slightly after the timestamp.
+        Returns the predicted path (n, 3), m. The images are exposed slightly after the timestamp.
         """
         truth, random = self._truth, self._random
         late_s = truth.stamp_offset_s

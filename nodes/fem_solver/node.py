@@ -98,7 +98,7 @@ class FemSolver(Node):
         return f"{current.method.name}, force within {percent:.0f} %, {nodes} skin nodes"
 
     def _force_error_ratio(self, current: body.SceneBody) -> float:
-        """Return the stated relative error of the force; bodies that are being replaced count too."""
+        """Return the stated relative error of the force, including that of replaced bodies."""
         return max(one.force_error_ratio for one in (current, *(old for old, _ in self._replaced)))
 
     async def close(self) -> None:
