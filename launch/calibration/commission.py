@@ -40,7 +40,7 @@ class CommissionError(FlexsheetError, ValueError):
 
 
 class StepName(StrEnum):
-    """Steps of a commissioning, in the order in which they run.
+    """Steps of a commissioning (calibration of a whole laboratory), in their order.
 
     camera: optics of the stereo camera. arms: poses of the arm bases in the frame of the camera.
     edges: pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of
@@ -73,13 +73,13 @@ class NodeValue(LimitedModel):
 
 
 class StepResult(LimitedModel):
-    """Result of one step.
+    """Result of one step of a commissioning.
 
-    residual: error of the fit in `unit`. advice: what to do if it is above `limit`. uncertainty:
-    standard deviations, whose names end in their units. scene_values: values by dotted path in the
-    scene. parameters: names of calibration files in the folder, by node type and parameter
-    (TYPE.PARAMETER). figures: further results. covariances: covariance matrices by name, from which
-    errors are predicted. node_values: other measured parameters of nodes.
+    residual: error of the fit in `unit`. advice: remedy if the residual exceeds `limit`.
+    uncertainty: standard deviations, whose names end in their units. scene_values: new values of
+    the scene by dotted path. parameters: names of calibration files in the folder, by node type and
+    parameter (TYPE.PARAMETER). figures: further results. covariances: covariance matrices by name,
+    from which errors are predicted. node_values: other measured parameters of nodes.
     """
 
     residual: float

@@ -42,8 +42,8 @@ SINGULAR_LENGTH_M = 0.25
 """Length that converts velocities to angular velocities in the singular values of the Jacobian."""
 
 MIN_SINGULAR_VALUE, NEAR_SINGULAR_VALUE = 0.01, 0.05
-"""Limits of the smallest singular value of the Jacobian: a pose is rejected below the first, and
-paths must stay above the second, at which 0.25 m/s need joint speeds of at most 20 rad/s."""
+"""Limits of the smallest singular value of the Jacobian.  A pose is rejected below the first limit.
+Paths must stay above the second one, where 0.25 m/s needs joint speeds of at most 20 rad/s."""
 
 SEEDS = 256
 """Number of random joint vectors from which `solve_all` starts."""

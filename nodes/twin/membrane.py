@@ -46,8 +46,9 @@ MAX_STEP_RADII = 0.7
 
 MAX_ITERATIONS = 80
 UNDAMPED_ROUNDS, MAX_FRICTION_ROUNDS = 6, 20
-"""Maximum number of equilibria that are solved per step of the finger while nodes slip, and the
-number after which the changes of the friction forces are halved, since they may alternate."""
+"""Limits of the number of equilibria that are solved per finger step while nodes slip. Above the
+first limit, changes of the friction forces are halved, since they may alternate. The second limit
+is the maximum."""
 FRICTION_TOLERANCE = 0.01
 """Relative change of the friction forces between two equilibria below which they are accepted."""
 GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
