@@ -63,7 +63,7 @@ MAX_SUBSCRIPTION_BYTES = 512
 HANDSHAKE_MS = 5000
 REOPEN_DELAY_S = 0.5
 WATCHED_RECONNECT_MS = 50
-"""Maximum period of attempts to connect to a writer whose end the subscriber watches."""
+"""Maximum period of reconnection attempts to a writer whose end the subscriber must detect."""
 
 MAX_PAST_CLOCKS = 16
 
@@ -222,9 +222,9 @@ class Publisher:
             self._open(self.endpoints)
 
     def interrupt(self) -> None:
-        """Disconnect all readers, as the end of this process would.
+        """Disconnect all readers, as if this process had ended.
 
-        They connect again by themselves. Messages sent before are still delivered.
+        They reconnect automatically. Messages that were sent before are still delivered.
         """
         if self._channel is not None:
             self._channel.interrupt()

@@ -76,7 +76,7 @@ def _parse_text(text: str) -> Any:
 
 
 class CalibrationComposer(Composer):
-    """Composer of YAML without aliases and with a limited depth."""
+    """YAML composer that rejects aliases and excessive nesting depth."""
 
     depth = 0
 

@@ -21,7 +21,7 @@ def describe_field_type(field: FieldInfo) -> str:
 
 
 def get_annotation(field: FieldInfo) -> Any:
-    """Return a field's type with its marks, as one annotation."""
+    """Return the type of a field and its metadata as one annotation (`typing.Annotated`)."""
     annotation: Any = field.annotation
     for mark in field.metadata:
         annotation = Annotated[annotation, mark]
@@ -29,7 +29,7 @@ def get_annotation(field: FieldInfo) -> Any:
 
 
 def split_annotation(annotation: Any) -> tuple[Any, ArraySpec | None]:
-    """Return an annotation without its marks, and the array specification among them."""
+    """Split an annotation into the type without metadata, and its array specification or None."""
     spec = None
     while get_origin(annotation) is Annotated:
         annotation, *marks = get_args(annotation)

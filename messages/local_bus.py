@@ -120,7 +120,7 @@ class LocalChannel:
         self._last = None
 
     def interrupt(self) -> None:
-        """Tell the readers that no more messages come for now."""
+        """Tell the readers that this writer sends no more messages for now."""
         for reader in self._readers:
             reader.report_end()
 
@@ -194,7 +194,7 @@ class LocalConnection:
             self._loop.call_soon(self._read)
 
     def report_end(self) -> None:
-        """Call `on_disconnected` after the delivery of the queued messages."""
+        """Call `on_disconnected` after all queued messages have been delivered."""
         if self._receiver.on_disconnected is not None and self._loop is not None:
             self._loop.call_soon(self._receiver.on_disconnected)
 

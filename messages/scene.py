@@ -29,7 +29,7 @@ Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 SmallSix = tuple[Small, Small, Small, Small, Small, Small]
 
 MAX_AXIS_ERROR = 1e-6
-"""Maximum difference of the length of a joint's axis from 1."""
+"""Maximum deviation of the length of a joint axis vector from 1."""
 
 
 class Part(MessagePart, LimitedModel):
@@ -348,7 +348,7 @@ class ClosedFormArm(ArmModel):
     flange_m: Positive = Field(description="distance from the wrist centre to the flange")
 
     def chain(self) -> JointChain:
-        """Return the same arm as a chain of joints."""
+        """Convert the dimensions of this arm to a chain of joints."""
         offsets = (
             (0.0, 0.0, 0.0),
             (0.0, 0.0, self.shoulder_height_m),
@@ -382,7 +382,7 @@ RV_1A = ClosedFormArm(
     speed_rad_per_s=_radians(180, 90, 135, 180, 180, 210),
     start_rad=_radians(0, 25, 119, 0, -54, 0),
 )
-"""Mitsubishi RV-1A, by two public models (Adolphus `mitsubishirv1a.yaml`, ICube `mrv1a.urdf`)."""
+"""Mitsubishi RV-1A, from two public models (Adolphus `mitsubishirv1a.yaml`, ICube `mrv1a.urdf`)."""
 
 RV_2FR = ClosedFormArm(
     name="rv-2fr",
@@ -396,17 +396,17 @@ RV_2FR = ClosedFormArm(
     speed_rad_per_s=_radians(300, 150, 300, 450, 450, 720),
     start_rad=_radians(0, 10, 115, 0, -35, 0),
 )
-"""Mitsubishi RV-2FR, by the manufacturer's public model (`melfa_description`).
+"""Mitsubishi RV-2FR, from the manufacturer's public model (`melfa_description`).
 
-The elbow's shift is towards the back, as for the RV-1A: only then is the maximum reach of the wrist
-centre the 504 mm of the data sheet."""
+The elbow is shifted towards the back, as in the RV-1A.  Only then does the maximum reach of the
+wrist centre equal the 504 mm of the data sheet."""
 
 ARM_MODELS = {arm.name: arm for arm in (RV_1A, RV_2FR)}
-"""Arms that a scene may name."""
+"""Known arm models, which a scene may select by name."""
 
 
 class ArmSpec(Part):
-    """Robot arm: its model, the pose of its base, and of its edge of the sheet on its flange.
+    """Robot arm: its model, the pose of its base, and the pose of its sheet edge on its flange.
 
     Sheet frame: x from the left edge to the right edge, y along the edges, z towards the user.
     """

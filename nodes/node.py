@@ -279,10 +279,10 @@ class Node:
     """Parameters that may change while the node runs, because each use reads them from
     `parameters`.  A class with such parameters declares `parameter: Input[ParameterChange]`."""
     watched_inputs: ClassVar[frozenset[str]] = frozenset()
-    """Ports at which the node must notice at once that the writer's process has ended."""
+    """Input ports at which the node must detect at once that the writer's process has ended."""
     ends_with_inputs: ClassVar[bool] = False
-    """Whether the end of a watched input also disconnects the readers of the node's outputs, so
-    that the nodes after it notice it too."""
+    """Whether the end of a watched input also disconnects the readers of this node's outputs, so
+    that downstream nodes detect it too."""
     on_demand: ClassVar[bool] = False
     """Whether the node is left out of a graph in which no other node reads its topics."""
     opens_devices: ClassVar[bool] = False
@@ -357,7 +357,7 @@ class Node:
             epoch = self.started_ns
         declared = find_ports(type(self))
         for port in declared.values():
-            port.message.model_rebuild()  # otherwise done during the first message
+            port.message.model_rebuild()  # Otherwise this would happen during the first message.
             topic = find_topic((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
                 raise TypeError(

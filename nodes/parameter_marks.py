@@ -12,7 +12,7 @@ from pydantic import BaseModel, Field
 
 
 class ParameterMark(StrEnum):
-    """Mark of a node parameter by which the launcher knows how the value is used."""
+    """Mark of a node parameter that tells the launcher how the value is used."""
 
     LISTEN_PORT = "listen_port"
     DEVICE_HOST = "device_host"

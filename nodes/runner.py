@@ -184,7 +184,7 @@ class NodeTransport:
         self._stop_socket.open()
 
     def _end_input(self, node: Node, port: str) -> None:
-        """Mark a watched input as ended; pass the end on to the nodes that read this one."""
+        """Mark a watched input as ended; if the node requires it, disconnect its readers too."""
         node.inputs[port].has_ended = True
         if not node.ends_with_inputs or self._has_failed.is_set():
             return
@@ -197,7 +197,7 @@ class NodeTransport:
             self._has_failed.set()
 
     async def watch_failure(self) -> None:
-        """Wait until a socket could not be opened again.  Raises BusError."""
+        """Wait until a socket cannot be opened again, then raise BusError."""
         await self._has_failed.wait()
         if self._failure is not None:
             raise self._failure

@@ -301,7 +301,7 @@ def test_an_unusable_model_names_the_key(tmp_path: Path, model: str, text: str) 
         ("<", "", "not a valid URDF file"),
         ('type="revolute"', 'type="prismatic"', "only independent rotary joints"),
         (' velocity="3.141592653589793"', "", "velocity"),
-        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>', "has no direction"),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>', "its axis is zero"),
     ],
 )
 def test_an_unusable_urdf_says_what_is_wrong(tmp_path: Path, old: str, new: str, text: str) -> None:

@@ -234,7 +234,7 @@ def test_a_time_that_ros_cannot_represent_is_refused(tmp_path: Path) -> None:
     with BagWriter(bag, {"recording": {"clock_id": "c"}}) as writer:
         header = Header(1, 2**62, 2**62, "c", "node", 1)
         writer.write(TOPICS["eye"], FURTHER[0][1], header, 2**62)
-    with pytest.raises(Ros2Error, match="from 1970 to 2038"):
+    with pytest.raises(Ros2Error, match="1970 to 2038"):
         export_ros2(bag, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

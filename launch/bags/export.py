@@ -142,9 +142,9 @@ def export(
 
 @dataclass(frozen=True, slots=True)
 class TopicsToExport:
-    """Bag to export with its start and duration, and names of its topics to export.
+    """Bag to export, its start and duration, and the names of the topics to export.
 
-    context: other topics that contain what is needed to draw the topics to export. unreadable:
+    context: further topics whose messages are needed to draw the exported topics. unreadable:
     requested topics whose message type cannot be migrated. clock_id: clock of the recorder; None if
     it is unknown.
     """
@@ -159,7 +159,7 @@ class TopicsToExport:
 
 
 def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) -> TopicsToExport:
-    """Select the topics of a bag to export; default: all that can be read.
+    """Select the topics of a bag to export; default: all readable topics.
 
     Raises ExportError if the output exists or the bag does not contain a topic, and BagError.
     """

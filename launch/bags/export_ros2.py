@@ -1,7 +1,7 @@
 """Export bags as bags of ROS 2: MCAP files in CDR, which `ros2 bag play` and RViz accept.
 
-`flexsheet.launch.ros2.mapping` defines the topics and types. Times of messages are times since
-1970, if the bag contains the wall-clock time of its start; else since the start of the computer.
+`flexsheet.launch.ros2.mapping` defines the topics and types. Timestamps count from 1970 if the bag
+contains the wall-clock time of its start, else from the start of the recording computer.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.files import make_write_error
 
 METADATA_VERSION = 8
-"""Version of the bag's metadata: ROS 2 Humble and later releases read it."""
+"""Format version of metadata.yaml, which ROS 2 Humble and later releases can read."""
 
 MCAP_SUFFIX = ".mcap"
 
@@ -36,10 +36,11 @@ def export_ros2(
     topics: Iterable[str] | None = None,
     progress: Callable[[float, float], None] = lambda done_s, whole_s: None,
 ) -> ExportResult:
-    """Write a bag as a bag of ROS 2.
+    """Convert a bag to a ROS 2 bag.
 
-    output: folder with metadata.yaml and an MCAP file; a name that ends with .mcap gives the MCAP
-    file alone, which contains the same metadata. topics: names; default: all. Raises ExportError,
+    output: folder to create, with metadata.yaml and an MCAP file. If its name ends with .mcap, only
+    the MCAP file is written, which contains the same metadata. topics: names of flexsheet topics;
+    default: all. progress: called with the converted and the total duration, s. Raises ExportError,
     Ros2Error and BagError.
     """
     ros = load_ros_types()
@@ -61,12 +62,12 @@ def export_ros2(
             for number, (topic, message, header, log_ns) in enumerate(reader):
                 check_free_space(output)
                 split_time(log_ns + offset_ns)
-                # The recorder receives a message almost when it is published.
+                # The delay between publication and recording is negligible.
                 same_clock = header.clock_id == selection.clock_id
                 shift_ns = offset_ns if same_clock else offset_ns + log_ns - header.publish_ns
                 for ros_topic, made in converter.convert(topic, message, header, shift_ns):
                     if topic not in selection.readable:
-                        continue  # read only because other topics need it
+                        continue  # read only to convert other topics
                     connection = connections.get(ros_topic.name)
                     if connection is None:
                         connection = connections[ros_topic.name] = writer.add_connection(
@@ -91,7 +92,7 @@ def export_ros2(
 
 
 def make_qos(topic: RosTopic) -> Any:
-    """Return the quality of service with which a topic is offered: reliable, or also latched."""
+    """Return the offered quality of service: reliable, and transient local for a latched topic."""
     from rosbags.interfaces import (
         Qos,
         QosDurability,

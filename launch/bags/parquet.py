@@ -1,7 +1,8 @@
 """Convert bags to tables: one Parquet file per topic, or a table in memory.
 
-A row is a message. Columns begin with the time of recording, timestamps, clock, writer and sequence
-number of the header. The columns of a field have its name, which contains the unit:
+Each row is a message. The first columns contain recording time, timestamps, clock, writer and
+sequence number of its header. Each field becomes one or more columns named after the field, whose
+name contains the unit:
 
     number, text, timestamp          one column
     vector of 2 or 3                 FIELD.x, FIELD.y, FIELD.z
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
 MAX_VECTOR = 6
 ROWS_PER_GROUP = 2000
 MAX_GROUP_BYTES = 64 << 20
-"""Maximum size of the images that wait for a row group to be written."""
+"""Size of buffered images at which a row group is written, bytes."""
 
 TWIST = tuple(
     f"{kind}_{axis}_{unit}"
@@ -68,7 +69,7 @@ Get = Callable[[Any], Any]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Column of a table: name, Arrow type, function that gets the value of a row, description."""
+    """Column of a table: name, Arrow type, function that reads a message's value, and metadata."""
 
     name: str
     type: Any
@@ -78,7 +79,7 @@ class Column:
 
 def _arrow() -> Any:
     if find_spec("pyarrow") is None:
-        raise ExportError("tables need the package pyarrow: pip install 'flexsheet[parquet]'")
+        raise ExportError("tables need the package pyarrow; run: pip install 'flexsheet[parquet]'")
     import pyarrow
 
     return pyarrow
@@ -86,7 +87,7 @@ def _arrow() -> Any:
 
 @cache
 def list_columns(kind: type[Message], *, images: bool) -> tuple[Column, ...]:
-    """Return the columns of the fields of a message type."""
+    """List the table columns for the fields of a message type, with or without images."""
     return tuple(_columns_of_group(kind, "", lambda message: message, images))
 
 
@@ -125,7 +126,7 @@ def _columns_of_value(
             yield Column(part, _find_type(arguments[0]), _at(get, i), about)
         return
     if origin is tuple and split_annotation(arguments[0])[1] is not None:
-        if images:  # one image or none
+        if images:  # a tuple of one image or none
             yield from _columns_of_value(arguments[0], name, _first(get), about, images)
         return
     yield Column(name, _find_type(inner), _converted(get, inner), about)
@@ -155,7 +156,7 @@ def _columns_of_array(
 
 
 def split_pose(matrix: np.ndarray) -> list[float]:
-    """Return the position and the quaternion (x, y, z, w) of a rigid transform (4, 4)."""
+    """Split a rigid transform (4, 4) into position (m) and quaternion (x, y, z, w): 7 values."""
     w, *xyz = quaternion_from_rotation(matrix[:3, :3]).tolist()
     return [*matrix[:3, 3].tolist(), *xyz, w]
 
@@ -173,7 +174,7 @@ def _is_vector(arguments: tuple[Any, ...]) -> bool:
 
 
 def _find_type(annotation: Any) -> Any:
-    """Return the Arrow type of a value that is one column."""
+    """Return the Arrow type for a value that is stored in one column."""
     arrow = _arrow()
     inner, spec = split_annotation(annotation)
     if spec is not None:
@@ -236,7 +237,7 @@ def _size(get: Get, axis: int) -> Get:
 
 
 class TableBuilder:
-    """Builder of the table of one topic: collects rows, and returns them as an Arrow table."""
+    """Builder of an Arrow table from the messages of one topic."""
 
     def __init__(self, topic: str, selection: TopicsToExport, *, images: bool) -> None:
         arrow = _arrow()
@@ -267,12 +268,12 @@ class TableBuilder:
 
     @property
     def is_full(self) -> bool:
-        """Return whether the rows should be written now."""
+        """Return whether enough rows are buffered to be written as a row group."""
         return len(self._rows) >= ROWS_PER_GROUP or self._bytes >= MAX_GROUP_BYTES
 
     def add(self, message: Message, header: Header, log_ns: int) -> None:
-        """Add a row. `time_s` is the source time since the start of the bag."""
-        # The recorder receives a message almost when it is published.
+        """Add a row for a message; `time_s` is its source time since the start of the bag."""
+        # The delay between publication and recording is negligible.
         same_clock = header.clock_id == self._selection.clock_id
         source_ns = header.source_ns + (0 if same_clock else log_ns - header.publish_ns)
         row = [
@@ -289,7 +290,7 @@ class TableBuilder:
         self._rows.append(row)
 
     def drain(self) -> pyarrow.Table:
-        """Return the rows as a table, and forget them."""
+        """Return the buffered rows as a table, and clear the buffer."""
         arrow = _arrow()
         columns = zip(*self._rows, strict=True) if self._rows else ((),) * len(self.schema)
         try:
@@ -305,7 +306,7 @@ class TableBuilder:
 
 
 def read_table(bag: Path | str, topic: str, *, images: bool = False) -> pyarrow.Table:
-    """Read a topic of a bag into an Arrow table; its method `to_pandas` makes a data frame.
+    """Read a topic of a bag into an Arrow table, which `to_pandas` converts to a data frame.
 
     Raises ExportError and BagError.
     """

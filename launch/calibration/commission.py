@@ -40,7 +40,7 @@ class CommissionError(FlexsheetError, ValueError):
 
 
 class StepName(StrEnum):
-    """Steps of a commissioning, in the order in which they run.
+    """Steps of a commissioning (calibration of a whole laboratory), in their order.
 
     camera: optics of the stereo camera. arms: poses of the arm bases in the frame of the camera.
     edges: pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of
@@ -64,7 +64,7 @@ STEPS = tuple(StepName)
 
 
 class NodeValue(LimitedModel):
-    """Measured value of a parameter, for all nodes of a type, or only for the one of an arm."""
+    """Measured value of a node parameter, for all nodes of a type or for that of one arm."""
 
     node_type: str
     parameter: str
@@ -73,13 +73,13 @@ class NodeValue(LimitedModel):
 
 
 class StepResult(LimitedModel):
-    """Result of one step.
+    """Result of one step of a commissioning.
 
-    residual: error of the fit in `unit`. advice: what to do if it is above `limit`. uncertainty:
-    standard deviations, whose names end in their units. scene_values: values by dotted path in the
-    scene. parameters: names of calibration files in the folder, by node type and parameter
-    (TYPE.PARAMETER). figures: further results. covariances: covariance matrices by name, from which
-    errors are predicted. node_values: other measured parameters of nodes.
+    residual: error of the fit in `unit`. advice: remedy if the residual exceeds `limit`.
+    uncertainty: standard deviations, whose names end in their units. scene_values: new values of
+    the scene by dotted path. parameters: names of calibration files in the folder, by node type and
+    parameter (TYPE.PARAMETER). figures: further results. covariances: covariance matrices by name,
+    from which errors are predicted. node_values: other measured parameters of nodes.
     """
 
     residual: float
@@ -341,7 +341,7 @@ def format_report(state: State) -> str:
 
 
 def _format_verdict(figures: Mapping[str, Any]) -> list[str]:
-    """Return the predicted errors as a table, and whether the laboratory is good, with reasons."""
+    """Format the predicted errors as a table, and the verdict on the laboratory with reasons."""
     lines = ["", "## Predicted errors", ""]
     lines += ["| metric | root mean square | 95 % | tolerance |", "|---|---|---|---|"]
     lines += [
@@ -357,7 +357,7 @@ def _format_verdict(figures: Mapping[str, Any]) -> list[str]:
 def list_doubts(
     steps: Mapping[StepName, StepRecord], figures: Mapping[str, Any], tracking: tuple[float, float]
 ) -> list[str]:
-    """Return why a laboratory may exceed a tolerance; empty if all errors are expected within it.
+    """List reasons why a laboratory may exceed a tolerance; empty if none is expected.
 
     figures: results of the verification. tracking: error of the sheet in the stroke as the devices
     report it, and its tolerance, mm.

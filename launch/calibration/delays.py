@@ -1,8 +1,8 @@
 """Measure the servo lags of the arms while they follow a stroke of the finger.
 
-Each arm bridge measures the lag of its arm behind the commands, from commanded and measured joints.
-It starts with the lag in the launch file, and its self-check reports a deviation from that value.
-So the measured lag is written into the launch file.
+The servo lag is the time by which an arm follows its commands. Each arm bridge measures it from
+commanded and measured joints. The bridge starts with the lag in the launch file, and its self-check
+reports a deviation from that value. Therefore the measured lag is written into the launch file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ STROKE_S = 5.0
 
 
 class DelaysError(FlexsheetError, ValueError):
-    """Raised for a recording from which the lag of an arm cannot be read."""
+    """Raised for a recording that does not contain the measured servo lag of an arm."""
 
     code = "delays-calibration"
     remedy = "Record a stroke in which both arms follow the finger for several seconds."
@@ -32,14 +32,14 @@ class DelaysError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredLag:
-    """Servo lag of an arm, including the latency of its commands, with standard deviation, s."""
+    """Servo lag of an arm, including command latency, and its standard deviation (s)."""
 
     lag_s: float
     uncertainty_s: float
 
 
 def read_measured_lags(bag: Path) -> dict[Side, MeasuredLag]:
-    """Return the newest lags that the bridges measured in a bag; raises DelaysError without one."""
+    """Read the last servo lag of each arm from a bag; raises DelaysError if one is missing."""
     found: dict[Side, MeasuredLag] = {}
     for _, message, _, _ in BagReader(bag, topics=["arm_left", "arm_right"]):
         if not isinstance(message, ArmState) or message.servo_lag_s is None:
@@ -53,7 +53,7 @@ def read_measured_lags(bag: Path) -> dict[Side, MeasuredLag]:
 
 
 def measure_lags_in_simulation(scene: Scene, apparatus: Apparatus) -> dict[Side, MeasuredLag]:
-    """Return the lags that the bridges of simulated arms measure in a stroke."""
+    """Simulate a stroke of the finger, and return the servo lags that both bridges measure."""
     found = follow_in_simulated_time(scene, stroke_path(scene, STROKE_S), apparatus)
     lags_ms, uncertainties_ms = found["servo_lag_ms"], found["servo_lag_uncertainty_ms"]
     lags = {}

@@ -1,10 +1,10 @@
-"""Measure the positions of the viewer's eyes from points that an eye sees behind one another.
+"""Measure the positions of the viewer's eyes from pairs of points that appear aligned to an eye.
 
 The projector shows a cross on the sheet. The viewer closes one eye and moves a bead, which stands
-between the eye and the sheet, until it covers the cross. The stereo camera measures both points, so
-that the eye lies on the straight line through them. Lines through beads at several positions meet
-at the eye. Augmented reality calls this active alignment (Tuceryan and Navab 2000). It measures the
-eye's own centre of projection, and neither the projector nor the sheet has to be calibrated.
+between the eye and the sheet, until it covers the cross. The stereo camera measures both points.
+The eye lies on the straight line through them, and the lines for several bead positions meet at the
+eye. Augmented reality uses the same method (active alignment, Tuceryan and Navab 2000). It measures
+the centre of projection of the eye, and needs no calibration of projector or sheet.
 """
 
 from __future__ import annotations
@@ -41,31 +41,34 @@ Floats = NDArray[np.float64]
 SIDES: tuple[Side, Side] = ("left", "right")
 POINTS = ("bead", "cross")
 COLUMNS = ("eye", *(f"{point}_{axis}_mm" for point in POINTS for axis in "xyz"))
-"""Columns of the CSV file, which has one row for each alignment: eye, and measured positions of
-bead and cross in the world."""
+"""Columns of the CSV file with one row per alignment: the open eye (left or right), and the
+measured world positions of bead and cross, mm."""
 
 MIN_ALIGNMENTS = 6
 OUTLIER_RATIO = 2.0
-"""Multiple of the robust standard deviation above which the influence of an angle no longer grows
-(Huber 1964)."""
+"""Multiple of the median distance above which the influence of an alignment on the fit no longer
+grows (Huber 1964)."""
 
 MAX_ANGLE_RAD = 0.02
-"""Maximum root mean square of the angles; a larger one indicates exchanged eyes or points."""
+"""Maximum rms angle between bead and cross at the fitted eye.
+
+A larger angle indicates that the eyes, or bead and cross, have been exchanged in the file.
+"""
 
 MAX_SHIFT_M = 0.3
-"""Maximum distance of a measured eye from that of the scene."""
+"""Maximum distance of a measured eye from its position in the scene."""
 
 MIN_DISTANCE_M = 0.05
 """Minimum distance between bead and cross."""
 
 BEADS_M = tuple((x, y, z) for z in (0.10, 0.15) for y in (-0.05, 0.0, 0.05)
                 for x in (-0.05, 0.0, 0.05))  # fmt: skip
-"""Simulated positions of the bead, which the viewer uses with each eye."""
+"""World positions (x, y, z) of the bead in a simulation, used with each eye."""
 ALIGNMENT_S = 6.0
-"""Time from one simulated alignment to the next."""
+"""Time between two simulated alignments."""
 
 HEAD_REST_SWAY_M = 1.5e-3
-"""Maximum standard deviation of the head's motion on a chin rest, which the procedure requires."""
+"""Maximum standard deviation of head motion on a chin rest, which the procedure requires."""
 
 
 class EyesError(FlexsheetError, ValueError):
@@ -80,7 +83,7 @@ class EyesError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Bead and cross (3,), m, that one eye sees as one point."""
+    """Measured world positions (3,) of a bead and a cross that coincide for one eye, m."""
 
     eye: Side
     bead_m: Floats
@@ -89,11 +92,11 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class EyesFit:
-    """Measured eyes of a scene.
+    """Measured positions of both eyes, with their uncertainty.
 
     angle_rms_rad: root mean square of the angle between bead and cross at the measured eye.
-    covariance_m2: (3, 3) of the point between the eyes. interocular_std_m: standard deviation of
-    the eyes' distance.
+    covariance_m2: covariance (3, 3) of the midpoint between the eyes. interocular_std_m: standard
+    deviation of the distance between the eyes.
     """
 
     eyes: Eyes
@@ -103,30 +106,31 @@ class EyesFit:
 
 
 def fit_eyes(alignments: Sequence[Alignment], guess: Eyes) -> EyesFit:
-    """Fit both eyes to alignments; raises EyesError if they do not determine the eyes.
+    """Fit the positions of both eyes to alignments, starting from `guess`.
 
-    For each eye, the sum of the squared distances of the crosses from the lines of sight through
-    their beads is smallest. (Angles would not do: they become zero for an eye at infinity.)
+    For each eye, the fit minimizes the distances of the crosses from the lines of sight through
+    their beads, with a Huber loss. It does not minimize angles, because these approach zero for an
+    eye at infinity. Raises EyesError if the alignments do not determine the eyes.
     """
     positions, covariances, angles = [], [], []
     for sign, side in zip((-0.5, 0.5), SIDES, strict=True):
         given = [one for one in alignments if one.eye == side]
         if len(given) < MIN_ALIGNMENTS:
             raise EyesError(
-                f"{len(given)} alignments of the {side} eye; at least {MIN_ALIGNMENTS} are needed"
+                f"{len(given)} alignments of the {side} eye; at least {MIN_ALIGNMENTS} are required"
             )
         start = guess.centre_world_m + sign * guess.interocular_m * np.eye(3)[0]
         position, covariance, rms_rad = _fit_eye(given, start)
         if np.linalg.norm(position - start) > MAX_SHIFT_M:
             raise EyesError(
-                f"the lines of the {side} eye meet {np.linalg.norm(position - start):.2g} m from "
-                f"the eye of the scene, at most {MAX_SHIFT_M:g} m are expected; check "
-                "eyes.centre_world_m in the scene, and the columns of the file"
+                f"the measured {side} eye is {np.linalg.norm(position - start):.2g} m from its "
+                f"position in the scene, at most {MAX_SHIFT_M:g} m are allowed; check "
+                "eyes.centre_world_m in the scene, and the columns of the CSV file"
             )
         if rms_rad > MAX_ANGLE_RAD:
             raise EyesError(
-                f"bead and cross of the {side} eye differ by {1e3 * rms_rad:.1f} mrad, at most "
-                f"{1e3 * MAX_ANGLE_RAD:.0f} mrad are expected; check the columns eye, bead, cross"
+                f"{side} eye: the rms angle between bead and cross is {1e3 * rms_rad:.1f} mrad, at "
+                f"most {1e3 * MAX_ANGLE_RAD:.0f} mrad are allowed; check all columns of the CSV"
             )
         positions.append(position)
         covariances.append(covariance)
@@ -145,17 +149,17 @@ def fit_eyes(alignments: Sequence[Alignment], guess: Eyes) -> EyesFit:
 
 
 def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Floats, float]:
-    """Return an eye's position (3,), its covariance (3, 3) and the rms angle, rad."""
+    """Fit one eye; return its position (3,), the covariance (3, 3) and the rms angle (rad)."""
     beads = np.array([one.bead_m for one in alignments])
     crosses = np.array([one.cross_m for one in alignments])
     if np.linalg.norm(beads - crosses, axis=1).min() < MIN_DISTANCE_M:
         raise EyesError(
-            f"a bead is closer than {1e3 * MIN_DISTANCE_M:.0f} mm to its cross; move it towards "
-            "the viewer"
+            f"a bead is less than {1e3 * MIN_DISTANCE_M:.0f} mm from its cross; hold the bead "
+            "closer to the viewer"
         )
 
     def offsets(eye: Floats) -> Floats:
-        """Return the vectors (n, 3) from the lines of sight through the beads to the crosses."""
+        """Return the shortest vectors (n, 3) from the lines of sight to the crosses, m."""
         directions, far = beads - eye, crosses - eye
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         return np.asarray(far - np.einsum("ni,ni->n", far, directions)[:, None] * directions)
@@ -174,7 +178,7 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
         lengths_m = np.linalg.norm(offsets(solved.x), axis=1)
         scale_m = OUTLIER_RATIO * max(float(np.median(lengths_m)), 1e-5)
         start = solved.x
-    # An offset has two components across the line of sight; the eye has three unknowns.
+    # Each offset has two components, across the line of sight; the eye has three unknowns.
     variance_m2 = float((lengths_m**2).sum()) / (2 * len(lengths_m) - 3)
     covariance = variance_m2 * np.linalg.pinv(solved.jac.T @ solved.jac)
     angles = lengths_m / np.linalg.norm(crosses - solved.x, axis=1)
@@ -184,7 +188,7 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
 def read_alignments(path: Path) -> list[Alignment]:
     """Read alignments from a CSV file with the columns `COLUMNS`.
 
-    Raises BadInputError with file, line, column, value and remedy.
+    Raises BadInputError, which names file, line, column and value, and states the remedy.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -232,11 +236,12 @@ def _rest(position: Floats, _time_s: float) -> Floats:
 def simulate_alignments(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> list[Alignment]:
-    """Simulate alignments of a viewer, as the simulated stereo camera sees them.
+    """Simulate a viewer's alignments, measured by the simulated stereo camera.
 
-    The arms hold the flat sheet at the screen. Alignments are left out if the sheet is not behind
-    the bead, or if the detector rejects one of the points. calibration: camera parameters that the
-    detector uses; None: those of the scene.
+    The arms hold the flat sheet at the screen. An alignment is omitted if the viewer does not see
+    the sheet behind the bead, or if the detector rejects one of the points. apparatus: true
+    parameters of the simulated hardware. calibration: camera parameters that the detector uses;
+    None: those of the scene.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)

@@ -1,10 +1,11 @@
 """Predict the errors of a commissioned laboratory from the uncertainties of its calibrations.
 
-The scene describes the devices as they were calibrated. Random apparatuses (true parameters) are
-drawn that could equal the real devices: deviations with the covariances of the calibrations, and
-with the tolerances below for what no step measures. All errors of the sheet, image, force and
-fingertip follow from one such apparatus, so that errors that several devices have in common are
-counted once. Only files of the commissioning are read, not the true parameters.
+The scene contains the calibrated parameters of the devices. The prediction is a Monte Carlo
+simulation: it samples apparatuses, which are sets of possible true parameters of the devices. Their
+deviations from the scene have the covariances of the calibrations. Parameters that no calibration
+measures deviate by the standard deviations below. All errors of sheet, image, force and fingertip
+are computed from the same samples, so that errors with a common cause are counted once. The true
+parameters of simulated devices are not read.
 """
 
 from __future__ import annotations
@@ -43,31 +44,38 @@ Random = np.random.Generator
 DRAWS = 12
 DRAW_SEED = 20_000
 PIXEL_M = 0.0025
-"""Resolution of the predicted images. Their error is the mean over a hundred mm²."""
+"""Size of a pixel of the predicted images, m. Their error is averaged over about 100 mm²."""
 
 CELLS = 16
-"""Number of node intervals per side of the sheet's mesh in a prediction."""
+"""Number of mesh intervals per side of the sheet in a prediction."""
 
 NORMAL_95 = 1.645
 """95 % quantile of the standard normal distribution."""
 
 RADIUS_STD_M = 3e-4
-"""Calliper on a soft fingertip."""
+"""Standard deviation of the finger radius, measured with a calliper on a soft fingertip."""
 
 EYE_STD_M = 5e-3
-"""Head tracker, per axis, unless a step measures the eyes."""
+"""Standard deviation per axis of a head tracker, used if no step has measured the eyes."""
 
 STAMP_STD_S = 3e-3
-"""Exposure time minus timestamp, unless a step measures it: within half an exposure of 10 ms."""
+"""Standard deviation of exposure time minus timestamp, used if no step has measured it.
+
+The value assumes a uniform distribution within an exposure of 10 ms.
+"""
 
 THICKNESS_GRADIENT_STD, DENSITY_STD_RATIO = 0.03, 0.04
-"""Rubber sheets by ISO 3302-1 class M1, and density of natural rubber compounds."""
+"""Standard deviations of the relative thickness gradient of the sheet and of its relative density.
+
+Sources: ISO 3302-1 class M1 for rubber sheets; densities of natural rubber compounds.
+"""
 
 FRICTION, FRICTION_STD_LN = 1.24, 0.3
-"""Friction coefficient between rubber and a finger at 1 N (Seo et al. 2009)."""
+"""Friction coefficient between rubber and a finger at 1 N, and standard deviation of its logarithm
+(Seo et al. 2009)."""
 
 CREEP_RATIO_PER_DECADE, CREEP_STD = 0.05, 0.02
-"""Relative decrease of the force of natural rubber per decade of time."""
+"""Relative decrease of the force of natural rubber per decade of time, and standard deviation."""
 
 MAX_HYSTERESIS_RATIO = 0.9
 
@@ -75,7 +83,8 @@ MAX_HYSTERESIS_RATIO = 0.9
 class PredictedError(LimitedModel):
     """Predicted error of one metric, in the unit of the metric.
 
-    typical: root mean square. limit_95: 95 % quantile. tolerance: tolerance of the scene.
+    typical: root mean square error. limit_95: 95 % quantile of the error. tolerance: maximum error
+    that the scene allows.
     """
 
     typical: float
@@ -88,9 +97,10 @@ class PredictedError(LimitedModel):
 class Knowledge:
     """Results of a commissioning from which errors are predicted.
 
-    calibrations: calibration files of the nodes. edges: covariances (19, 19) of the unknowns of
-    `fit_edges` by side, or empty. projector_px2: covariance (2, 2) of the image's displacement.
-    eyes_m2: covariance (3, 3) of the eyes. stamp_std_s: see STAMP_STD_S.
+    calibrations: calibrations that the nodes use. edges: by side, covariance (19, 19) of the
+    unknowns of `fit_edges`; a side that was not calibrated is absent. projector_px2: covariance
+    (2, 2) of the displacement of the projected image. eyes_m2: covariance (3, 3) of the midpoint
+    between the eyes. stamp_std_s: standard deviation of exposure time minus timestamp.
     """
 
     scene: Scene
@@ -106,14 +116,15 @@ def predict_errors(
 ) -> dict[Metric, PredictedError]:
     """Predict the errors of sheet and fingertip during a stroke, and of image and force at rest.
 
-    tracking_m: mean error of the sheet that the devices themselves report during a stroke. It is
-    independent of the errors of the calibrations, and is added to them in quadrature.
+    tracking_m: mean tracking error of the sheet that the devices report during a stroke. It is
+    independent of the calibration errors, so it is added to them in quadrature. draws: number of
+    random apparatuses.
     """
     random = np.random.default_rng(DRAW_SEED)
     scene = known.scene
     given = known.calibrations
     if given.stereo is not None:
-        # The drawn apparatuses have the camera that the simulator assumes for the scene.
+        # All sampled apparatuses have the true camera that the simulator derives from the scene.
         true = make_true_camera(scene.camera)
         exact = {
             "left": true.left, "right": true.right, "right_from_left": true.right_from_left,
@@ -132,8 +143,8 @@ def predict_errors(
             continue
         if metric is Metric.SHEET:
             errors = np.hypot(errors, 1e3 * tracking_m)
-        # The quantile of a length with normal components: of few draws, it is more certain than
-        # an empirical one.
+        # With few samples, the quantile of a fitted normal distribution is more certain than the
+        # empirical quantile.
         high = float(errors.mean() + NORMAL_95 * errors.std(ddof=1))
         predicted[metric] = PredictedError(
             typical=float(np.sqrt(np.mean(errors**2))),
@@ -145,7 +156,7 @@ def predict_errors(
 
 
 def draw_apparatus(known: Knowledge, random: Random) -> Apparatus:
-    """Draw an apparatus that is consistent with what is known about the devices."""
+    """Draw a random apparatus (true parameters) that is consistent with the calibrations."""
     scene, given = known.scene, known.calibrations
     apparatus = nominal_apparatus(scene)
     seen_m = dict.fromkeys(("left", "right"), np.zeros(3))
@@ -198,9 +209,10 @@ def draw_apparatus(known: Knowledge, random: Random) -> Apparatus:
 def draw_camera_errors(
     scene: Scene, calibration: StereoCalibration, random: Random
 ) -> dict[str, Floats]:
-    """Draw the errors (3,), m, of measured positions at the clamps, relative to the finger.
+    """Draw random errors (3,) of the measured clamp positions relative to the finger, m, by side.
 
-    An error that clamps and finger share displaces both, so that only the difference counts.
+    Only the difference from the error at the finger matters, because a common error displaces
+    clamps and finger equally.
     """
     left, right, stand = calibration.left, calibration.right, calibration.right_from_left
     rig = np.zeros(22)
@@ -219,7 +231,11 @@ def draw_camera_errors(
 
 
 def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: Random) -> ArmTruth:
-    """Draw the true parameters of an arm; seen_m: error of its clamp's measured position."""
+    """Draw random true parameters of an arm.
+
+    covariance: covariance (19, 19) of `fit_edges`; None returns the arm unchanged. seen_m: error
+    (3,) of the measured position of its clamp, m.
+    """
     if covariance is None:
         return arm
     off = _draw(covariance, random)
@@ -237,7 +253,7 @@ def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: R
 
 
 def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
-    """Draw modulus and width of the sheet; empty without a calibration."""
+    """Draw random modulus and slack width of the sheet; empty without a sheet calibration."""
     sheet = known.calibrations.sheet
     if sheet is None:
         return {}
@@ -250,10 +266,10 @@ def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
 
 
 def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Random) -> Apparatus:
-    """Return the apparatus with the hysteresis whose forces differ as in the calibration.
+    """Return the apparatus with a random hysteresis that is consistent with the calibration.
 
-    The calibration compares the forces of a push in and out at the same depth. They differ by
-    hysteresis and by the creep of the apparatus.
+    The calibration measures how much smaller the force is while unloading than while loading, at
+    the same depth. Creep explains a part of this difference, and the hysteresis the remainder.
     """
     if sheet.hysteresis_ratio is None:
         return apparatus
@@ -274,7 +290,7 @@ def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Rando
 
 
 def draw_marker(scene: Scene, given: NodeCalibrations, random: Random) -> tuple[float, ...]:
-    """Draw the true marker in the finger's frame of the simulator, m."""
+    """Draw a random true position (3,) of the marker in the simulator's finger frame, m."""
     world_m = given.find_marker_offset_m(scene)
     if given.marker is not None:
         world_m = world_m + np.array(given.marker.standard_deviations_m) * random.standard_normal(3)
@@ -284,7 +300,7 @@ def draw_marker(scene: Scene, given: NodeCalibrations, random: Random) -> tuple[
 
 
 def _draw(covariance: Floats, random: Random) -> Floats:
-    """Draw from a normal distribution with mean 0; the covariance may be singular."""
+    """Draw a random vector with normal distribution and mean 0; the covariance may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     scales = np.sqrt(np.maximum(values, 0.0))
     return np.asarray(vectors @ (scales * random.standard_normal(len(values))))

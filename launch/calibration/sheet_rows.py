@@ -241,7 +241,7 @@ def simulate_rows(
 
 
 def _simulated_cases(scene: Scene, places: bool) -> Iterator[tuple[float, tuple[float, float]]]:
-    """Yield each combination of a stretch ratio and a pushed point (x, y), m."""
+    """Yield each simulated combination of a stretch ratio and a pushed point (x, y), m."""
     sheet = scene.sheet
     stretches = np.linspace(
         max(sheet.min_stretch_ratio, 1.005), sheet.max_stretch_ratio, SIMULATED_STRETCHES

@@ -250,11 +250,11 @@ def export(
     target: FormerOutput = None,
     output: Annotated[
         Path | None,
-        output_file("MCAP file to write; for ROS 2 also a folder, which is then a bag of ROS 2."),
+        output_file("MCAP file to write; with --format ros2, a folder name gives a ROS 2 bag."),
     ] = None,
     form: Annotated[
         Literal["foxglove", "ros2"],
-        typer.Option("--format", help="foxglove: for Foxglove and Rerun; ros2: for ROS 2."),
+        typer.Option("--format", help="foxglove: MCAP for Foxglove and Rerun; ros2: ROS 2."),
     ] = "foxglove",
     topics: TopicsOption = None,
     as_json: JsonOption = False,
@@ -281,13 +281,13 @@ def to_parquet(
     *,
     bag: BagArgument,
     output: Annotated[
-        Path | None, output_file("Folder to write; default: next to the bag.", "FOLDER")
+        Path | None, output_file("Folder to write; default: bag path without suffix.", "FOLDER")
     ] = None,
     topics: TopicsOption = None,
-    images: Annotated[bool, typer.Option("--images", help="Write images too, as bytes.")] = False,
+    images: Annotated[bool, typer.Option("--images", help="Include images as bytes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Convert a bag to one table per topic, for pandas and other tools that read Parquet files."""
+    """Convert each topic of a bag to a Parquet file, for pandas and other analysis tools."""
     from flexsheet.launch.bags.parquet import write_parquet
 
     output = output or bag.with_suffix("")
@@ -414,7 +414,7 @@ def plot(
 
 
 def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
-    """Print how many messages were written by topic or channel, and what could not be read."""
+    """Print the number of exported messages by topic or channel, and the unreadable topics."""
     if result.unreadable:
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED

@@ -433,7 +433,7 @@ class Laboratory:
         centre = [calibrate.round_digits(one) for one in found.eyes.centre_world_m]
         std_mm = 1e3 * np.sqrt(np.diag(found.covariance_m2))
         lateral_mm, depth_mm = float(np.linalg.norm(std_mm[:2])), float(std_mm[2])
-        # An error of the eyes displaces what lies behind the screen, here by the depth of a push.
+        # An eye position error displaces the image of points behind the screen, here at push depth.
         behind_m, distance_m = scene.working_range.push_depth_m, found.eyes.centre_world_m[2]
         across_m = 0.25 * scene.sheet.width_m
         shift_mm = behind_m * math.hypot(lateral_mm, depth_mm * across_m / distance_m)
@@ -513,7 +513,7 @@ class Laboratory:
 
 
 def collect_knowledge(lab: Commissioning) -> Knowledge:
-    """Return what the finished steps know about the devices."""
+    """Collect calibrations and covariances of the finished steps, to predict errors from them."""
     from flexsheet.launch.calibration.prediction import EYE_STD_M, STAMP_STD_S, Knowledge
     from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 
@@ -537,10 +537,10 @@ def collect_knowledge(lab: Commissioning) -> Knowledge:
 def run_verification(
     lab: Commissioning, seconds: float, seed: int, *, simulated_time: bool
 ) -> dict[str, Any]:
-    """Run a stroke of a simulated laboratory, and evaluate its true errors at rest.
+    """Run a stroke in a simulated laboratory, and evaluate its true errors at rest.
 
-    simulated_time: run the stroke without a graph, and omit the errors before the calibration. No
-    self-checks run then.
+    simulated_time: run the stroke without a graph and without self-checks, and omit the errors
+    before calibration.
     """
     from flexsheet.launch.experiments.maps import draw_cross_errors
     from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
@@ -622,11 +622,11 @@ def _read_stroke(path: Path) -> dict[str, Any]:
 def describe_sheet(
     scene: Scene, modulus_thickness_n_per_m: float, width_m: float
 ) -> dict[str, float]:
-    """Return the values of the scene for a measured sheet.
+    """Return the values to store in the scene for a measured sheet, by dotted path.
 
-    modulus_thickness_n_per_m: product of modulus and thickness. width_m: width without tension. The
-    step `edges` measured how far the tension displaces the flanges. Their compliances change so
-    that this displacement stays the same with the other tension, at the middle stretch.
+    modulus_thickness_n_per_m: product of Young's modulus and thickness. width_m: width without
+    tension. The step `edges` measured how far the tension displaces the flanges. The measured sheet
+    has another tension, so the compliances are scaled to keep this displacement at mean stretch.
     """
     sheet = scene.sheet
     modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m

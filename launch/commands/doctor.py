@@ -119,7 +119,7 @@ def check_scene(
 
 
 def _describe_branch(branch: dict[str, Any]) -> str:
-    """Return the names of a branch, or for arms without names the joints to which it leads."""
+    """Describe a branch (joint solution) by its names, or by its joint angles if it has none."""
     if "seed_rad" not in branch:
         return ", ".join(branch.values())
     degrees = (f"{math.degrees(angle):.0f}" for angle in branch["seed_rad"])

@@ -280,8 +280,8 @@ def compliance(
 ) -> None:
     """Compare the force on the finger with that of the virtual object at several push depths.
 
-    The experiment waits until the soft body is computed by a table, about a minute on the first
-    start.
+    The experiment first waits for the table of the soft body. If the table is not in the cache, its
+    computation takes about a minute.
     """
     from flexsheet.launch.experiments import compliance as experiment
     from flexsheet.launch.experiments.pictures import draw_compliance
@@ -348,7 +348,7 @@ def _measure_images(
     as_json: bool,
     with_table: bool = False,
 ) -> None:
-    """Run the experiment; with_table: wait for a table of the soft body."""
+    """Run the experiment; with_table: wait first until the soft body's table is computed."""
     from flexsheet.launch.experiments import image
     from flexsheet.launch.experiments.maps import draw_error_maps
     from flexsheet.launch.experiments.run import (

@@ -144,7 +144,7 @@ def robustness(
 
 
 def _print_predictions(found: dict[str, Any]) -> None:
-    """Print how often the reports of the laboratories are right, overall and by metric."""
+    """Print how often the reports of the laboratories agree with their true errors."""
     cases = ("good_and_within", "good_but_exceeded", "doubted_but_within", "doubted_and_exceeded")
     every = {"all": {**found["confusion"], "stated_over_true": {"median": None}}}
     print_table(

@@ -1,4 +1,4 @@
-"""`flexsheet files`: list the files that the package contains besides its code."""
+"""`flexsheet files`: list the data files of the package, such as launch files and scenes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ app = make_app()
 
 
 class FileKind(StrEnum):
-    """Kind of files in the package."""
+    """Kind of data file in the package."""
 
     LAUNCH = "launch"
     SCENE = "scene"
@@ -34,7 +34,7 @@ PATTERNS = {
     FileKind.SYSTEMD: "systemd/*",
     FileKind.DOCKER: "../docker/[!.]*",
 }
-"""Pattern of each kind's files, relative to the folder of the launch files."""
+"""File pattern (glob) of each kind, relative to the folder of the launch files."""
 
 
 @app.command(epilog=examples("flexsheet files", "flexsheet files docker --json"))
@@ -46,7 +46,7 @@ def files(
 ) -> None:
     """List launch files, scenes, calibrations, layouts, systemd units and Compose files.
 
-    KIND is launch, scene, calibration, layout, systemd or docker. Copy a file to change it.
+    KIND is launch, scene, calibration, layout, systemd or docker. To change a file, copy it first.
     """
     kinds = list(FileKind) if kind is None else [kind]
     rows = [{"kind": str(one), "path": str(path)} for one in kinds for path in list_files(one)]

@@ -1,4 +1,4 @@
-"""`flexsheet man`: print the manual page, which is generated from the commands."""
+"""`flexsheet man`: print the manual page, generated from the help of all commands."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ EXIT_CODES = {
 
 @app.command(epilog=examples("flexsheet man", "flexsheet man --json"))
 def man(as_json: JsonOption = False) -> None:
-    """Print the manual page in roff format; `flexsheet man | man -l -` shows it."""
+    """Print the manual page in roff format; to read it, run `flexsheet man | man -l -`."""
     text = render()
     if as_json:
         print_json({"name": "flexsheet.1", "text": text})
@@ -104,7 +104,7 @@ def _format_command(name: str, command: Any) -> Iterator[str]:
 
 
 def _escape(text: str) -> str:
-    """Escape text for roff: backslashes, hyphens, and a dot or apostrophe that begins a line."""
+    """Escape backslashes, hyphens, and dots or apostrophes at the start of a line for roff."""
     plain = re.sub(r"\[/?(?:bold|dim|italic)?\]", "", text)
     escaped = plain.replace("\\", r"\e").replace("-", r"\-")
     return rf"\&{escaped}" if escaped[:1] in (".", "'") else escaped

@@ -43,8 +43,8 @@ def ros2_bridge(
         list[ExternalTopic] | None,
         typer.Option(
             "--accept",
-            help="Topic to accept from ROS nodes, as /external/eye or /external/fingertip; repeat "
-            "for several; default: none.",
+            help="Topic that ROS nodes may publish, as /external/eye or /external/fingertip; can "
+            "be repeated; default: none.",
         ),
     ] = None,
     noise_mm: Annotated[
@@ -54,20 +54,20 @@ def ros2_bridge(
             metavar="MM",
             min=0.01,
             max=50.0,
-            help="Standard deviation of an external fingertip, mm.",
+            help="Standard deviation of external fingertip positions, mm.",
         ),
     ] = 1.0,
     domain: Annotated[
         int | None,
         typer.Option(
-            metavar="N", min=0, max=232, help="DDS domain; default: ROS_DOMAIN_ID, else 0."
+            metavar="N", min=0, max=232, help="DDS domain number; default: ROS_DOMAIN_ID or 0."
         ),
     ] = None,
     interface: Annotated[
         str,
         typer.Option(
             metavar="NAME",
-            help="Network interface. DDS has no authentication here: on another interface than lo, "
+            help="Network interface. DDS has no authentication here: on any interface except lo, "
             "everyone in that network can read the topics and publish external inputs.",
         ),
     ] = "lo",
@@ -77,8 +77,8 @@ def ros2_bridge(
 ) -> None:
     """Publish the topics of the running graph to ROS 2, and accept external inputs.
 
-    RViz and `ros2 bag record` see the arms, the sheet and the fingertip. The bridge uses the
-    loopback interface and never commands the arms.
+    Arms, sheet and fingertip then appear in RViz and `ros2 bag record`. By default the bridge uses
+    the loopback interface. It never commands the arms.
     """
     from flexsheet.launch.ros2.bridge import list_default_topics
     from flexsheet.launch.ros2.dds import MAX_DOMAIN, RosParticipant

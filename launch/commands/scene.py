@@ -22,7 +22,7 @@ app = make_app("Export the apparatus of a scene to other tools.")
 
 
 class ModelFormat(StrEnum):
-    """Format of a model of the apparatus."""
+    """File format of an exported model of the apparatus."""
 
     URDF = "urdf"
     GLTF = "gltf"
@@ -64,8 +64,8 @@ def export(
 ) -> None:
     """Write arms, clamps, camera, projector and screen as a URDF or glTF model.
 
-    The joints have the names left_joint_1 to right_joint_6. A viewer can move the arms by them. The
-    model contains geometry and joint limits, but no masses and torques.
+    The joints are named left_joint_1 to left_joint_6 and right_joint_1 to right_joint_6, and can be
+    moved in a viewer. The model contains geometry and joint limits, but no masses or torques.
     """
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.launch.viewing.apparatus_model import make_model, solve_rest_joints

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 app = make_app()
 
 NICENESS = 10
-"""The viewer gives way to the nodes of the graph."""
+"""Niceness of the server, so that the nodes of the graph have priority."""
 
 
 @app.command(
@@ -46,14 +46,14 @@ def view(
     """Serve the running graph to the viewers Foxglove and Lichtblick, until Ctrl-C.
 
     In the viewer, open a connection of the type "Foxglove WebSocket" with the printed address, and
-    import the printed layout file. The server listens on this computer only, and is read-only. To
-    use it from another computer, run ssh -L 8765:127.0.0.1:8765 THIS_COMPUTER there.
+    import the printed layout file. The server is read-only and listens on this computer only. On
+    another computer, first run there: ssh -L 8765:127.0.0.1:8765 THIS_COMPUTER
     """
     try:
         import foxglove  # noqa: F401
     except ImportError as error:
         raise CommandError(
-            "view needs the package foxglove-sdk: pip install 'flexsheet[view]'"
+            "view needs the package foxglove-sdk; run: pip install 'flexsheet[view]'"
         ) from error
     plan, found = running_graph(run)
     os.nice(NICENESS)

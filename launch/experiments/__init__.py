@@ -31,7 +31,7 @@ class ExperimentInterruptedError(ExperimentError):
 def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
     """Check names and remove duplicates; without names, return all known ones.
 
-    kind: what the names are, for the error. Raises ExperimentError for an unknown name.
+    kind: noun for the names in the error text. Raises ExperimentError for an unknown name.
     """
     for name in names:
         if name not in known:

@@ -200,7 +200,7 @@ class Driver:
     async def wait_for_table(
         self, scene: Scene, method: TableMethod, progress: Callable[[str], None]
     ) -> None:
-        """Wait until the soft body is computed by a table that is at least as precise as `method`.
+        """Wait until the soft body uses a table that is at least as precise as `method`.
 
         Until then, a node with an empty cache uses a less precise method. Return at once if the
         scene or the parameters of all nodes choose such a method. progress: receives the node's
@@ -347,7 +347,7 @@ class Driver:
 
 
 def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
-    """Return whether a solver uses a table for a scene, and computes it if it is not cached."""
+    """Return whether a solver node uses a table for a scene and computes a missing one."""
     method, _ = choose_method(
         scene,
         parameters.method,

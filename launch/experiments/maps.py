@@ -23,7 +23,7 @@ MIN_MM, MAX_MM = 0.01, 10.0
 """Limits of the logarithmic colour scale."""
 
 CROSS_MAGNIFICATION = 20.0
-"""Factor by which the arrows of `draw_cross_errors` are longer than the errors."""
+"""Magnification of the error arrows in `draw_cross_errors`."""
 
 
 def draw_error_maps(images: dict[str, EyeImage], series: Series, path: Path) -> None:
@@ -64,7 +64,7 @@ def _find_box(maps: list[ErrorMap]) -> tuple[slice, slice]:
 
 
 def draw_cross_errors(errors: CrossErrors, path: Path) -> None:
-    """Draw where both eyes see the projected crosses, relative to the touched points."""
+    """Plot, for each eye, the errors of the seen crosses relative to the touched points."""
     figure = Figure(figsize=(7, 6), layout="constrained")
     axes = figure.subplots()
     places_mm, errors_mm = 1e3 * errors.places_m, 1e3 * errors.errors_m

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class NodeCalibrations:
-    """Calibrations that the nodes use in addition to the scene."""
+    """Calibrations of stereo camera, sheet and marker that nodes use; None: from the scene."""
 
     stereo: StereoCalibration | None = None
     sheet: SheetCalibration | None = None
@@ -45,7 +45,7 @@ class NodeCalibrations:
         return NodeCalibrations(stereo, sheet, marker)
 
     def find_marker_offset_m(self, scene: Scene) -> Floats:
-        """Return the vector (3,) from the finger's pad to its marker in the world, as measured."""
+        """Return the measured vector (3,) from finger pad to marker, in world axes, m."""
         marker = scene.finger if self.marker is None else self.marker
         turned = world_from_finger(scene.finger.direction_world)
         return np.asarray(turned @ np.array(marker.marker_from_pad_m))

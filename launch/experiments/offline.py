@@ -158,18 +158,18 @@ def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class CrossErrors:
-    """Crosses that are projected where touches are expected, compared with the touches.
+    """Errors of crosses that are projected at expected contact points.
 
-    places_m: (n, 2) positions on the screen plane of the points at which touches are expected, as
-    the point between the true eyes sees them. errors_m: (n, 2, 2) positions (x, y) on the screen
-    plane at which the left and the right eye see the cross, minus those of the touched point.
+    All positions are projected from a viewpoint onto the screen plane. places_m (n, 2): expected
+    contact points, seen from the midpoint between the true eyes. errors_m (n, 2, 2): positions
+    (x, y) at which the left and the right eye see the cross, minus those of the actual contact.
     """
 
     places_m: Floats
     errors_m: Floats
 
     def figures(self) -> dict[str, float]:
-        """Return lengths of the errors, mm: of each eye and of both, and of their disparity."""
+        """Return the error lengths, mm: for each eye, for both eyes, and for their disparity."""
         left, right = np.moveaxis(1e3 * self.errors_m, 1, 0)
         both = np.linalg.norm(0.5 * (left + right), axis=1)
         return {
@@ -194,7 +194,7 @@ class Contact:
 
 
 class OfflineEvaluator:
-    """Evaluator of apparatuses of one scene.
+    """Evaluator of the errors of apparatuses (true hardware parameters) of one scene.
 
     metres_per_px: resolution of the images. cells: number of node intervals per side of the mesh of
     the true sheet.
@@ -261,9 +261,9 @@ class OfflineEvaluator:
         return Evaluation(fingertip, sheet, image, felt, expected)
 
     def _touch(self, around_m: float, aside_m: float = 0.0) -> Contact:
-        """Return the sheet after rolling without slip from the object's front.
+        """Return the sheet after rolling without slip from the front of the object.
 
-        around_m, aside_m: arc length to its new contact point, and distance to the right.
+        around_m: arc length to the new contact point, m. aside_m: its distance to the right, m.
         """
         place = np.array([aside_m, around_m, 0.0])
         point, above = map_to_surface(self._scene, place + np.outer([0.0, 1e-3], [0, 0, 1]))
@@ -449,7 +449,7 @@ class OfflineEvaluator:
         return self._correct_parallax(errors, eye)
 
     def compare_crosses(self, apparatus: Apparatus) -> CrossErrors:
-        """Compare crosses that are projected where touches are expected with the felt touches.
+        """Compare crosses projected at expected contact points with the actual contact points.
 
         The crosses lie on the object, and are drawn for each eye of the scene on the sheet in front
         of it. The sheet then moves to the finger, which touches it where the tracker measures the

@@ -66,8 +66,8 @@ def run_robustness(
     """Run one trial per seed; return the results of `experiment robustness --json`.
 
     commissioned: calibrate each simulated laboratory first, in a folder of its own, and evaluate it
-    in simulated time with the resulting scene and launch file. The apparatus is then that of
-    hardware that nobody has calibrated, in the world frame that the calibrated camera defines.
+    in simulated time with the resulting scene and launch file. The apparatus then has the errors of
+    uncalibrated hardware. The calibrated camera defines the world frame.
     """
     if commissioned and calibrated:
         raise ExperimentError(
@@ -132,9 +132,9 @@ def run_robustness(
 def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
     """Compare what each laboratory's report predicts with its true errors.
 
-    confusion: number of laboratories by report (good or not) and truth (within tolerance or not);
-    the same for each metric. stated_over_true: predicted root mean square over true error,
-    quantiles over the laboratories. covered: share of true errors below the predicted 95 %
+    confusion: number of laboratories by report (good or not) and by true errors (within tolerance
+    or not), in total and by metric. stated_over_true: quantiles of the ratio of predicted rms error
+    to true error. covered: share of true errors below the predicted 95 %
     quantile.
     """
     predictions = {}
@@ -180,7 +180,7 @@ def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
-    """Count cases (reported as good, truly good)."""
+    """Count the combinations of pairs: (reported as good, truly good)."""
     return {
         "good_and_within": cases.count((True, True)),
         "good_but_exceeded": cases.count((True, False)),

@@ -197,7 +197,7 @@ def make_image_procedure(
 
 
 def make_table_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
-    """Make a procedure that waits for a table of the soft body, see `Driver.wait_for_table`."""
+    """Make a procedure that waits for the table of the soft body; see `Driver.wait_for_table`."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         await driver.wait_for_table(scene, method, progress)

@@ -66,8 +66,8 @@ CYCLE_S = 0.0071
 """Period of the commands to the arms."""
 
 READ_OUT_S, COMPUTING_S, SENDING_S = 0.004, 0.002, 0.001
-"""Durations of the camera's read-out (unless the apparatus states it), of the computation from then
-to the published target, and of sending the target until an arm command uses it."""
+"""Durations of three successive stages: camera read-out (unless the apparatus states it),
+computation until the target is published, and transmission until an arm command uses it."""
 
 PIXEL_NOISE_PX = 0.02
 PREDICTION_STEP_S, PREDICTION_S = 0.01, 0.12
@@ -124,7 +124,7 @@ class MeasuredFinger:
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
         """Measure the finger, whose true position and velocity at the timestamp are given, (3,).
 
-        Returns its predicted path (n, 3). The images are exposed slightly after the timestamp.
+        Returns the predicted path (n, 3), m. The images are exposed slightly after the timestamp.
         """
         truth, random = self._truth, self._random
         late_s = truth.stamp_offset_s
@@ -173,7 +173,7 @@ class SimulatedArm:
         self._now_s = 0.0
 
     def sheet_to(self, other: SimulatedArm) -> SheetMotion:
-        """Return the sheet between both arms, as a bridge computes it from the measured joints."""
+        """Return the sheet between both arms, computed from measured joints as a bridge does."""
         edges = [arm._geometry.world_from_edge(arm._servo.joints_rad) for arm in (self, other)]
         return self._geometry.sheet_between(*edges)
 

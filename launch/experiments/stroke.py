@@ -379,9 +379,9 @@ def read_recording(bag: Path) -> StrokeRecording:
 def apply_compliance(
     scene: Scene, edges: tuple[SampledMotion, SampledMotion]
 ) -> tuple[SampledMotion, SampledMotion]:
-    """Displace the left and right edge as the sheet's tension displaces the flanges of the scene.
+    """Displace the reported motions of both edges by the compliance of the flanges.
 
-    The arms report the poses of rigid arms.
+    The arms report poses as if they were rigid, but the tension of the sheet displaces them.
     """
     limits = ArmGeometry(scene, "left").sheet_limits
     moved = []

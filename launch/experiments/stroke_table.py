@@ -98,7 +98,7 @@ def write_radius_variant(launch_file: Path, folder: Path, radius_m: float) -> Pa
     added_m = radius_m - require_cylinder(require_scene(graph)).radius_m
     name = f"radius-{1e3 * radius_m:.1f}-mm"
     varied, result = folder / f"scene-{name}.yaml", folder / f"launch-{name}.yaml"
-    assert graph.scene_file is not None  # `require_scene` has raised an error otherwise
+    assert graph.scene_file is not None  # Otherwise `require_scene` has raised an error.
     with edit_yaml(Path(graph.scene_file), varied) as scene:
         scene["object"]["geometry"]["radius_m"] = radius_m
         position = scene["object"]["world_from_object"]["position_m"]

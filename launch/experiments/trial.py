@@ -123,8 +123,8 @@ def _join_figures(moving: Row, resting: Mapping[str, float | None]) -> Row:
 def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
     """Commission a simulated laboratory, and return its errors.
 
-    The verification runs in simulated time, without a graph. Its result says what the laboratory
-    knows: the predicted errors, and whether the report calls the laboratory good.
+    The verification runs in simulated time, without a graph. Its result also contains the predicted
+    errors and the verdict of the laboratory's own report.
     """
     from flexsheet.launch.commands.commission import summarize
     from flexsheet.launch.commands.commission_steps import open_laboratory

@@ -127,7 +127,7 @@ def check_opencv() -> Finding:
 
 
 def check_cameras() -> Finding:
-    """List the cameras that V4L2, Aravis and RealSense find."""
+    """List the cameras that are found by V4L2, Aravis and RealSense."""
     from flexsheet.nodes.camera.captures import list_devices
 
     found = list_devices()

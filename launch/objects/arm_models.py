@@ -4,8 +4,8 @@ A scene file may give the model of an arm as
 
 model: {urdf: ur5e.urdf, base: base_link, tip: tool0, start_rad: [...]}
 
-with a path relative to the scene file. The scene message contains the joints themselves, so that
-only the computer that reads the scene file needs the package yourdfpy.
+with a path relative to the scene file. The scene message contains the resulting joint chain,
+so only the computer that reads the scene file needs the package yourdfpy.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Floats = NDArray[np.float64]
 JOINTS = 6
 MAX_BYTES = 4 << 20
 CONTINUOUS_RANGE_RAD = 2.0 * np.pi
-"""Range in both directions of a joint without limits; two revolutions keep cables intact."""
+"""Assumed range (+-) of a joint without limits: two revolutions, to protect the cables."""
 
 
 class UrdfError(FlexsheetError, ValueError):
-    """Raised for a URDF file from which no arm can be made."""
+    """Raised for a URDF file that does not describe a usable arm."""
 
     code = "urdf"
     remedy = "Correct the URDF file or the links `base` and `tip` of the scene file."
@@ -90,12 +90,12 @@ def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
         axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, dtype=np.float64)
         length = float(np.linalg.norm(axis))
         if not length > 0.0:
-            raise UrdfError(f'joint "{joint.name}": its axis has no direction')
+            raise UrdfError(f'joint "{joint.name}": its axis is zero')
         axes.append(axis / length)
         pending = np.eye(4)
     if len(origins) != JOINTS:
         raise UrdfError(
-            f'{len(origins)} rotary joints between "{base}" and "{tip}"; an arm has {JOINTS}'
+            f'{len(origins)} rotary joints between "{base}" and "{tip}", expected {JOINTS}'
         )
     lowest, highest, speeds = zip(*limits, strict=True)
     try:
@@ -129,7 +129,7 @@ def _load_joints(path: Path) -> list[Any]:
         raise UrdfError(f"the file cannot be read: {error.strerror}; check the path") from error
     except UrdfError:
         raise
-    except Exception as error:  # The library lets errors of XML and of numbers pass.
+    except Exception as error:  # The library does not convert errors of XML and of number parsing.
         raise UrdfError(f"not a valid URDF file: {error}") from error
     return list(robot.robot.joints)
 

@@ -34,7 +34,7 @@ TOPIC = "twin/apparatus"
 _SEED = re.compile(r"seed:(?P<seed>\d{1,18})(?P<words>(?:,[a-z]+)*)")
 CALIBRATED = "calibrated"
 COMMISSION_STATE = "commission.json"
-"""File beside a scene that states the scene from which its commissioning started."""
+"""File next to a commissioned scene that names the scene before commissioning."""
 
 PROFILES = tuple(one.value for one in Profile)
 
@@ -75,8 +75,8 @@ def parse_draw(text: str) -> Draw | None:
 def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> Apparatus:
     """Read an apparatus from a file, or sample it from a text such as "seed:7".
 
-    scene_file: file of the scene. If a commissioning wrote it, hardware that is not calibrated is
-    sampled around the scene from which the commissioning started, in the world frame of the camera.
+    scene_file: file of the scene. If a commissioning wrote it, uncalibrated hardware is sampled
+    around the scene before commissioning, in the world frame of the camera.
 
     Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.
@@ -101,7 +101,7 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
 
 
 def _load_base(scene_file: Path | None) -> Scene | None:
-    """Return the scene from which the commissioning that wrote a scene file started, or None."""
+    """Load the scene before commissioning; None if no commissioning wrote the scene file."""
     state = None if scene_file is None else scene_file.parent / COMMISSION_STATE
     if state is None or not state.is_file():
         return None

@@ -1,1 +1,1 @@
-"""Exchange messages with ROS 2: types, the table of topics, and the bridge over DDS."""
+"""Exchange messages with ROS 2: message types, table of topics, and bridge over DDS."""

@@ -1,7 +1,8 @@
 """Bridge a running graph to ROS 2: publish its topics over DDS, and accept external inputs.
 
-The bridge reads the graph as a tool does, and may write only topics that tools may write. External
-messages are published under the writer name of tools, by which readers and bags recognize them.
+The bridge has the permissions of a command-line tool: it reads all topics of the graph, and writes
+only those that tools may write. External messages are published with the writer name of tools, so
+that readers and bags can recognize them.
 """
 
 from __future__ import annotations
@@ -34,8 +35,9 @@ from flexsheet.messages.topics import TOPICS, find_topic
 class Ros2Bridge:
     """Bridge between one running graph and one DDS participant.
 
-    topics: topics to publish. accept: topics to accept from ROS nodes, keys of `INPUTS`. noise_m:
-    standard deviation of an external fingertip. published, accepted: numbers of messages by topic.
+    topics: flexsheet topics to publish. accept: topics to accept from ROS nodes, keys of `INPUTS`.
+    noise_m: standard deviation of external fingertip positions. published, accepted: numbers of
+    messages by topic. on_problem: called with the text of an error.
     """
 
     def __init__(
@@ -115,5 +117,5 @@ class Ros2Bridge:
 
 
 def list_default_topics(plan: ResolvedGraph) -> list[str]:
-    """Return the topics of a graph that are published by default: those recorded by default."""
+    """Return the topics of a graph that are published by default: those that bags contain too."""
     return [name for name in plan.writers if find_topic(name).logged]

@@ -1,7 +1,7 @@
-"""Publish and subscribe to ROS 2 topics over DDS, by Cyclone DDS.
+"""Publish and subscribe to ROS 2 topics with the middleware Cyclone DDS.
 
 ROS 2 maps the topic `/a` to the DDS topic `rt/a`, and the type `p/msg/T` to `p::msg::dds_::T_`.
-Messages are CDR bytes from `mapping.RosTypes`, so Cyclone DDS only transports them.
+`mapping.RosTypes` serializes messages to CDR, so Cyclone DDS only transports their bytes.
 """
 
 from __future__ import annotations
@@ -32,24 +32,25 @@ _ARRAY_LIMIT = 65535
 
 
 def mangle_topic(name: str) -> str:
-    """Return the DDS topic of a ROS topic."""
+    """Return the name of the DDS topic for the name of a ROS topic."""
     return f"rt{name}"
 
 
 def mangle_type(name: str) -> str:
-    """Return the DDS type of a ROS type."""
+    """Return the name of the DDS type for the name of a ROS type."""
     package, _, short = name.split("/")
     return f"{package}::msg::dds_::{short}_"
 
 
 def make_configuration(interface: str) -> str:
-    """Return the configuration of Cyclone DDS for one network interface; on loopback, no multicast.
+    """Return the XML configuration of Cyclone DDS for one network interface.
 
-    Raises Ros2Error for an unknown interface.
+    The loopback interface is configured without multicast. Raises Ros2Error if this computer has no
+    such interface.
     """
     if interface not in psutil.net_if_addrs():
         names = ", ".join(sorted(psutil.net_if_addrs()))
-        raise Ros2Error(f"--interface {interface}: no such network interface; there are {names}")
+        raise Ros2Error(f"--interface {interface}: no such network interface; choose {names}")
     loopback = interface == LOOPBACK
     multicast = "false" if loopback else "true"
     peers = '<Peers><Peer Address="127.0.0.1"/></Peers>' if loopback else ""
@@ -65,7 +66,7 @@ def make_configuration(interface: str) -> str:
 
 @dataclass(slots=True)
 class Sample:
-    """Received message as CDR bytes."""
+    """Received message, serialized as CDR bytes."""
 
     cdr: bytes
     sample_info: Any = None
@@ -73,7 +74,7 @@ class Sample:
 
 @cache
 def make_dds_type(ros_type: str) -> Any:
-    """Return a Cyclone DDS type for a ROS type, whose samples contain CDR bytes in `cdr`."""
+    """Make a Cyclone DDS type for a ROS type; its samples store the CDR bytes in `cdr`."""
     described = _describe(ros_type)
 
     def serialize(self: Any, **_: Any) -> bytes:
@@ -114,13 +115,13 @@ def _describe(ros_type: str) -> Any:
 class RosParticipant:
     """Participant of a DDS domain that publishes and subscribes to ROS topics.
 
-    domain: number, ROS_DOMAIN_ID of the other participants. interface: name of the only network
-    interface that is used. Raises Ros2Error.
+    domain: number of the domain, as in the ROS_DOMAIN_ID of the other participants. interface: name
+    of the only network interface to use. Raises Ros2Error if the participant cannot be created.
     """
 
     def __init__(self, domain: int, interface: str = LOOPBACK) -> None:
         if find_spec("cyclonedds") is None:
-            raise Ros2Error("the bridge needs the package cyclonedds: pip install flexsheet[ros2]")
+            raise Ros2Error("the bridge needs cyclonedds; run: pip install 'flexsheet[ros2]'")
         from cyclonedds.core import DDSException, WaitSet
         from cyclonedds.domain import Domain, DomainParticipant
 
@@ -129,7 +130,7 @@ class RosParticipant:
             self._domain = Domain(domain, configuration)
             self._participant = DomainParticipant(domain)
         except DDSException as error:
-            raise Ros2Error(f"DDS domain {domain} on {interface}: {error}") from error
+            raise Ros2Error(f"DDS domain {domain} on {interface}: cannot join: {error}") from error
         self._writers: dict[str, Any] = {}
         self._readers: list[tuple[Any, Callable[[bytes], None]]] = []
         self._waiting = WaitSet(self._participant)
@@ -137,7 +138,7 @@ class RosParticipant:
         self._thread: threading.Thread | None = None
 
     def advertise(self, topic: RosTopic) -> None:
-        """Create the writer of a topic, so that other participants find it."""
+        """Create the DDS writer of a topic, so that other participants discover the topic."""
         from cyclonedds.pub import DataWriter
 
         if topic.name not in self._writers:
@@ -146,11 +147,11 @@ class RosParticipant:
             )
 
     def has_readers(self, topic: RosTopic) -> bool:
-        """Return whether a message would be received now, or by a late reader of a latched one."""
+        """Return whether a topic needs a message: it has readers, or is latched for later ones."""
         return topic.latched or bool(self._writers[topic.name].get_matched_subscriptions())
 
     def write(self, topic: RosTopic, cdr: bytes) -> None:
-        """Publish a message on an advertised topic. Raises Ros2Error if no reader takes it."""
+        """Publish a message on an advertised topic. Raises Ros2Error if DDS cannot write it."""
         from cyclonedds.core import DDSException
 
         kind = make_dds_type(topic.ros_type)
@@ -159,10 +160,10 @@ class RosParticipant:
         try:
             self._writers[topic.name].write(sample)
         except DDSException as error:
-            raise Ros2Error(f"{topic.name}: {error}") from error
+            raise Ros2Error(f"ROS topic {topic.name}: cannot publish: {error}") from error
 
     def subscribe(self, topic: RosTopic, on_message: Callable[[bytes], None]) -> None:
-        """Call a function with the CDR bytes of each message, in the running event loop."""
+        """Subscribe: call a function in the running event loop with each message (CDR bytes)."""
         from cyclonedds.core import InstanceState as State
         from cyclonedds.core import ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader
@@ -203,10 +204,10 @@ class RosParticipant:
 
 
 def _make_qos(topic: RosTopic) -> Any:
-    """Return the quality of service: reliable; a latched topic also for late readers.
+    """Return the quality of service: reliable, and for a latched topic also transient local.
 
-    Readers of ROS 2 are reliable or best-effort by choice, and a reliable writer serves both.  The
-    hash of the type lets ROS 2 Iron and later report the topic without a warning.
+    A ROS 2 reader may request reliable or best-effort delivery, and a reliable writer serves both.
+    With the hash of the type, ROS 2 Iron and later releases list the topic without a warning.
     """
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration

@@ -1,6 +1,7 @@
-"""Describe messages of flexsheet as ROS 2 types of the package `flexsheet_msgs`.
+"""Generate the ROS 2 package `flexsheet_msgs`: message types that equal those of flexsheet.
 
-Each message type becomes one ROS type of the same name, and so does each named group of fields:
+Each message type, and each named group of fields, becomes one ROS type of the same name. Fields
+are converted as follows:
 
     bool, int, float, text              bool, int64, float64, string
     timestamp                           builtin_interfaces/Time
@@ -32,17 +33,17 @@ from flexsheet.messages.field_types import get_annotation, is_image, split_annot
 
 PACKAGE = "flexsheet_msgs"
 HEADER = "std_msgs/Header header\nstring writer\nuint64 sequence_number\n"
-"""First fields of each message type; `writer` is the name of the node that published."""
+"""First fields of each ROS message type; `writer` is the name of the publishing node."""
 
 ELEMENTS = {"<f8": "float64", "<f4": "float32", "<i4": "int32", "<i8": "int64", "|u1": "uint8"}
-"""ROS element type of each element type of arrays."""
+"""ROS element type for each NumPy element type of an array field."""
 
 Make = Callable[[str, dict[str, Any]], Any]
 """Function that makes a ROS message from the name of its type and its fields."""
 
 
 class Ros2Error(FlexsheetError, RuntimeError):
-    """Messages cannot be exchanged with ROS 2; the text gives the reason and the remedy."""
+    """Raised if messages cannot be exchanged with ROS 2; the text gives reason and remedy."""
 
     code = "ros2"
     remedy = "Install the packages of the extra `flexsheet[ros2]`, or correct the named value."
@@ -50,7 +51,7 @@ class Ros2Error(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class OwnField:
-    """Field of a ROS type: name, ROS type, and function that converts a value of the field."""
+    """Field of a ROS type: name, ROS type, and function that converts a value to ROS."""
 
     name: str
     ros_type: str
@@ -58,24 +59,27 @@ class OwnField:
 
 
 def split_time(at_ns: int) -> dict[str, int]:
-    """Return the fields of a ROS time. Raises Ros2Error for a time before 1970 or after 2038."""
+    """Split a time (ns since 1970) into the fields of a ROS time.
+
+    Raises Ros2Error for a time before 1970 or after 2038, which ROS 2 cannot represent.
+    """
     seconds, nanoseconds = divmod(at_ns, 1_000_000_000)
     if not 0 <= seconds < 1 << 31:
         raise Ros2Error(
-            f"the timestamp {at_ns} ns is not a time of ROS 2, which counts from 1970 to 2038; "
+            f"the timestamp {at_ns} ns is outside the range of ROS 2 (1970 to 2038); "
             "check the bag with `flexsheet bag info`"
         )
     return {"sec": seconds, "nanosec": nanoseconds}
 
 
 def ros_name(kind: type[BaseModel]) -> str:
-    """Return the name of the ROS type of a message or of a group of fields."""
+    """Return the name of the ROS type for a message type or a group of fields."""
     return f"{PACKAGE}/msg/{kind.__name__}"
 
 
 @cache
 def list_fields(kind: type[BaseModel]) -> tuple[OwnField, ...]:
-    """Return the fields of a message or group in their order, without images."""
+    """List the ROS fields of a message type or group in order of declaration, without images."""
     stamps = find_stamp_fields(kind) if issubclass(kind, Message) else ()
     fields = []
     for name, info in kind.model_fields.items():
@@ -88,7 +92,7 @@ def list_fields(kind: type[BaseModel]) -> tuple[OwnField, ...]:
 
 
 def make_definitions(kinds: Iterable[type[Message]]) -> dict[str, str]:
-    """Return the text of the .msg file of each message type and group, by the name of its type."""
+    """Return the texts of the .msg files of message types and their groups, by ROS type name."""
     found: dict[str, str] = {}
     waiting: list[type[BaseModel]] = list(kinds)
     while waiting:
@@ -97,21 +101,21 @@ def make_definitions(kinds: Iterable[type[Message]]) -> dict[str, str]:
             continue
         lines = [f"{one.ros_type} {one.name}\n" for one in list_fields(kind)]
         head = HEADER if issubclass(kind, Message) else ""
-        # A ROS type has at least one field.
+        # A ROS type must have at least one field.
         found[ros_name(kind)] = head + "".join(lines) or "bool unused\n"
         waiting.extend(_list_groups(kind))
     return found
 
 
 def convert_fields(value: BaseModel, make: Make) -> dict[str, Any]:
-    """Return the ROS values of the fields of a message or group, by name."""
+    """Convert the fields of a message or group to ROS values, by field name."""
     return {
         one.name: one.convert(getattr(value, one.name), make) for one in list_fields(type(value))
     }
 
 
 def _list_groups(kind: type[BaseModel]) -> list[type[BaseModel]]:
-    """Return the groups that appear by name in the ROS type of a message or group."""
+    """List the groups of fields to which the ROS type of a message or group refers by name."""
     named = {one.ros_type.partition("[")[0] for one in list_fields(kind)}
     groups: list[type[BaseModel]] = []
 
@@ -129,7 +133,7 @@ def _list_groups(kind: type[BaseModel]) -> list[type[BaseModel]]:
 
 
 def _describe(annotation: Any) -> tuple[str, Callable[[Any, Make], Any]]:
-    """Return the ROS type of an annotation, and the function that converts its values."""
+    """Return the ROS type for a Python annotation, and the function that converts its values."""
     annotation, spec = split_annotation(annotation)
     if spec is not None:
         return _describe_array(spec)
@@ -154,9 +158,9 @@ def _describe(annotation: Any) -> tuple[str, Callable[[Any, Make], Any]]:
 def _describe_sequence(
     item: Any, suffix: str, split: Callable[[Any], tuple[Any, ...]]
 ) -> tuple[str, Callable[[Any, Make], Any]]:
-    """Return type and conversion of a sequence; None is an empty one."""
+    """Return the ROS type of a sequence and its conversion; None becomes an empty sequence."""
     item_type, convert = _describe(item)
-    if "[" in item_type:  # ROS has no sequences of sequences.
+    if "[" in item_type:  # ROS does not support sequences of sequences.
         adapter = TypeAdapter(item)
         return f"string{suffix}", lambda value, _: [
             json.dumps(adapter.dump_python(one, mode="json"))
@@ -191,7 +195,7 @@ def _find_scalar(annotation: Any) -> str | None:
 
 
 def _holds_images(annotation: Any) -> bool:
-    """Return whether a value is an image, a tuple of images or an optional image."""
+    """Return whether an annotation is that of an image, a tuple of images or an optional image."""
     inner, spec = split_annotation(annotation)
     if spec is not None:
         return is_image(spec)

@@ -1,7 +1,8 @@
 """Check messages of external ROS nodes, and convert them to messages of flexsheet.
 
-They are untrusted: a message is rejected unless its frame, numbers and timestamp are plausible, and
-a fingertip passes the same tracker as one from the camera. Nothing here commands the arms.
+The messages are not trusted: one is rejected unless its frame, numbers and timestamp are plausible.
+External fingertips are filtered by the same tracker as those from the camera. No external message
+commands the arms directly.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ MAX_AGE_S = 0.5
 MAX_FUTURE_S = 0.005
 MIN_PERIOD_S = 0.001
 MAX_EYE_OFFSET_M = 1.0
-"""Maximum distance of an external eye from the position in the scene."""
+"""Maximum distance of an external eye position from that in the scene."""
 
 QUATERNION_TOLERANCE = 1e-3
 
 
 class Rejection(StrEnum):
-    """Reason why an external message is not passed on."""
+    """Reason for rejecting an external message."""
 
     NO_SCENE = "no_scene"
     MALFORMED = "malformed"
@@ -47,7 +48,7 @@ class Rejection(StrEnum):
 
 
 class RejectedError(ValueError):
-    """Raised for an external message that must not be passed on."""
+    """Raised for an external message that must not enter the graph."""
 
     def __init__(self, reason: Rejection) -> None:
         super().__init__(reason.value)
@@ -56,7 +57,7 @@ class RejectedError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RosInput:
-    """ROS topic from which external messages are accepted for a topic of flexsheet."""
+    """ROS topic whose messages may be converted and published on a topic of flexsheet."""
 
     topic: str
     ros_topic: RosTopic
@@ -70,14 +71,15 @@ INPUTS = {
                           RosTopic("/external/fingertip", "geometry_msgs/msg/PointStamped", False),
                           "point of the finger's pad that touches the sheet"),
 }  # fmt: skip
-"""External inputs by topic."""
+"""Possible external inputs, by the flexsheet topic on which they are published."""
 
 
 @dataclass(slots=True)
 class ExternalInputs:
     """Checker and converter of external messages.
 
-    noise_m: standard deviation of an external fingertip. rejected: counts by reason.
+    noise_m: standard deviation of external fingertip positions. rejected: numbers of rejected
+    messages by reason.
     """
 
     noise_m: float
@@ -101,17 +103,18 @@ class ExternalInputs:
     def convert(
         self, topic: str, decode: Callable[[], Any], now_ns: int, unix_ns: int
     ) -> tuple[Message, int] | None:
-        """Return the message and its source timestamp on the local clock; None if it is rejected.
+        """Convert a ROS message; return it with its source timestamp on the local clock, ns.
 
-        decode: function that returns the ROS message, or raises an exception for malformed bytes.
-        now_ns, unix_ns: the present time of the local clock, and since 1970.
+        Returns None if the message is rejected. decode: function that returns the ROS message, or
+        raises an exception for malformed bytes. now_ns: present time of the local clock. unix_ns:
+        present time since 1970.
         """
         try:
             if self.scene is None:
                 raise RejectedError(Rejection.NO_SCENE)
             try:
                 message = decode()
-            except Exception as error:  # untrusted bytes can fail anywhere in the decoder
+            except Exception as error:  # Untrusted bytes can cause any exception in the decoder.
                 raise RejectedError(Rejection.MALFORMED) from error
             at_ns = self._check_header(topic, message.header, now_ns, unix_ns)
             if topic == "eye":
@@ -125,7 +128,7 @@ class ExternalInputs:
         return made, at_ns
 
     def _check_header(self, topic: str, header: Any, now_ns: int, unix_ns: int) -> int:
-        """Return the timestamp on the local clock."""
+        """Check frame and timestamp of a header; return the timestamp on the local clock, ns."""
         if header.frame_id != WORLD:
             raise RejectedError(Rejection.WRONG_FRAME)
         stamp_ns = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)

@@ -1,12 +1,12 @@
-"""Map topics of flexsheet to topics of ROS 2: one table for recorded and for live messages.
+"""Map topics of flexsheet to topics of ROS 2, for exported bags and for the live bridge.
 
-`VIEWS` lists the ROS topics with standard types, and `INPUTS` those that a ROS node may publish for
-flexsheet. In addition, each topic appears with all its fields as `flexsheet/TOPIC`, with its own
-type (`definitions`).
+`VIEWS` lists the ROS topics with standard types, and `inputs.INPUTS` those that a ROS node may
+publish for flexsheet. In addition, each topic is published with all its fields as
+`flexsheet/TOPIC`. The module `definitions` generates the types of these topics.
 
-Frames in `world`: `object`, `camera_left`, `camera_right`, `projector`, `left_base`, `right_base`,
-`left_flange_measured`, `right_flange_measured`, `sheet`, `fingertip`.  A robot model that ROS nodes
-load can have flanges of its own, which follow from the joint angles.
+Children of the frame `world`: `object`, `camera_left`, `camera_right`, `projector`, `left_base`,
+`right_base`, `left_flange_measured`, `right_flange_measured`, `sheet`, `fingertip`.  The measured
+flanges have their own names, because a robot model in ROS computes flanges from joint angles.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ OWN_PREFIX = "/flexsheet/"
 WORLD = "world"
 JOINTS = 6
 CONTEXT_TOPICS = frozenset({"scene", "skin", "arm_left", "arm_right"})
-"""Topics that contain what is needed to convert messages of other topics."""
+"""Topics whose latest messages are needed to convert messages of other topics."""
 
 SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
 _TRIANGLE_LIST = 11
@@ -69,7 +69,7 @@ class RosTypes:
 
     def __init__(self) -> None:
         if find_spec("rosbags") is None:
-            raise Ros2Error("ROS 2 messages need the package rosbags: pip install flexsheet[ros2]")
+            raise Ros2Error("ROS 2 messages need rosbags; run: pip install 'flexsheet[ros2]'")
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         # Humble and later releases have the same definitions of these types.
@@ -80,11 +80,11 @@ class RosTypes:
         self.store.register(own)
 
     def make(self, name: str, fields: dict[str, Any]) -> Any:
-        """Make a message of a type, such as `std_msgs/msg/Bool`, from its fields."""
+        """Make a ROS message of a type, such as `std_msgs/msg/Bool`, from its field values."""
         return self.store.types[name](**fields)
 
     def encode(self, name: str, message: Any) -> bytes:
-        """Serialize a message to CDR with its four header bytes."""
+        """Serialize a message to CDR, including the encapsulation header of four bytes."""
         return bytes(self.store.serialize_cdr(message, name))
 
     def decode(self, name: str, data: bytes) -> Any:
@@ -114,7 +114,7 @@ class RosTypes:
 
 @cache
 def load_ros_types() -> RosTypes:
-    """Return the ROS types; loading them takes about half a second."""
+    """Load the ROS types on the first call, which takes about half a second."""
     return RosTypes()
 
 
@@ -122,8 +122,9 @@ def load_ros_types() -> RosTypes:
 class Source:
     """Context in which a message is converted.
 
-    topic: its topic. at_ns: its source timestamp, ns since 1970. scene, skin, flanges: latest ones
-    of the same graph, as far as they are known.
+    ros: ROS types. topic: topic of the message. at_ns: source timestamp of the message, ns since
+    1970. scene, skin: latest messages of the same graph; None before the first. flanges: latest
+    flange poses (4, 4) by side.
     """
 
     ros: RosTypes
@@ -134,17 +135,17 @@ class Source:
     flanges: dict[Side, Floats]
 
     def stamped(self, kind: str, name: str, value: Any, frame: str = WORLD) -> Any:
-        """Make a message of header and one field."""
+        """Make a ROS message with a header and one further field, `name`."""
         return self.ros.make(kind, {"header": self.ros.header(self.at_ns, frame), name: value})
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """ROS topic with a standard type that contains a field of a message.
+    """ROS topic with a standard type that represents some fields of a message.
 
-    fields: fields of the message. name: name of the ROS topic without the slash at its start;
-    {topic} is the topic of the message. make: function that returns the ROS message, or None if
-    there is none.
+    message: type of the message. fields: names of the fields. name: name of the ROS topic without
+    its first slash; {topic} stands for the topic of the message. make: function that converts a
+    message, or returns None if there is nothing to publish.
     """
 
     message: type[Message]
@@ -157,7 +158,10 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class RosTopic:
-    """Topic of ROS 2: name, which begins with a slash, type, and whether it is latched."""
+    """ROS 2 topic: name, which begins with a slash, ROS type, and whether it is latched.
+
+    Later readers of a latched topic receive its last message.
+    """
 
     name: str
     ros_type: str
@@ -200,7 +204,7 @@ def _camera_info(side: Side) -> Callable[[StereoPair, Source], Any | None]:
         projection = np.column_stack([np.reshape(matrix, (3, 3)), np.zeros(3)])
         cropped = (height, width) != (camera.height_px, camera.width_px)
         roi = {"x_offset": column, "y_offset": row, "height": height, "width": width}
-        if not cropped:  # In ROS, zeros mean the whole image.
+        if not cropped:  # In ROS, a region of interest of zeros means the whole image.
             roi = dict.fromkeys(roi, 0)
         return source.ros.make(
             "sensor_msgs/msg/CameraInfo",
@@ -286,7 +290,7 @@ FORCE_DIRECTIONS = {
     "left_edge": (1.0, 0.0, 0.0),
     "right_edge": (-1.0, 0.0, 0.0),
 }
-"""Direction of a positive measured force in the frame of the sheet, by its axis."""
+"""Direction of a positive measured force in the frame of the sheet, by the axis of the sensor."""
 
 
 def _measured_force(force: Force, source: Source) -> Any | None:
@@ -296,7 +300,7 @@ def _measured_force(force: Force, source: Source) -> Any | None:
 
 
 def list_joints(side: str) -> list[str]:
-    """Return the names of an arm's joints."""
+    """Return the names of the joints of the left or right arm, from the base to the flange."""
     return [f"{side}_joint_{number}" for number in range(1, JOINTS + 1)]
 
 
@@ -362,7 +366,7 @@ def _fingertip_frame(fingertip: Fingertip, source: Source) -> Any | None:
 
 
 def _eye_pose(eye: Eye, source: Source) -> Any | None:
-    """Return the midpoint of the eyes; x of its frame points from the left to the right eye."""
+    """Return the pose of the eyes: their midpoint, with x from the left to the right eye."""
     if not eye.valid:
         return None
     x_axis = eye.right_world / np.linalg.norm(eye.right_world)
@@ -406,9 +410,10 @@ def _deformed_points(body: SoftBody, source: Source) -> Any | None:
 
 
 def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floats | None:
-    """Return the corners (4, 3) of the sheet: left below, left above, right below, right above.
+    """Return the corners (4, 3), m, of a flat sheet between both clamped edges.
 
-    The sheet is drawn flat between both clamped edges.  None if the scene or an arm is unknown.
+    Their order is lower left, upper left, lower right, upper right.  flanges: poses (4, 4) by side.
+    Returns None before the scene and both arms are known.
     """
     if scene is None or len(flanges) < 2:
         return None
@@ -528,7 +533,10 @@ VIEWS = (
 
 @cache
 def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
-    """Return the ROS topics of a topic: standard views, then the own type with all fields."""
+    """List the ROS topics for a flexsheet topic, each with its view.
+
+    Topics with standard types come first, then the one with all fields, whose view is None.
+    """
     found: list[tuple[RosTopic, View | None]] = [
         (RosTopic("/" + view.name.format(topic=topic.name), view.ros_type, view.latched), view)
         for view in VIEWS
@@ -541,7 +549,10 @@ def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
 
 @dataclass(slots=True)
 class Converter:
-    """Converter of the messages of one graph to ROS 2; it stores what later messages need."""
+    """Converter of the messages of one graph to ROS 2.
+
+    It stores the latest scene, skin and flange poses, which later conversions need.
+    """
 
     ros: RosTypes
     scene: Scene | None = None
@@ -556,10 +567,10 @@ class Converter:
         shift_ns: int,
         wanted: Callable[[RosTopic], bool] = lambda _: True,
     ) -> Iterator[tuple[RosTopic, Any]]:
-        """Yield the ROS messages of a message, each with its ROS topic.
+        """Convert a message; yield each resulting ROS message with its ROS topic.
 
-        shift_ns: time since 1970 minus the time of the header's clock. wanted: function that
-        returns whether a message for a ROS topic is needed.
+        shift_ns: time since 1970 minus time of the clock in the header. wanted: function that
+        returns whether a ROS topic needs a message.
         """
         match message:
             case Scene():

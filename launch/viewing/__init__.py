@@ -1,1 +1,1 @@
-"""Models of the apparatus for other tools, and the server for live viewing."""
+"""Export models of the apparatus to other tools, and serve a running graph to viewers."""

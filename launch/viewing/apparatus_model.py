@@ -1,8 +1,9 @@
-"""Describe the apparatus of a scene as a tree of links and joints, as URDF does.
+"""Describe the hardware of a scene (arms, camera, projector, sheet) by links and joints, like URDF.
 
-Links: `world`, for each side `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and
-`SIDE_clamp`, then `camera_left`, `camera_right`, `projector` and `screen`. Joints that move:
-`SIDE_joint_1` to `SIDE_joint_6`. The model contains only geometry: masses and torques are unknown.
+Links of each arm: `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and `SIDE_clamp`; SIDE
+is `left` or `right`. Other links: `world`, `camera_left`, `camera_right`, `projector` and `screen`.
+The movable joints are `SIDE_joint_1` to `SIDE_joint_6`. The model contains only geometry, because
+masses and torques are unknown.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ LENS: Colour = (0.0, 0.42, 0.58, 1.0)
 SCREEN: Colour = (0.97, 0.93, 0.84, 0.35)
 
 CAMERA_BODY_M: Vector = (0.05, 0.035, 0.045)
-"""Size of the housing of each of the two cameras, centred behind its lens."""
+"""Size (x, y, z) of the drawn housing of each camera, which is centred behind the lens."""
 PROJECTOR_BODY_M: Vector = (0.16, 0.07, 0.12)
 LENS_LENGTH_M = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Box of a link: size and centre (m) in the frame of the link; red, green, blue, opacity."""
+    """Box of a link: size and centre (m) in the frame of the link, and colour as RGBA (0 to 1)."""
 
     size_m: Vector
     centre_m: Vector
@@ -50,7 +51,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Rigid part of the apparatus, drawn as boxes."""
+    """Rigid part of the apparatus, represented by boxes."""
 
     name: str
     boxes: tuple[Box, ...] = ()
@@ -58,7 +59,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class JointLimit:
-    """Axis of a joint in the frame of its child, range (rad) and maximum speed (rad/s)."""
+    """Axis of a revolute joint in the frame of its child link, range and maximum speed."""
 
     axis: Vector
     min_rad: float
@@ -68,9 +69,10 @@ class JointLimit:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """Connection of two links.
+    """Joint between two links.
 
-    parent_from_child: pose (4, 4) of the child at the joint angle zero. limit: None if it is fixed.
+    parent_from_child: pose (4, 4) of the child at joint angle zero. limit: axis and range of a
+    revolute joint; None for a fixed joint.
     """
 
     name: str
@@ -80,7 +82,7 @@ class Joint:
     limit: JointLimit | None = None
 
     def pose(self, angle_rad: float) -> Floats:
-        """Return parent_from_child (4, 4) at an angle; a fixed joint ignores it."""
+        """Return the pose (4, 4) of the child at a joint angle; a fixed joint ignores the angle."""
         if self.limit is None:
             return self.parent_from_child
         rotation = rotation_from_vector(angle_rad * np.array(self.limit.axis))
@@ -89,14 +91,14 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class ApparatusModel:
-    """Links and joints of the apparatus; each joint's parent precedes its child."""
+    """Links and joints of the apparatus, in an order in which each parent precedes its child."""
 
     name: str
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
 
     def poses(self, angles_rad: Mapping[str, float]) -> dict[str, Floats]:
-        """Return world_from_link (4, 4) of all links at joint angles by name; default: zero."""
+        """Return the world poses (4, 4) of all links; joints that are not named are at zero."""
         found = {WORLD: np.eye(4)}
         for joint in self.joints:
             found[joint.child] = found[joint.parent] @ joint.pose(angles_rad.get(joint.name, 0.0))
@@ -104,10 +106,10 @@ class ApparatusModel:
 
 
 def make_model(scene: Scene) -> ApparatusModel:
-    """Make the model of both arms with clamps, the camera, the projector, and the screen.
+    """Make the model of both arms with clamps, the stereo camera, the projector and the screen.
 
-    The screen is the unstretched sheet at the origin of the world. Joint angles are those that the
-    encoders report.
+    The screen is the unstretched sheet at the origin of the world. The joint angles of the model
+    equal the readings of the encoders.
     """
     links, joints = [Link(WORLD)], []
     for side in get_args(Side):
@@ -121,9 +123,9 @@ def make_model(scene: Scene) -> ApparatusModel:
 
 
 def solve_rest_joints(scene: Scene) -> dict[str, float]:
-    """Return the joint angles (rad) at which the arms hold the sheet at the screen.
+    """Return the joint angles (rad), by joint name, at which the arms hold the sheet at the screen.
 
-    An arm that does not reach the screen has its joints at the middle of their ranges.
+    For an arm that cannot reach the screen, return the centres of its joint ranges.
     """
     angles: dict[str, float] = {}
     for side in get_args(Side):
@@ -141,7 +143,7 @@ def solve_rest_joints(scene: Scene) -> dict[str, float]:
 
 
 def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
-    """Yield the links of an arm with the joints that carry them, from the base to the clamp."""
+    """Yield each link of an arm, from base to clamp, with the joint to its parent."""
     arm = scene.arms.left if side == "left" else scene.arms.right
     chain = arm.model.chain() if isinstance(arm.model, ClosedFormArm) else arm.model
     numbered = [f"{side}_link_{number}" for number in range(1, 7)]
@@ -158,7 +160,7 @@ def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
     yield mount, Link(names[0], tuple(boxes[0]))
     for i, name in enumerate(list_joints(side)):
         x, y, z = chain.axes[i].tolist()
-        # The encoder reads zero where the joint is at its offset.
+        # The encoder reads zero when the joint angle equals its offset.
         offset = rotation_from_vector(arm.joint_offsets_rad[i] * chain.axes[i])
         limit = JointLimit((x, y, z), chain.min_rad[i], chain.max_rad[i], chain.speed_rad_per_s[i])
         pose = pose_matrix(chain.origins[i]) @ transform(offset, np.zeros(3))
@@ -179,7 +181,7 @@ def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
 
 
 def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]:
-    """Yield name, pose in the world and boxes of cameras, projector and screen."""
+    """Yield name, world pose (4, 4) and boxes of each camera, the projector and the screen."""
     left = pose_matrix(scene.camera.world_from_left)
     yield "camera_left", left, _make_device(CAMERA_BODY_M, 0.02)
     right = left @ inverse(np.asarray(scene.camera.right_from_left))
@@ -194,7 +196,7 @@ def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]
 
 
 def _make_device(body_m: Vector, lens_m: float) -> tuple[Box, ...]:
-    """Make the housing of a device and its lens, whose centre is the origin; z points outwards."""
+    """Make boxes for housing and lens of a device; the lens is at the origin and faces +z."""
     depth_m = body_m[2]
     return (
         Box(body_m, (0.0, 0.0, -0.5 * (depth_m + LENS_LENGTH_M)), DARK),

@@ -1,7 +1,8 @@
 """Write the model of the apparatus as glTF 2.0, for 3D viewers and modelling programs.
 
-Each joint is a node of its name, whose rotation moves all that follows; its `extras` contain axis
-and range. The node of the child link is below it. The frame is that of glTF: y up, z to the user.
+Each joint is a glTF node of the same name, and its child link is the node below it. Rotating the
+node of a joint therefore moves all following links. The `extras` of the node contain the axis and
+the range of the joint. As usual in glTF, y points up and z towards the user.
 """
 
 from __future__ import annotations
@@ -19,19 +20,19 @@ from flexsheet.launch.viewing.apparatus_model import WORLD, ApparatusModel, Box
 
 GLTF_FILE = "model.gltf"
 
-# These parts of the library have no types.
+# These parts of trimesh have no type annotations.
 _gltf: Any = gltf
 _material: Any = material
 _visual: Any = trimesh.visual
 
 
 def make_glb(model: ApparatusModel, angles_rad: Mapping[str, float]) -> bytes:
-    """Return the binary form of the model at joint angles (rad) by name."""
+    """Return the model as binary glTF, at joint angles (rad) given by joint name."""
     return bytes(_gltf.export_glb(_make_scene(model, angles_rad)))
 
 
 def make_gltf(model: ApparatusModel, angles_rad: Mapping[str, float]) -> str:
-    """Return the JSON form of the model at joint angles (rad) by name, with embedded meshes."""
+    """Return the model as glTF JSON with embedded meshes, at joint angles (rad) by joint name."""
     scene = _make_scene(model, angles_rad)
     files = _gltf.export_gltf(scene, merge_buffers=True, embed_buffers=True)
     return json.dumps(json.loads(files[GLTF_FILE]), indent=1) + "\n"
@@ -64,7 +65,7 @@ def _make_scene(model: ApparatusModel, angles_rad: Mapping[str, float]) -> Any:
 
 def _make_mesh(box: Box) -> Any:
     mesh: Any = trimesh.creation.box(box.size_m)
-    # Each face gets corners of its own, so that viewers draw sharp edges.
+    # With separate vertices for each face, viewers draw sharp edges.
     mesh.unmerge_vertices()
     mesh.visual = _visual.TextureVisuals(
         material=_material.PBRMaterial(

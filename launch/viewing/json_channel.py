@@ -1,7 +1,7 @@
-"""Describe messages as JSON that viewers can list and plot.
+"""Convert messages to JSON that viewers can list and plot.
 
-Foxglove and Lichtblick refuse nested arrays and fields without a type, and one index selects an
-element. Therefore arrays are written row by row as one list, and a value that is None is omitted.
+Foxglove and Lichtblick reject nested arrays and fields without a type. Therefore an array becomes
+one list, row by row, and a field with the value None is omitted.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from flexsheet.messages.arrays import ArraySpec
 
 MAX_ARRAY = 64
-"""Maximum number of values of an array in a JSON message; larger ones are omitted."""
+"""Maximum number of elements of an array in a JSON message; larger arrays are omitted."""
 
 JsonSchema = dict[str, Any]
 _NUMBER: JsonSchema = {"type": "number"}
@@ -27,7 +27,7 @@ _OMITTED = object()
 
 @cache
 def make_schema(kind: type[BaseModel]) -> JsonSchema:
-    """Return the JSON Schema of the values that `to_json` returns for a type of messages."""
+    """Return the JSON Schema that describes the output of `to_json` for a message type."""
     fields = {}
     for name, info in kind.model_fields.items():
         annotation: Any = info.annotation
@@ -38,7 +38,7 @@ def make_schema(kind: type[BaseModel]) -> JsonSchema:
 
 
 def to_json(value: Any) -> Any:
-    """Convert a message to JSON types, without arrays of more than MAX_ARRAY values."""
+    """Convert a message to JSON types; omit arrays of more than MAX_ARRAY elements."""
     found = _convert(value)
     return None if found is _OMITTED else found
 
@@ -66,7 +66,7 @@ def _convert(value: Any) -> Any:
 
 
 def _describe(annotation: Any) -> JsonSchema:
-    """Return the schema of a field's type."""
+    """Return the JSON Schema for the type annotation of a field."""
     marks: list[Any] = []
     while get_origin(annotation) is Annotated:
         annotation, *more = get_args(annotation)
@@ -95,7 +95,10 @@ def _describe_type(kind: type) -> JsonSchema:
 
 
 def _merge(schemas: list[JsonSchema]) -> JsonSchema:
-    """Return a schema for values of several types: objects with the fields of all, else text."""
+    """Return one schema for values of several types.
+
+    If all types are objects, the schema contains the fields of all; else it is text.
+    """
     if not schemas:
         return _TEXT
     if all(one == schemas[0] for one in schemas):

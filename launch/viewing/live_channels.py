@@ -1,6 +1,6 @@
-"""Define the channels of the live view, and make their messages from those of the graph.
+"""Define the channels that live viewers can display, and make their messages from the graph.
 
-Every topic of the graph is a JSON channel of the same name. In addition:
+Each topic of the graph becomes a JSON channel of the same name. Further channels are:
 
     tf                                   poses of links, sheet target and fingertip
     apparatus, sheet, object, finger     the 3D scene
@@ -8,7 +8,7 @@ Every topic of the graph is a JSON channel of the same name. In addition:
     TOPIC/left, TOPIC/right, ...         images as JPEG; .../calibration of the stereo camera
     log                                  e-stops and notes of the nodes
 
-The frame `viewer` has z up, which viewers expect; `world` has y up.
+In the frame `viewer` z points up, as viewers expect; in the frame `world` y points up.
 """
 
 from __future__ import annotations
@@ -66,14 +66,15 @@ LOST_COLOUR: Colour = (0.60, 0.60, 0.60, 0.5)
 EYE_COLOUR: Colour = (0.98, 0.98, 0.98, 1.0)
 EYE_RADIUS_M = 0.011
 SHEET_STEP = 2
-"""Every n-th row and column of the drawn sheet is sent."""
+"""Step between the rows and columns of the mesh of the sheet that are sent to viewers."""
 JPEG_QUALITY = 80
 
 
 class Pace(Enum):
-    """Define how often a channel sends: at the rate of numbers or images, or each message.
+    """Rule for how often a channel sends messages.
 
-    STATIC: when the scene changes, and once a second for viewers that connect later.
+    NUMBERS, IMAGES: at most at the configured rate of numbers or images. EACH: every message.
+    STATIC: when the scene changes, and once per second for viewers that connect later.
     """
 
     NUMBERS = "numbers"
@@ -84,7 +85,7 @@ class Pace(Enum):
 
 @dataclass(slots=True)
 class LiveState:
-    """Latest messages of the graph by topic, and the model of its apparatus with its joints."""
+    """Latest message of each topic, with the model of the apparatus and its joint angles."""
 
     latest: dict[str, Message] = field(default_factory=dict)
     model: ApparatusModel | None = None
@@ -107,7 +108,7 @@ class LiveState:
         return found if isinstance(found, Fingertip) else None
 
     def edges(self) -> tuple[Floats, Floats] | None:
-        """Return the poses (4, 4) of the left and right clamped edge; None if unknown."""
+        """Return the world poses (4, 4) of the left and right clamped edge; None if unknown."""
         scene, found = self.scene, []
         for side in get_args(Side):
             state = self.latest.get(f"arm_{side}")
@@ -122,10 +123,10 @@ class LiveState:
 class LiveChannel:
     """Channel of the live view.
 
-    topics: topics of the graph that it needs, besides the scene. triggers: those of them whose
-    messages it follows. make: function that makes its message from the state, the message that
-    arrived and its timestamp; it returns None if there is nothing to send. schema: JSON Schema, or
-    None if the messages are of the type `kind` of Foxglove.
+    topics: topics of the graph that the channel needs in addition to the scene. triggers: topics
+    whose messages cause the channel to send. make: function that makes a message of the channel
+    from the state, the received message and its timestamp, or returns None if there is nothing to
+    send. schema: JSON Schema, or None for messages of the Foxglove type `kind`.
     """
 
     name: str
@@ -138,7 +139,7 @@ class LiveChannel:
 
 
 def list_channels(topics: list[Topic]) -> Iterator[LiveChannel]:
-    """Yield the channels for the topics that a graph writes."""
+    """Yield the channels that can be made from the given topics of a graph."""
     written = {topic.name for topic in topics}
     arms = tuple(name for name in ("arm_left", "arm_right") if name in written)
     for topic in topics:
@@ -178,7 +179,7 @@ def list_channels(topics: list[Topic]) -> Iterator[LiveChannel]:
 
 
 def _list_image_names(topic: Topic) -> tuple[str, ...]:
-    """Return the names of the images in the messages of a topic."""
+    """Return the names of the image fields in the messages of a topic."""
     names: dict[type[Message], tuple[str, ...]] = {
         StereoPair: ("left", "right"),
         Frame: ("image",),
@@ -358,7 +359,7 @@ def _make_log(_: LiveState, message: Message | None, stamp: Any) -> Any:
 
 
 def make_stamp(at_ns: int) -> Any:
-    """Return a timestamp of Foxglove for a time since 1970, ns."""
+    """Make a Foxglove timestamp from a time since 1970, ns."""
     return fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
 
 

@@ -1,9 +1,9 @@
 """Serve a running graph to Foxglove and Lichtblick over their WebSocket protocol, read-only.
 
-The server of the SDK has no authentication and accepts any origin. Therefore it listens on
-loopback only, and offers no publication, no service and no change of parameters. A topic is read
-from the graph only while a viewer is subscribed to a channel that needs it. Each viewer has a
-bounded queue; if it is slow, it loses the oldest messages.
+The server of the Foxglove SDK has no authentication and accepts requests from any web page.
+Therefore it listens on the loopback interface only. Viewers cannot publish, call services or change
+parameters. A topic is read from the graph only while a viewer has subscribed to a channel that
+needs it. Each viewer has a bounded queue, and a slow viewer loses the oldest messages.
 """
 
 from __future__ import annotations
@@ -39,24 +39,27 @@ from flexsheet.messages.types import Status
 
 ADDRESS = "127.0.0.1"
 MAX_BACKLOG = 64
-"""Maximum number of messages that wait for one viewer."""
+"""Maximum number of messages in the queue of one viewer."""
 UPDATE_S = 0.1
-"""Period in which the server checks which channels have viewers."""
+"""Period with which the server checks which channels have viewers."""
 STATIC_S = 1.0
 TIME_S = 1.0 / 30.0
 ALWAYS_READ = frozenset({"scene", "status"})
-"""Topics that the server always reads: they are small and needed for poses and parameters."""
+"""Topics that the server always reads, because they are small and give poses and parameters."""
 URDF_PARAMETER = "/robot_description"
 
 
 class ReadOnlyParameters(ServerListener):
-    """Answer requests for parameters; refuse changes by answering with the present values."""
+    """Listener that answers requests for parameters.
+
+    It ignores requests to change parameters, and answers them with the present values.
+    """
 
     def __init__(self) -> None:
         self.values: dict[str, Any] = {}
 
     def select(self, names: list[str]) -> list[Parameter]:
-        """Return parameters by name; all if there are no names."""
+        """Return the named parameters; without names, return all."""
         values = self.values
         return [Parameter(name, value=values[name]) for name in names or values if name in values]
 
@@ -70,10 +73,10 @@ class ReadOnlyParameters(ServerListener):
 
 
 class LiveServer:
-    """Server of the live view of one graph.  Requires a running event loop.
+    """Server that shows one running graph to viewers.  Requires a running event loop.
 
-    rate_hz: maximum rate of numbers per channel; image_rate_hz: of images and meshes. port: 0
-    selects a free one.
+    rate_hz: maximum rate of numbers per channel. image_rate_hz: maximum rate of images and meshes
+    per channel. port: TCP port; 0 selects a free one. on_problem: called with the text of an error.
     """
 
     def __init__(
@@ -131,11 +134,11 @@ class LiveServer:
 
     @property
     def topics_read(self) -> set[str]:
-        """Return the topics that are now read from the graph."""
+        """Return the topics that the server currently reads from the graph."""
         return set(self._subscribers)
 
     async def serve(self) -> None:
-        """Serve until the task is cancelled.  Raises what a task of the server raises."""
+        """Serve until the calling task is cancelled.  Raises exceptions of the server's tasks."""
         await asyncio.gather(*self._tasks)
 
     def close(self) -> None:
@@ -164,7 +167,7 @@ class LiveServer:
             await asyncio.sleep(period_s)
 
     def _update_subscribers(self) -> None:
-        """Read exactly the topics that the channels with viewers need."""
+        """Subscribe to the topics that channels with viewers need, and to no others."""
         wanted = set(ALWAYS_READ & self._plan.writers.keys())
         for channel in self.channels:
             if self._sinks[channel.name].has_sinks():
@@ -191,7 +194,7 @@ class LiveServer:
             changed = json.loads(message.changed_parameters)
             self._set_parameters({f"{message.node}.{key}": one for key, one in changed.items()})
         now_ns = self._clock.now_ns()
-        # Timestamps of another computer's clock are replaced by the time of arrival.
+        # A timestamp from the clock of another computer is replaced by the time of arrival.
         source_ns = header.source_ns if header.clock_id == self._clock.id else now_ns
         for channel in self.channels:
             if topic in channel.triggers:
@@ -200,7 +203,7 @@ class LiveServer:
     def _send(
         self, channel: LiveChannel, topic: str, message: Message | None, now_ns: int, source_ns: int
     ) -> None:
-        """Make and send a message of a channel if it has viewers and its period has passed."""
+        """Send a message on a channel if the channel has viewers and its period has elapsed."""
         sink, key = self._sinks[channel.name], (channel.name, topic)
         if now_ns < self._due_ns.get(key, 0) or not sink.has_sinks():
             return
@@ -219,18 +222,18 @@ class LiveServer:
         self._server.broadcast_time(self._clock.now_ns() + self._epoch_ns)
 
     def _set_parameters(self, values: dict[str, Any]) -> None:
-        """Store parameters, and send the changed ones to the viewers that are subscribed."""
+        """Store parameters, and send those that changed to the subscribed viewers."""
         plain = {key: _make_plain(value) for key, value in values.items() if value is not None}
         old = self._parameters.values
         changed = {key: value for key, value in plain.items() if old.get(key) != value}
-        # Another thread reads the dictionary, so it is replaced, not changed.
+        # The dictionary is replaced and not modified, because another thread reads it.
         self._parameters.values = {**old, **changed}
         if changed:
             self._server.publish_parameter_values(self._parameters.select(list(changed)))
 
 
 def _make_plain(value: Any) -> Any:
-    """Convert a value to the types of parameters: numbers are floating-point, others text."""
+    """Convert a value to a parameter type: numbers to float, other types except bool to text."""
     if isinstance(value, bool | str):
         return value
     if isinstance(value, int | float):

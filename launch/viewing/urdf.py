@@ -9,13 +9,16 @@ from flexsheet.launch.viewing.apparatus_model import ApparatusModel, Box, Joint,
 from flexsheet.nodes.models.rigid import rpy_from_rotation
 
 UNKNOWN_EFFORT = "0"
-"""Value of the attribute `effort`, which URDF requires: the torques of the arms are not known."""
+"""Value of the attribute `effort`, which URDF requires; the maximum torques are unknown."""
 
 
 def make_urdf(model: ApparatusModel) -> str:
-    """Return the URDF text of a model: m, rad; `rpy` are rotations about fixed x, y, z axes."""
+    """Return the model as URDF text, with lengths in m and angles in rad.
+
+    The angles `rpy` are rotations about the fixed x, y and z axes, in this order.
+    """
     robot = xml.Element("robot", name=f"flexsheet_{model.name}")
-    # MuJoCo would otherwise merge fixed links into the world and omit visual shapes.
+    # By default MuJoCo would merge fixed links into the world and discard visual shapes.
     mujoco = xml.SubElement(robot, "mujoco")
     xml.SubElement(mujoco, "compiler", fusestatic="false", discardvisual="false")
     for link in model.links:
@@ -67,5 +70,5 @@ def _make_joint(joint: Joint) -> xml.Element:
 
 
 def _join(values: Iterable[float]) -> str:
-    """Write numbers so that reading them gives the same values."""
+    """Format numbers separated by spaces, with all digits so that no precision is lost."""
     return " ".join(repr(float(value)) for value in values)

@@ -1,7 +1,8 @@
-"""Compute the kinematics of arms with the axes z, y, y, z, y, z in closed form.
+"""Compute the kinematics of 6-axis arms with a spherical wrist in closed form.
 
-Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.  A branch is one of up to eight
-joint solutions of a pose.  `ClosedFormArm` of the scene defines the dimensions.
+At joint angles of zero, the joints rotate about the axes z, y, y, z, y, z.  Joint angles are (6,)
+in radians, poses are 4x4 `base_from_flange` in metres.  A branch is one of up to eight joint
+solutions of a pose.  `ClosedFormArm` in the scene defines the dimensions.
 """
 
 from __future__ import annotations
@@ -20,20 +21,20 @@ from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
 Floats = NDArray[np.float64]
 
 WRIST_SINGULAR = 1e-7
-"""|sin J5| below which the axes of J4 and J6 count as coincident; J4 then stays constant."""
+"""Value of |sin J5| below which the axes of J4 and J6 count as coincident; J4 is then kept."""
 
 SHOULDER_SINGULAR_M = 1e-7
 """Distance of the wrist centre from the axis of J1 below which J1 stays constant."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
-"""|J5| up to which `solve_next_joints` keeps J4 constant, and from which it solves J4 exactly."""
+"""Values of |J5| up to which `solve_next_joints` keeps J4 constant, and from which J4 is exact."""
 
 SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
 """Distance of the wrist centre from J1's axis up to which `solve_next_joints` keeps J1 constant,
 and from which it solves J1 exactly."""
 
 MAX_FIXED_ERROR_RATIO = 1.4
-"""Maximum error between both bounds, as a multiple of the first bound: 1.05 degrees or 1 mm."""
+"""Maximum pose error between both bounds, as a multiple of the first: 1.05 degrees or 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
 """Maximum rotation of J4 or J1 in one step to reduce the error near a singularity.  At 140 steps
@@ -68,19 +69,20 @@ BRANCHES = tuple(
 
 
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
-    """Return the rotation (3, 3) of the forearm: about z by J1, then about y by J2 + J3."""
+    """Return the rotation matrix (3, 3) of the forearm: J1 about z times J2 + J3 about y."""
     c1, s1, c23, s23 = cos(joint_1), sin(joint_1), cos(joints_23), sin(joints_23)
     return np.array([[c1 * c23, -s1, c1 * s23], [s1 * c23, c1, s1 * s23], [-s23, 0.0, c23]])
 
 
 def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
-    """Return the rotation (rad) of an axis towards a vector, or towards its opposite if nearer.
+    """Return the angle (rad) by which to rotate an axis towards a vector or its opposite.
 
-    along, across: components of the vector along the axis, and 90 degrees further.
-    fixed, near: lengths of the vector up to which there is no rotation, and from which it is full.
-
-    In between, the axis may deviate from the vector by an angle that falls from 90 degrees to zero.
-    A deviation within this tolerance is reduced by at most MAX_FREE_ROTATION_RAD per step.
+    The nearer of both directions is used.  Near a singularity the vector is short and the rotation
+    is limited.
+    along, across: components of the vector parallel to the axis, and at +90 degrees from it.
+    fixed, near: lengths of the vector.  Up to `fixed`, the axis may deviate by 90 degrees from the
+        vector.  From `near` on, the rotation is complete.  In between, the permitted deviation
+        decreases.  A permitted deviation is reduced by at most MAX_FREE_ROTATION_RAD per step.
     """
     length = hypot(along, across)
     if length == 0.0:
@@ -110,7 +112,10 @@ def _wrap(angle: float) -> float:
 
 
 def _nearest_revolution(angle: float, near: float, low: float, high: float) -> float:
-    """Return the angle plus revolutions, in [low, high] and nearest to `near`; infinite if none."""
+    """Add revolutions to an angle so that it is in [low, high] and nearest to `near`, rad.
+
+    Returns infinity if no such angle exists.
+    """
     best = inf
     for rotated in (angle, angle - 2.0 * pi, angle + 2.0 * pi):
         if low <= rotated <= high and abs(rotated - near) < abs(best - near):
@@ -170,21 +175,21 @@ class ClosedFormKinematics:
         return np.array(rows).T
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return the joints (6,) rad of a pose on all branches, in or out of the joint ranges."""
+        """Return the joints (6,) rad of a pose on all branches, even beyond the joint ranges."""
         return [np.array(one) for one in self.branches(base_from_flange, self.model.start_rad)]
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[Branch]:
-        """Return all branches; the poses do not matter."""
+        """Return all eight branches, independently of the poses."""
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return how far (n,) the wrist centres of poses (n, 4, 4) are within reach."""
+        """Return by how much (n,) the wrist centres of poses (n, 4, 4) are within reach, m."""
         wrist = base_from_flange[:, :3, 3] - self._flange_m * base_from_flange[:, :3, 2]
         away = np.linalg.norm(wrist - [0.0, 0.0, self._shoulder_m], axis=1)
         return np.asarray(self.max_wrist_m - away)
 
     def branches(self, base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
-        """Return every joint solution of a flange pose, up to 8, in or out of the joint ranges.
+        """Return all joint solutions of a flange pose, at most 8, even beyond the joint ranges.
 
         The order is that of `BRANCHES`.  A joint that is undefined at a singularity keeps its value
         in `present_rad` (6,).  Other angles are less than a revolution from zero.  The list is
@@ -224,9 +229,9 @@ class ClosedFormKinematics:
     def inverse_kinematics(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
         """Return joints (6,) within the ranges for a flange pose, nearest to the present joints.
 
-        The nearest solution is the one whose largest joint change is the smallest.  Since ranges
-        may exceed 360 degrees, one revolution more and less is also tried.  Raises UnreachableError
-        if no branch is within the ranges.
+        The nearest solution has the smallest maximum joint change.  Joint ranges may exceed 360
+        degrees, so angles that differ by one revolution are also tried.  Raises UnreachableError if
+        no branch is within the ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         nearest, least = None, inf
@@ -246,18 +251,18 @@ class ClosedFormKinematics:
         return np.array(nearest)
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Return joints (6,) rad for the next step of a motion, on the present branch without
-        jumps.
+        """Return joints (6,) rad for the next step of a motion, without a jump between branches.
 
         The result is exact except near two singularities.  Near J5 = 0, the exact J4 is the
-        direction of a vector of length sin(J5).  It rotates arbitrarily fast when the vector passes
-        close to zero, so J4 may lag there.  J5 then follows the component of the vector along J4,
-        which may be negative.  The other component is ignored.  This causes an orientation error of
-        the flange of at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
+        direction of a vector of length sin(J5).  This direction changes arbitrarily fast when the
+        vector passes close to zero, so J4 may lag there.  J5 then follows the component of the
+        vector along J4, which may be negative.  The other component is ignored.  The resulting
+        orientation error of the flange is at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
 
-        J1 is treated in the same way when the wrist centre is near its axis.  A path that passes a
-        singularity closely (WRIST_FIXED_RAD, SHOULDER_FIXED_M) therefore hardly moves J4 or J1.
-        Further away they rotate as in the exact solution, and the caller bounds their speeds.
+        J1 is treated in the same way when the wrist centre is near its axis.  Therefore J4 or J1
+        hardly move on a path that passes within WRIST_FIXED_RAD or SHOULDER_FIXED_M of a
+        singularity.  Farther away they follow the exact solution, and the caller limits their
+        speeds.
 
         If the solution is out of a joint's range, `inverse_kinematics` selects another branch.  It
         raises UnreachableError if there is none.
@@ -300,9 +305,10 @@ class ClosedFormKinematics:
         return self.inverse_kinematics(base_from_flange, present)
 
     def _bend(self, out: float, height: float) -> float | None:
-        """Return the angle (0..pi) between upper arm and elbow-wrist line, or None if out of reach.
+        """Return the angle (0 to pi) between upper arm and elbow-wrist line; None if out of reach.
 
-        out, height: position of the wrist centre in the arm's plane, relative to the shoulder, m.
+        out, height: horizontal and vertical distance of the wrist centre from the shoulder, in the
+        plane of the arm, m.
         """
         cosine = (out * out + height * height - self._upper_m**2 - self._elbow_to_wrist_m**2) / (
             2.0 * self._upper_m * self._elbow_to_wrist_m
@@ -312,7 +318,7 @@ class ClosedFormKinematics:
         return acos(min(1.0, max(-1.0, cosine)))
 
     def _solve_shoulder(self, out: float, height: float, q3: float) -> float:
-        """Return J2 (rad) that puts the wrist centre at a point of the arm's plane, see `_bend`."""
+        """Return J2 (rad) for a wrist centre in the plane of the arm at given J3; see `_bend`."""
         along = self._forearm_m * sin(q3) - self._shift_m * cos(q3)
         up = self._upper_m + self._shift_m * sin(q3) + self._forearm_m * cos(q3)
         return _wrap(atan2(out, height) - atan2(along, up))
@@ -320,8 +326,8 @@ class ClosedFormKinematics:
     def _unreachable(
         self, base_from_flange: Floats, solutions: list[tuple[float, ...]]
     ) -> UnreachableError:
-        """Make the error for a pose whose `solutions` are all out of the joint ranges."""
-        # Adding zero removes the sign of a negative zero.
+        """Make the error for a pose of which no solution is within the joint ranges."""
+        # Adding zero turns a negative zero into zero.
         x, y, z = np.round(base_from_flange[:3, 3] * 1e3) + 0.0
         where = f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base"
         if not solutions:
@@ -341,7 +347,7 @@ class ClosedFormKinematics:
         )
 
     def _beyond(self, solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
-        """Return for each joint how far (rad) it is out of range, its index and its angle."""
+        """Return for each joint its excess beyond its range (rad), its index and angle (rad)."""
         found = []
         for joint, (angle, low, high) in enumerate(
             zip(solution, self._lowest, self._highest, strict=True)
@@ -352,7 +358,7 @@ class ClosedFormKinematics:
         return found
 
     def find_branch(self, joints_rad: ArrayLike) -> Branch:
-        """Return the branch of joints (6,) rad; at a singularity, the first one that applies."""
+        """Return the branch of joints (6,) rad; at a singularity, the first one that matches."""
         joints = np.asarray(joints_rad, dtype=np.float64)
         return Branch(
             "front" if self._out(joints) >= 0.0 else "back",
@@ -363,11 +369,11 @@ class ClosedFormKinematics:
     def solve_joints_on_branch(
         self, base_from_flange: Floats, branch: Branch, near_rad: ArrayLike
     ) -> Floats:
-        """Return joints (n, 6) rad for flange poses (n, 4, 4) on one branch, in or out of range.
+        """Return joints (n, 6) rad for flange poses (n, 4, 4) on one branch.
 
-        Joints are NaN where the wrist centre is out of reach.  Of the equivalent angles of J1, J4
-        and J6, one within the range is preferred, then the nearest to `near_rad` (6,). At a
-        singularity the undefined joint is 0.
+        Joints may be beyond their ranges.  They are NaN where the wrist centre is out of reach.  Of
+        the equivalent angles of J1, J4 and J6, those within the range are preferred, and of these
+        the nearest to `near_rad` (6,).  At a singularity the undefined joint is 0.
         """
         poses = np.asarray(base_from_flange, dtype=np.float64)
         wrist = poses[:, :3, 3] - self._flange_m * poses[:, :3, 2]
@@ -408,7 +414,7 @@ class ClosedFormKinematics:
         return joints
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return by limit the distances (n,) of joints (n, 6) from being too near a singularity."""
+        """Return, by singularity, the margins (n,) of joints (n, 6) from its minimum distance."""
         joints = np.asarray(joints_rad, dtype=np.float64)
         elbow = np.remainder(joints[..., 2] - self.elbow_rad + 0.5 * pi, pi) - 0.5 * pi
         wrist = np.remainder(joints[..., 4] + 0.5 * pi, pi) - 0.5 * pi
@@ -419,7 +425,7 @@ class ClosedFormKinematics:
         }
 
     def _out(self, joints: Floats) -> Floats:
-        """Return how far (m) the wrist centre is in front of the axis of J1; negative behind it."""
+        """Return how far (m) the wrist centre is in front of the axis of J1; negative: behind."""
         q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
         return np.asarray(
             self._upper_m * np.sin(q2) - self._shift_m * np.cos(q23) + self._forearm_m * np.sin(q23)

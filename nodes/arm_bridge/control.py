@@ -524,9 +524,9 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """Move the sheet with its target; decelerate while target or other arm's state is late.
+        """Move the sheet to its target; decelerate while target or other arm's state is late.
 
-        If the planner or the other arm's bridge has ended, decelerate at once.
+        If the planner or the bridge of the other arm has ended, decelerate at once.
         """
         late_s = max(goal.overdue_s, other.age_s - self._timeouts.hold_after_s)
         is_late = goal.planner_ended or other.ended or late_s > self._timeouts.hold_after_s
@@ -914,7 +914,7 @@ class ArmControl:
 
 
 def _find_late_note(goal: Goal, other: OtherArm) -> NodeNote:
-    """Return the cause of a late target or state of the other arm."""
+    """Return the note that explains a late sheet target or a late state of the other arm."""
     if goal.planner_ended:
         return NodeNote.PLANNER_ENDED
     return NodeNote.OTHER_BRIDGE_ENDED if other.ended else NodeNote.TARGET_OR_ARM_LATE

@@ -27,7 +27,7 @@ EDGE_SPEED_FRACTION = 0.95
 
 
 def make_kinematics(model: ClosedFormArm | JointChain) -> ArmKinematics:
-    """Make the kinematics of an arm by its model."""
+    """Make the kinematics that suit the model of an arm."""
     return (
         ClosedFormKinematics(model)
         if isinstance(model, ClosedFormArm)

@@ -1,8 +1,8 @@
 """Compute the kinematics of any arm with six rotary joints numerically.
 
-Joints are (6,) or (n, 6) in radians, poses 4x4 `base_from_flange` in metres.  The inverse is a
-damped Newton method from known joints, with a bounded number of steps.  Poses that are far from the
-known joints are reached through intermediate poses, so that the arm stays on its branch.
+Joint angles are (6,) or (n, 6) in radians, poses are 4x4 `base_from_flange` in metres.  The inverse
+kinematics use a damped Newton method, which starts at known joints and has a bounded number of
+steps.  Distant poses are reached through intermediate poses, so that the arm stays on its branch.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from flexsheet.nodes.models.rigid import pose_matrix
 Floats = NDArray[np.float64]
 
 MAX_STEPS = 12
-"""Maximum number of Newton steps from known joints; a step of a bridge's cycle needs 2 or 3."""
+"""Maximum number of Newton steps from known joints; a control cycle typically needs 2 or 3."""
 
 WAYPOINTS, STEPS_PER_WAYPOINT = 8, 5
-"""Number of intermediate poses on the way to a far pose, and of Newton steps to each of them."""
+"""Number of intermediate poses on the way to a distant pose, and of Newton steps for each."""
 
 MAX_STEP_RAD = 0.3
 """Maximum change of a joint in one Newton step."""
@@ -33,32 +33,32 @@ TOLERANCE = 1e-8
 """Error of a solved pose (m, rad) below which the iteration ends."""
 
 MAX_ERROR = 1e-6
-"""Maximum error of a solved pose, m and rad."""
+"""Maximum error of an accepted solution, m and rad."""
 
 DAMPING = 1e-9
-"""Damping of the normal equations; it bounds the steps at a singularity."""
+"""Damping term of the normal equations, which limits the steps at a singularity."""
 
 SINGULAR_LENGTH_M = 0.25
-"""Length by which velocities are divided in the Jacobian's singular values."""
+"""Length that converts velocities to angular velocities in the singular values of the Jacobian."""
 
 MIN_SINGULAR_VALUE, NEAR_SINGULAR_VALUE = 0.01, 0.05
-"""Smallest singular value of the Jacobian below which a pose is refused, and above which paths must
-stay: there a flange speed of 0.25 m/s needs joint speeds of at most 20 rad/s."""
+"""Limits of the smallest singular value of the Jacobian.  A pose is rejected below the first limit.
+Paths must stay above the second one, where 0.25 m/s needs joint speeds of at most 20 rad/s."""
 
 SEEDS = 256
-"""Number of random joints from which `solve_all` starts."""
+"""Number of random joint vectors from which `solve_all` starts."""
 
 SEED_STEPS = 40
 
 MIN_DIFFERENCE = 0.02
-"""Sine of half the difference of a joint above which two solutions are distinct."""
+"""Value of |sin(difference / 2)| of any joint above which two solutions are distinct."""
 
 
 class SerialChain:
-    """Poses and Jacobians of a chain of six rotary joints, many at once."""
+    """Vectorized forward kinematics and Jacobian of a chain of six rotary joints."""
 
     def __init__(self, model: JointChain) -> None:
-        # A joint's transform is P + sin(q) Q + cos(q) R, with the constants below.
+        # The transform of a joint at angle q is constant + sin(q) sine + cos(q) cosine.
         constant, sine, cosine = np.zeros((3, 6, 4, 4))
         self._axes = np.array(model.axes)
         for joint, (origin, axis) in enumerate(zip(model.origins, self._axes, strict=True)):
@@ -76,7 +76,7 @@ class SerialChain:
         self.flange_m = float(np.linalg.norm(model.flange.position_m))
 
     def _frames(self, joints_rad: Floats) -> list[Floats]:
-        """Return base_from_joint (..., 4, 4) of all joints (..., 6), and of the flange."""
+        """Return the poses base_from_joint of all joints and of the flange, for joints (..., 6)."""
         angles = joints_rad[..., None, None]
         links = self._constant + np.sin(angles) * self._sine + np.cos(angles) * self._cosine
         frames = [links[..., 0, :, :]]
@@ -89,7 +89,7 @@ class SerialChain:
         return self._frames(joints_rad)[-1]
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the flange's velocity and angular velocity per joint speed, (..., 6, 6)."""
+        """Return the Jacobian (..., 6, 6): linear, then angular flange velocity per joint speed."""
         return self.pose_and_jacobian(joints_rad)[1]
 
     def pose_and_jacobian(self, joints_rad: Floats) -> tuple[Floats, Floats]:
@@ -102,7 +102,7 @@ class SerialChain:
         return flange, np.stack(rows, axis=-2)
 
     def levers_m(self, beyond_flange_m: float) -> Floats:
-        """Return upper bounds (6,) of the distances from the joints' axes to a point, m.
+        """Return upper bounds (6,) of the distances of a point from the joint axes, m.
 
         beyond_flange_m: distance of the point from the flange.
         """
@@ -111,7 +111,7 @@ class SerialChain:
 
 
 class NumericKinematics:
-    """Kinematics of one arm by Newton's method; see `kinematics.ArmKinematics`."""
+    """Kinematics of one arm with Newton's method; implements `kinematics.ArmKinematics`."""
 
     def __init__(self, model: JointChain) -> None:
         self.model = model
@@ -158,15 +158,15 @@ class NumericKinematics:
         return self._refine(poses, joints, STEPS_PER_WAYPOINT)
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: Floats) -> Floats:
-        """Return joints (6,) rad near the present ones; raises UnreachableError.
+        """Return joints (6,) rad near the present ones.
 
-        The result may leave the ranges of the joints only by raising the error, which names the
-        first such joint.
+        Raises UnreachableError if there is no solution, if a joint would leave its range, or near a
+        singularity.
         """
         poses, present = base_from_flange[None], np.asarray(present_rad, dtype=np.float64)
         if not (np.isfinite(poses).all() and np.isfinite(present).all()):
             raise UnreachableError(
-                "the flange's pose or the present joints are not finite", "reach"
+                "the pose of the flange or the present joints are not finite", "reach"
             )
         joints, errors = self._refine(poses, present[None], MAX_STEPS)
         if not errors[0] <= MAX_ERROR:
@@ -204,9 +204,9 @@ class NumericKinematics:
         return np.asarray(found)
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return the distinct solutions (6,) rad within the ranges, the nearest to the start first.
+        """Return distinct solutions (6,) rad within the joint ranges, nearest to the start first.
 
-        They are found from random joints, always the same ones, so that one may be missed.
+        The search starts from random joints with a fixed seed, so it may miss a solution.
         """
         random = np.random.default_rng(1)
         low, high = np.maximum(self._lowest, -pi), np.minimum(self._highest, pi)
@@ -218,7 +218,7 @@ class NumericKinematics:
         found: list[Floats] = []
         for one in turned[np.flatnonzero(np.less_equal(errors, MAX_ERROR))]:
             in_range = (np.maximum(self._lowest - one, one - self._highest) <= 0.0).all()
-            # Joints that differ by a revolution are the same solution.
+            # Joints that differ by whole revolutions count as the same solution.
             apart = [np.abs(np.sin(0.5 * (one - old))).max() for old in found]
             if in_range and min(apart, default=1.0) > MIN_DIFFERENCE:
                 found.append(one)
@@ -247,12 +247,12 @@ class NumericKinematics:
         return float(self._chain.offsets_m.sum() + self._chain.flange_m)
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return how far (n,) poses (n, 4, 4) are within the sum of all link lengths."""
+        """Return by how much (n,) the sum of all link lengths exceeds the distances of poses, m."""
         away = np.linalg.norm(base_from_flange[:, :3, 3], axis=1)
         return np.asarray(self._max_distance_m - away)
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return how far (n,) the smallest singular value is above its minimum."""
+        """Return the margin (n,) of the smallest singular value above NEAR_SINGULAR_VALUE."""
         return {"singularity": self._singular_values(joints_rad) - NEAR_SINGULAR_VALUE}
 
     def _singular_values(self, joints_rad: Floats) -> Floats:
@@ -266,7 +266,7 @@ class NumericKinematics:
 def _pose_errors(wanted: Floats, present: Floats) -> Floats:
     """Return translations (m) and rotation vectors (rad), (n, 6), from present to wanted poses.
 
-    The rotation vectors are exact for small angles, and have the right direction for others.
+    The rotation vectors are exact for small angles, and have the correct direction for all.
     """
     turn = wanted[:, :3, :3] @ np.swapaxes(present[:, :3, :3], 1, 2)
     spin = 0.5 * np.stack(
@@ -277,7 +277,7 @@ def _pose_errors(wanted: Floats, present: Floats) -> Floats:
         ],
         axis=1,
     )
-    # Beyond 90 degrees the sine falls again: keep its direction, and the length of a right angle.
+    # Beyond 90 degrees the sine decreases again. Keep its direction, with a length of 90 degrees.
     cosine = 0.5 * (np.trace(turn, axis1=1, axis2=2) - 1.0)
     sine = np.linalg.norm(spin, axis=1)
     factor = np.where(cosine < 0.0, 1.0 / np.maximum(sine, 1e-6), 1.0)

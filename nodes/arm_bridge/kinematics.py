@@ -1,7 +1,8 @@
-"""Define the interface of an arm's kinematics, which bridge, limiter and checks of the reach use.
+"""Define the interface of the kinematics of an arm.
 
-Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.  `closed_form` and `joint_chain`
-implement the interface, and `geometry.make_kinematics` selects one by the arm's model.
+Joint angles are (6,) in radians, poses are 4x4 `base_from_flange` in metres.  The modules
+`closed_form` and `joint_chain` implement the interface, and `geometry.make_kinematics` selects one
+of them for the model of an arm.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Floats = NDArray[np.float64]
 
 
 class UnreachableError(FlexsheetError, ValueError):
-    """A flange pose for which no joint solution is within the joint ranges.
+    """Raised for a flange pose that has no permitted joint solution.
 
     limit: "reach", "singularity", or the joint ("J1" to "J6") that is out of range in the nearest
         solution.
@@ -46,21 +47,22 @@ class ArmKinematics(Protocol):
         ...
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return d(velocity, angular velocity of the flange) / d(joint speeds), base frame.
+        """Return the Jacobian: velocity and angular velocity of the flange per joint speed.
 
-        joints_rad: (n, 6); the result is (n, 6, 6).
+        joints_rad: (n, 6). The result is (n, 6, 6), in the base frame.
         """
         ...
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: Floats) -> Floats:
         """Return joints (6,) rad near the present ones, within their ranges.
 
-        The work is bounded, since a bridge calls this in each cycle.  Raises UnreachableError.
+        The computing time is bounded, because a bridge calls this in each control cycle.  Raises
+        UnreachableError.
         """
         ...
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return the joints (6,) rad on all branches, in or out of the joint ranges."""
+        """Return the joints (6,) rad of a pose on all branches."""
         ...
 
     def find_branch(self, joints_rad: Floats) -> Any:
@@ -78,15 +80,15 @@ class ArmKinematics(Protocol):
         ...
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return how far (n,) poses (n, 4, 4) are within the arm's largest distance."""
+        """Return by how much (n,) poses (n, 4, 4) are within the reach of the arm, m."""
         ...
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return by limit the distances (n,) of joints (n, 6) from being too near a singularity."""
+        """Return, by singularity, the margins (n,) of joints (n, 6) from its minimum distance."""
         ...
 
 
 class SeedBranch(NamedTuple):
-    """Branch of an arm without closed form: the solutions that continue from some joints."""
+    """Branch of an arm without closed form: the solutions that are continuous with given joints."""
 
     seed_rad: tuple[float, ...]

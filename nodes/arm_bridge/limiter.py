@@ -84,8 +84,8 @@ class SheetLimits:
         """
         if self.compliance_m_per_n == 0.0 or not self.width_m < edge_distance_m < math.inf:
             return edge_distance_m
-        # The secant method between two lengths that enclose the solution (Illinois algorithm).
-        # `scipy.optimize` would double the time in which a bridge starts.
+        # Bracketing secant method (Illinois algorithm).  Importing `scipy.optimize` instead would
+        # double the start time of a bridge.
         low_m, low_excess_m = self.width_m, self.width_m - edge_distance_m
         high_m = edge_distance_m
         high_excess_m = self.compliance_m_per_n * self.force_n(high_m)
@@ -93,7 +93,7 @@ class SheetLimits:
             slope = (high_excess_m - low_excess_m) / (high_m - low_m)
             length_m = high_m - high_excess_m / slope
             excess_m = length_m + self.compliance_m_per_n * self.force_n(length_m) - edge_distance_m
-            # The excess grows by at least 1 m per metre, so it bounds the error of the length.
+            # The slope of the excess is at least 1, so the excess bounds the error of the length.
             if abs(excess_m) <= LENGTH_TOLERANCE_M:
                 return length_m
             if excess_m * high_excess_m > 0.0:

@@ -1,14 +1,14 @@
-"""Exchange lines of text with an arm's program over TCP; the example of a driver.
+"""Control an arm by lines of text over TCP; this module is an example of a driver.
 
-Most controllers can run a program that reads and writes lines on a socket.  Each command and its
-answer are one line, with fields separated by spaces:
+Most controllers can run a program that reads and writes lines on a socket.  A command is one line,
+and its answer is one line.  Spaces separate the fields:
 
     SEQUENCE MODE Q1 Q2 Q3 Q4 Q5 Q6
     SEQUENCE COUNT FAULTS Q1 Q2 Q3 Q4 Q5 Q6
 
 SEQUENCE counts commands, and the answer repeats it.  MODE is `idle`, `move`, `hold` or `stop`.
-COUNT is the number of the controller's measurements, modulo 2**32.  FAULTS is `-` or names of
-`ArmFault` in lower case, separated by commas.  The joints are in radians.
+COUNT is the number of joint measurements of the controller, modulo 2**32.  FAULTS is `-`, or names
+of `ArmFault` in lower case, separated by commas.  Q1 to Q6 are the joint angles in radians.
 """
 
 from __future__ import annotations
@@ -52,14 +52,14 @@ def decode_line(line: bytes, sequence: int) -> tuple[ArmStatus, tuple[int, ...]]
     if numbers[0] != sequence:
         raise ArmAnswerError(f"expected the answer to command {sequence}, found {numbers[0]}")
     if len(joints) != JOINTS or not all(math.isfinite(angle) for angle in joints):
-        raise ArmAnswerError(f"the answer {line[:80]!r} must have {JOINTS} finite joints")
+        raise ArmAnswerError(f"the answer {line[:80]!r} must have {JOINTS} finite joint angles")
     if not 0 <= numbers[1] < 2**32:
         raise ArmAnswerError(f"the count {numbers[1]} must be from 0 to 2**32 - 1")
     return ArmStatus(joints, found), (numbers[1],)
 
 
 class LineLink(ConnectedLink):
-    """Driver for one arm whose program answers lines of text."""
+    """Driver for one arm whose controller program exchanges lines of text."""
 
     period_s = 0.008
 

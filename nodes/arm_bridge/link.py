@@ -86,7 +86,7 @@ class Freshness(StrEnum):
     FRESH = "fresh"
     """The counters have advanced, so the joints are measured again."""
     REPEATED = "repeated"
-    """The counters equal those of the previous answer, for a short time so far."""
+    """The counters equal those of the previous answer, but only for a permitted time so far."""
     STALLED = "stalled"
     """The counters have not advanced for too long (`max_unchanged_s`)."""
     REVERSED = "reversed"
@@ -181,17 +181,17 @@ class ArmLink(Protocol):
 
 
 class ConnectedLink(ABC):
-    """Base class of drivers with one connection, on which each command has one answer.
+    """Base class of drivers that use one connection, on which each command gets one answer.
 
-    A driver implements `connected`, `_connect`, `_request` and `_disconnect`.  This class makes an
-    `ArmLink` of it: it opens the connection when it is needed, closes it after a failure, and opens
-    it again at once after a first failure, then after pauses that double up to `max_pause_s`.  It
-    judges by counters whether the measured joints are new.
+    A driver implements `connected`, `_connect`, `_request` and `_disconnect`.  This class uses them
+    to implement `ArmLink`.  It opens the connection when it is needed, and closes it after a
+    failure.  After the first failure it reconnects at once, then after pauses that double up to
+    `max_pause_s`.  Counters in the answers show whether the measured joints are new.
     """
 
     period_s: ClassVar[float] = 0.0071
-    """Period in which the controller measures its joints; repeated answers are allowed for seven
-    periods, or MAX_UNCHANGED_S if that is longer."""
+    """Period with which the controller measures its joints.  Answers may repeat a measurement for
+    seven periods, or for MAX_UNCHANGED_S if that is longer."""
 
     def __init__(
         self,
@@ -226,7 +226,7 @@ class ConnectedLink(ABC):
         """Send one command, wait for its answer, and return the status and its counters.
 
         mode, joints_rad: see `ArmLink`.  now_ns: time of the command.  The counters are 32-bit
-        numbers of the controller, of which the first counts its measurements.  Raises
+        counters of the controller; the first one counts its joint measurements.  Raises
         ArmSilentError, ArmRefusedError or ArmAnswerError.
         """
 
@@ -257,7 +257,7 @@ class ConnectedLink(ABC):
             self._pause_s = min(doubled_s, self._max_pause_s)
             raise
         except asyncio.CancelledError:
-            # The answer can still arrive, and the next request would receive it.
+            # A late answer could otherwise be taken for the answer to the next command.
             self.close()
             raise
         finally:

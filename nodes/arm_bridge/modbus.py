@@ -188,9 +188,9 @@ class _Framer(FramerSocket):
 class ModbusLink(ConnectedLink):
     """Driver for one arm by one Modbus TCP connection.
 
-    Any failure after which an answer can still arrive closes the connection, because pymodbus
-    3.16.1 can return a late answer to the next request.  Other false answers are detected by their
-    sequence and CRC.
+    The connection is closed after any failure after which an answer can still arrive, because
+    pymodbus 3.16.1 can return a late answer to the next request.  Other wrong answers are detected
+    by their sequence number and CRC.
     """
 
     def __init__(self, host: str, port: int, *, timeout_s: float = 0.03, **pauses: float) -> None:

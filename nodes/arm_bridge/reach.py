@@ -56,7 +56,7 @@ BRANCH_SAMPLES = 500
 """Approximate number of poses from which `find_best_reach` selects the branch."""
 
 SPEED_DAMPING = 1e-12
-"""Damping of the joint speeds, which bounds them at a singularity."""
+"""Damping term that limits the computed joint speeds at a singularity."""
 
 MAX_STEP_RAD = 0.05
 """Maximum change of a joint between two samples of a path; at a jump, any sampling exceeds it."""

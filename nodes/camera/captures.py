@@ -1,9 +1,10 @@
-"""Open cameras that OpenCV's package cannot open, with the interface of cv2.VideoCapture.
+"""Read cameras that the Python package of OpenCV does not support.
 
-`AravisCapture` reads one GenICam camera (GigE Vision or USB3 Vision), `GstreamerCapture` a
-pipeline, and `RealSenseCapture` the infrared pair of a RealSense camera as one image with both
-views side by side.  Their packages are optional and imported when a device is opened.
-`settings.BACKENDS` states the units of their controls.
+The classes have the interface of cv2.VideoCapture.  `AravisCapture` reads one GenICam camera (GigE
+Vision or USB3 Vision), and `GstreamerCapture` reads a GStreamer pipeline.  `RealSenseCapture` reads
+the infrared pair of a RealSense camera, and returns both views side by side in one image.  The
+packages are optional and imported when a device is opened.  `settings.BACKENDS` defines the units
+of the controls.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from flexsheet.nodes.camera.image_pair import DeviceError, Image
 
 GRAB_S = 1.0
-"""Maximum duration of a grab, so that a thread that reads a silent camera can end."""
+"""Timeout of a grab, so that the reading thread can end when a camera sends no images."""
 
 BUFFERS = 4
 
@@ -29,7 +30,7 @@ BUFFERS = 4
 def _import(module: str, remedy: str) -> Any:
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ImportWarning)  # The importer of gi causes them.
+            warnings.simplefilter("ignore", ImportWarning)  # Importing gi causes such warnings.
             return importlib.import_module(module)
     except ImportError as error:
         raise DeviceError(f"{module} cannot be imported ({error}); {remedy}") from error
@@ -37,7 +38,7 @@ def _import(module: str, remedy: str) -> Any:
 
 def _import_introspected(name: str, version: str) -> Any:
     remedy = (
-        f"install the system packages python3-gi and gir1.2 of {name}, and make them visible: "
+        f"install the system packages python3-gi and gir1.2 of {name}, and set "
         "PYTHONPATH=/usr/lib/python3/dist-packages"
     )
     gi = _import("gi", remedy)
@@ -49,12 +50,12 @@ def _import_introspected(name: str, version: str) -> Any:
 
 
 def _monotonic_ms(real_time_ns: int) -> float:
-    """Convert a time of the system clock to the monotonic clock, ms."""
+    """Convert a time of the system clock (ns since 1970) to the monotonic clock, ms."""
     return (real_time_ns - time.time_ns() + time.monotonic_ns()) * 1e-6
 
 
 class CapturedDevice:
-    """Base class of captures: stores the requested format, and starts the device when it is needed.
+    """Base class of captures: stores the requested format, and starts the device on first use.
 
     stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if there is none.
     """
@@ -80,7 +81,7 @@ class CapturedDevice:
             self.started = True
 
     def set(self, property_id: int, value: float) -> bool:
-        """Set the format before the start, or a control; return whether it may have been set."""
+        """Set a control, or before the start a format property; return whether it is accepted."""
         if property_id in self.wanted and not self.started:
             self.wanted[property_id] = value
             return True
@@ -90,7 +91,7 @@ class CapturedDevice:
         return self._set_control(property_id, value)
 
     def get(self, property_id: int) -> float:
-        """Return an actual setting, or the timestamp of the frame; 0 if it is unknown."""
+        """Return the actual value of a property, or the frame's timestamp (ms); 0 if unknown."""
         if property_id == cv2.CAP_PROP_POS_MSEC:
             return self.stamp_ms
         self._ensure_started()
@@ -103,12 +104,12 @@ class CapturedDevice:
         return 0.0
 
     def retrieve(self) -> tuple[bool, Image | None]:
-        """Return the grabbed image, grey (h, w)."""
+        """Return whether there is a grabbed image, and the grey image (h, w)."""
         return self.image is not None, self.image
 
 
 class AravisCapture(CapturedDevice):
-    """One GenICam camera by Aravis; device: its name, or empty for the only one."""
+    """GenICam camera read with Aravis; device: its name, or empty for the only camera."""
 
     def __init__(self, device: str) -> None:
         super().__init__(device)
@@ -119,7 +120,7 @@ class AravisCapture(CapturedDevice):
         self._camera = self._call(lambda: self._aravis.Camera.new(device or None), "open")
 
     def _call(self, call: Any, what: str) -> Any:
-        """Call Aravis; raises DeviceError that names the device and what was tried."""
+        """Call a function of Aravis; raises DeviceError that names the device and the action."""
         try:
             return call()
         except Exception as error:  # GLib.Error, which is known only after the import.
@@ -184,7 +185,7 @@ class AravisCapture(CapturedDevice):
             if complete:
                 shape = buffer.get_image_height(), buffer.get_image_width()
                 self.image = np.frombuffer(buffer.get_data(), np.uint8).reshape(shape).copy()
-                # The time at which this computer received the first packet of the frame.
+                # Time at which this computer received the first packet of the frame.
                 self.stamp_ms = _monotonic_ms(buffer.get_system_timestamp())
             self._stream.push_buffer(buffer)
             if complete:
@@ -199,10 +200,10 @@ class AravisCapture(CapturedDevice):
 
 
 class RealSenseCapture(CapturedDevice):
-    """Infrared pair of a RealSense camera; device: its serial number, or empty for any one.
+    """Infrared pair of a RealSense camera; device: its serial number, or empty for any camera.
 
-    The projector of dots is switched off.  Both sensors share their trigger.  The timestamp is the
-    middle of the exposure, if the camera reports the time of the sensor.
+    The dot projector of the camera is switched off.  Both sensors are triggered together.  The
+    timestamp is the middle of the exposure, if the camera reports sensor timestamps.
     """
 
     def __init__(self, device: str) -> None:
@@ -283,7 +284,7 @@ class RealSenseCapture(CapturedDevice):
         return True
 
     def _find_stamp_ms(self, frame: Any) -> float:
-        """Return the middle of the exposure on the monotonic clock, ms; 0 if it is unknown."""
+        """Return the time of the middle of the exposure, monotonic clock, ms; 0 if unknown."""
         rs = self._rs
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return 0.0
@@ -306,9 +307,9 @@ class RealSenseCapture(CapturedDevice):
 
 
 class GstreamerCapture(CapturedDevice):
-    """GStreamer pipeline; device: its text up to raw video, such as `v4l2src device=/dev/video0`.
+    """GStreamer pipeline; device: description up to raw video, like `v4l2src device=/dev/video0`.
 
-    The pipeline decides format and controls; its timestamps are those of its source.
+    The pipeline determines format and controls.  Timestamps come from the source element.
     """
 
     def __init__(self, device: str) -> None:
@@ -346,7 +347,7 @@ class GstreamerCapture(CapturedDevice):
         found, rate, per = caps.get_fraction("framerate")
         self._size = float(width), float(height), rate / per if found and per else 0.0
         data = np.frombuffer(buffer.extract_dup(0, buffer.get_size()), np.uint8)
-        # Rows of a grey image begin at multiples of four bytes.
+        # GStreamer pads the rows of a grey image to multiples of four bytes.
         self.image = data.reshape(height, -1)[:, :width].copy()
         known = buffer.pts != gst.CLOCK_TIME_NONE
         # The system clock of GStreamer is CLOCK_MONOTONIC.
@@ -354,7 +355,7 @@ class GstreamerCapture(CapturedDevice):
         return True
 
     def grab(self) -> bool:
-        """Wait for the next image; return False if the pipeline has ended or is silent."""
+        """Wait for the next image; return False if the pipeline has ended or delivers nothing."""
         self._ensure_started()
         return self.grab_sample()
 
@@ -376,13 +377,13 @@ CAPTURES: dict[str, type[AravisCapture | GstreamerCapture | RealSenseCapture]] =
     "gstreamer": GstreamerCapture,
     "realsense": RealSenseCapture,
 }
-"""Captures by the name of `api` in the camera's source."""
+"""Capture classes by the value of `api` in the source parameter of a camera node."""
 
 
 def list_devices(sysfs: Path = Path("/sys/class/video4linux")) -> list[str]:
-    """Return a line for each camera that is found, with its `api` and its name.
+    """Return a line of text for each camera found, with its `api` and its name.
 
-    Packages that are not installed are skipped.
+    Cameras whose optional package is not installed are not listed.
     """
     found = []
     for node in sorted(sysfs.glob("video*")):

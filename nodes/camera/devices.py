@@ -45,7 +45,7 @@ def open_reader(
 class ReaderThread(threading.Thread):
     """Thread that reads a source to its end, reports failures and opens the source again.
 
-    deliver(images, lost): called for each pair, with the total number of lost frames.
+    deliver(images, lost): called for each image pair, with the total number of lost frames.
     fail(error): called for each DeviceError.  The source is then opened again after a delay, which
         doubles from `retry_s` to MAX_RETRY_S until images arrive.
     report(text): called after each opening for every device, with its format and settings.

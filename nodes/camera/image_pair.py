@@ -81,11 +81,11 @@ class ImagePair:
 class Reader(Protocol):
     """Interface of readers of image pairs.
 
-    paced: whether `read` returns immediately, as for files.  The caller must then wait until the
-        time of each pair.
+    paced: whether `read` returns immediately, as for files.  The caller must then wait until each
+        pair is due.
     rate_hz: frame rate of a device, to count lost frames; None for files.
     warnings: texts about settings that the device did not accept.
-    opened: texts about the format and settings that each device has; empty for files.
+    opened: texts about the actual format and settings of each device; empty for files.
     """
 
     paced: bool

@@ -38,7 +38,7 @@ FIRST_FRAME_S = 5.0
 RELEASE_S = 0.5
 
 RATE_FRAMES = 61
-"""Number of pairs over which the true rate is measured."""
+"""Number of image pairs over which the actual frame rate is measured."""
 
 
 @dataclass(frozen=True, slots=True)

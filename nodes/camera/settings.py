@@ -75,7 +75,7 @@ BACKENDS = {
         autos=(("auto white balance", cv2.CAP_PROP_XI_AUTO_WB),),
         offsets=(cv2.CAP_PROP_XI_OFFSET_X, cv2.CAP_PROP_XI_OFFSET_Y),
     ),
-    # The next three are opened by `captures`, not by OpenCV.
+    # The module `captures` opens the next three, OpenCV the others.
     "aravis": Backend(
         api=cv2.CAP_ANY,
         exposure_unit_s=1e-6,
@@ -105,7 +105,8 @@ BACKENDS = {
 class DeviceSettings:
     """Actual settings of a device.
 
-    exposure_s: None if unknown.  got: format and settings, for the log and the node's status.
+    exposure_s: exposure time; None if unknown.  got: text with format and settings, for log and
+        status of the node.
     warnings: texts about settings that the device did not accept.
     """
 
@@ -201,7 +202,7 @@ def fix_settings(
 
 
 def _describe(capture: Device, device: object, rate_hz: float, exposure_s: float | None) -> str:
-    """Return the device's actual size, pixel format, rate, exposure and gain."""
+    """Return a text with the actual image size, pixel format, rate, exposure and gain."""
     width, height, code, gain = (
         capture.get(one)
         for one in (

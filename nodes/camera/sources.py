@@ -25,7 +25,7 @@ class TwinSource(CameraSource):
 
 
 class OpenCvSource(CameraSource):
-    """Cameras by number, device path or address of a stream, by serial number or by pipeline.
+    """Source of live images; a camera is given by number, path, stream address or pipeline.
 
     Two cameras without a common trigger expose at different times (`docs/camera.md`).
     """

@@ -1,7 +1,7 @@
-"""Define the arms that the page draws: boxes for each link, and the poses of the links.
+"""Define how the console page draws the arms: boxes for each link, and poses of the links.
 
-The lengths are those of the arm's model in the scene. The thicknesses are approximate. The origin
-of a link's frame is on its joint axis.
+The lengths come from the model of the arm in the scene. The thicknesses are approximate. The origin
+of the frame of a link is on its joint axis.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ PIECES = (
     Piece(5, (0.05, 0.05, 0.062), (0.0, 0.0, 0.035)),
     Piece(6, (0.044, 0.044, 0.012), (0.0, 0.0, -0.006), dark=True),
 )
-"""Boxes of an RV-1A."""
+"""Boxes that represent the links of a Mitsubishi RV-1A."""
 
 LINK_WIDTH_M = 0.07
-"""Width of the boxes of other arms."""
+"""Width of the boxes that represent the links of other arms."""
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 """Corners of a box, (8, 3)."""
@@ -68,7 +68,7 @@ def compute_link_poses(
 
 
 def make_pieces(model: ClosedFormArm | JointChain) -> tuple[Piece, ...]:
-    """Return the boxes of an arm; those of an unknown one lead from joint to joint."""
+    """Return the boxes of an arm; for an unknown arm, boxes that connect successive joints."""
     if model == RV_1A:
         return PIECES
     chain = model.chain() if isinstance(model, ClosedFormArm) else model

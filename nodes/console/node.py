@@ -109,7 +109,7 @@ class Console(Node):
         return [topic.name for topic in written if topic.name in TOPICS_READ]
 
     async def setup(self) -> None:
-        # Imported late: the libraries of the page take a second, and the launcher needs none.
+        # Imported here, because importing the libraries takes a second and the launcher needs none.
         from flexsheet.nodes.console.access_control import AccessControl, read_token, start_server
         from flexsheet.nodes.console.operator import Operator
 

@@ -98,7 +98,7 @@ class FemSolver(Node):
         return f"{current.method.name}, force within {percent:.0f} %, {nodes} skin nodes"
 
     def _force_error_ratio(self, current: body.SceneBody) -> float:
-        """Return the stated error of the force, with that of bodies which are being replaced."""
+        """Return the stated relative error of the force, including that of replaced bodies."""
         return max(one.force_error_ratio for one in (current, *(old for old, _ in self._replaced)))
 
     async def close(self) -> None:
@@ -211,7 +211,7 @@ class FemSolver(Node):
         self.soft_body.publish(message, source_ns=header.source_ns)
 
     def _end_transitions(self) -> None:
-        """Forget the replaced bodies that no longer contribute to the responses."""
+        """Remove the replaced bodies that no longer contribute to the responses."""
         if not self._replaced:
             return
         begin_ns = self.clock.now_ns() - round(1e9 * BLEND_S)

@@ -267,7 +267,10 @@ def _compute_table(
 def _interpolate_by(
     executor: Executor, on_progress: Callable[[int], None], jobs: Sequence[FillJob]
 ) -> list[FilledNodes]:
-    """Interpolate the nodes of jobs by an executor. on_progress: called with the nodes done."""
+    """Interpolate the nodes of jobs in an executor.
+
+    on_progress: called with the number of finished nodes.
+    """
     filled: dict[int, FilledNodes] = {}
     _collect(
         {executor.submit(interpolate_nodes, job): number for number, job in enumerate(jobs)},
@@ -282,9 +285,10 @@ def _collect(
     on_result: Callable[[int, T], None],
     on_progress: Callable[[], None],
 ) -> None:
-    """Await the futures, and cancel the remaining ones after an exception.
+    """Wait for all futures; cancel the remaining ones after an exception.
 
-    on_result: called with the number and the result of each. on_progress: called periodically.
+    waiting: indices by future. on_result: called with the index and the result of each future.
+    on_progress: called periodically.
     Raises LostWorkersError if the executor loses its workers, and the errors of the futures.
     """
     try:

@@ -193,7 +193,7 @@ class SnapshotSet:
     radius_m: float
 
     def make_interpolator(self) -> SnapshotInterpolator:
-        """Return an interpolator of the snapshots and their mirror images."""
+        """Make an interpolator of the snapshots and their mirror images."""
         placed = place_snapshots(self.samples, self.solved, self.mirrors)
         return SnapshotInterpolator(placed, self.towards_user, self.radius_m)
 

@@ -33,11 +33,11 @@ def choose_method(
     *,
     compute_table: bool = False,
 ) -> tuple[MethodChoice, float]:
-    """Return the method and the skin spacing (m), given a scene and the parameters of a node.
+    """Choose the method and the skin spacing (m) from a scene and the parameters of a node.
 
     method, skin_spacing_m: parameters; `auto` leaves the choice to the scene. If the scene chooses
-    the linear method, that is used even if a table is cached. Otherwise `auto` uses the table if it
-    is cached. compute_table: whether `auto` also computes a missing table, which takes minutes.
+    the linear method, it is used even if a table is cached. Otherwise `auto` uses a cached table.
+    compute_table: whether `auto` also computes a missing table, which takes minutes.
     """
     choice = scene.methods.soft_body
     by_scene_m = None if choice is None else choice.skin_spacing_m

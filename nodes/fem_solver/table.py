@@ -86,7 +86,7 @@ def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FillJob:
-    """Contact nodes at which snapshots are interpolated. It contains all inputs, for a worker.
+    """Job for a worker process: interpolate snapshots at some contact nodes. It has all inputs.
 
     samples: contact nodes. rest (s, 3): undeformed skin nodes. triangles (t, 3): skin triangles.
     """
@@ -101,8 +101,8 @@ class FillJob:
 class FilledNodes:
     """Interpolated snapshots at n nodes and k depths.
 
-    moved (n, k, 3 s), force_n (n, k, 3): displacement of the skin, and force. reached (n,): see
-    `SnapshotInterpolator.interpolate`. valid (n,): see `count_valid_levels`.
+    moved (n, k, 3 s): displacements of s skin nodes, m. force_n (n, k, 3): forces. reached (n,):
+    see `SnapshotInterpolator.interpolate`. valid (n,): see `count_valid_levels`.
     """
 
     moved: Floats32
@@ -128,7 +128,7 @@ def interpolate_nodes(job: FillJob) -> FilledNodes:
 
 
 Interpolate = Callable[[Sequence[FillJob]], Iterable[FilledNodes]]
-"""Function that interpolates the nodes of jobs, in this or in other processes, in their order."""
+"""Function that interpolates the nodes of jobs in this or other processes, in their order."""
 
 
 def fill_table(

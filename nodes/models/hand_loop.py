@@ -7,9 +7,11 @@ once per period T.  The sheet follows after a delay, so it can add energy.  The 
 damping b and stiffness k, the sheet the stiffness ks.  With the depth x and the sheet's offset s:
 
     m x'' + b x' + k x + ks (x - s) = 0
-    s(t) = slope (y_j + y'_j (t - j T - delay)),  y_j filtered x(j T),  y'_j its rate
+    s(t) = slope (y_j + y'_j (t - j T - delay))
 
-The change of the state over one period is an exact linear map, whose eigenvalues give stability.
+Here y_j is the low-pass filtered depth x(j T) of measurement j, and y'_j is its rate.  The state
+changes over one period by an exact linear map.  The loop is stable if all eigenvalues of this map
+are inside the unit circle.
 """
 
 from __future__ import annotations
@@ -26,18 +28,18 @@ MIN_DECAY_PER_S = 0.5
 
 GAIN_MARGIN = 1.5
 DELAY_MARGIN_S = 0.02
-"""Margins of gain (a factor) and of delay (added) that a permitted slope must have."""
+"""Required stability margins: factor on the gain, and additional delay (s)."""
 
 MAX_SLOPE = 20.0
 """Upper limit of the search for the critical slope, far above any slope in use."""
 
 SLOPES = 32
-"""Number of slopes at which the search evaluates the decay."""
+"""Number of slopes at which the search evaluates the decay rate."""
 
 DELAYS_S = (0.02, 0.04, 0.06, 0.08, 0.1, 0.13, 0.17)
 FILTERS_S = (0.03, 0.08, 0.16)
 SHEET_STIFFNESSES_N_PER_M = (50.0, 120.0, 300.0)
-"""Grid points of the table of bounds (`OffsetBoundsTable`)."""
+"""Grid of `OffsetBoundsTable`: delays, filter time constants and stiffnesses of the sheet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +68,7 @@ Mussa-Ivaldi, Hogan and Bizzi 1985.  Damping ratios of wrist and arm: 0.15 to 0.
 """
 
 LIMITING_HANDS = tuple(hand for name, hand in HANDS.items() if "low damping" in name)
-"""Hands that determine the bounds, because hands of low damping become unstable first."""
+"""Hands with low damping, which become unstable first and thus determine the bounds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +114,7 @@ def make_loop_matrices(
         flow * loop.period_s * np.array([fraction, 1.0 - fraction])[:, None, None]
     )
 
-    # `measure` adds a measurement: it maps the state to one with new filtered depth, offset, rate.
+    # `measure` adds a measurement: it extends the state by filtered depth, offset and its rate.
     measure = np.zeros((len(slopes), size + 2, size))
     measure[:, :2, :2] = np.eye(2)
     weight = loop.filter_weight
@@ -122,8 +124,8 @@ def make_loop_matrices(
     measure[:, 5] = slopes[:, None] * rate
     measure[:, 6:, 4:] = np.eye(2 * waiting)
 
-    # `move` moves the hand: until `fraction` of the period with the oldest offset, then with the
-    # next one.  The oldest took effect in the previous period, (1 - fraction) T ago.
+    # `move` moves the hand for one period: for its `fraction` with the oldest offset, then with
+    # the next one.  The oldest offset took effect (1 - fraction) T before this period.
     start = np.zeros((4, size + 2))
     start[:2, :2] = np.eye(2)
     start[2, -2], start[2, -1], start[3, -1] = 1.0, (1.0 - fraction) * loop.period_s, 1.0
@@ -139,7 +141,7 @@ def make_loop_matrices(
 def compute_decays_per_s(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the decay rate of the slowest mode for each slope, (k,), 1/s; negative if it grows."""
+    """Return the decay rate (k,) of the slowest mode for each slope, 1/s; negative: it grows."""
     matrices = make_loop_matrices(
         hand, loop, sheet_stiffness_n_per_m=sheet_stiffness_n_per_m, slopes=slopes
     )
@@ -155,10 +157,10 @@ def compute_critical_slope(
     towards_finger: bool,
     max_slope: float = MAX_SLOPE,
 ) -> float:
-    """Return the smallest magnitude of a slope at which the loop is unstable, up to `max_slope`.
+    """Return the smallest magnitude of slope at which the loop is unstable, at most `max_slope`.
 
-    The decay rate is interpolated between the slopes of a grid.  At larger slopes the loop may be
-    stable again, which is ignored.
+    The decay rate is interpolated between slopes on a grid.  Stability at even larger slopes is
+    ignored.  towards_finger: search among negative slopes, which move the sheet to the finger.
     """
     magnitudes = np.concatenate([[0.0], np.geomspace(0.01 * max_slope, max_slope, SLOPES)])
     decays = compute_decays_per_s(
@@ -179,7 +181,7 @@ def compute_critical_slope(
 
 @dataclass(frozen=True, slots=True)
 class OffsetBounds:
-    """Maximum slopes of the sheet's offset over the depth at which every hand is stable.
+    """Maximum slopes at which every hand is stable; slope: sheet offset divided by finger depth.
 
     filters_s (f,): time constants of the depth's low-pass filter.
     sheet_stiffnesses_n_per_m (k,): stiffness of the sheet under the finger.
@@ -217,7 +219,7 @@ class OffsetBoundsTable:
     max_retreats: Floats
 
     def at_delay(self, delay_s: float) -> OffsetBounds:
-        """Return the bounds at the next longer delay of the table; beyond the last they are 0."""
+        """Return the bounds at the next longer delay of the table; beyond the last, bounds of 0."""
         row = int(np.searchsorted(self.delays_s, delay_s - 1e-9))
         axes = self.filters_s, self.sheet_stiffnesses_n_per_m
         if row == len(self.delays_s):

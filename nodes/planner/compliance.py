@@ -422,9 +422,9 @@ def fit_compliance(
     stretch_ratio: float | None = None,
     max_depth_m: float | None = None,
 ) -> Compliance:
-    """Find the stretch and the offset that best render the curve in a scene.
+    """Find the stretch ratio and the sheet offset that best render a force curve in a scene.
 
-    stretch_ratio: stretch to keep; None: choose the best one. max_depth_m: depth of the deepest
+    stretch_ratio: fixed stretch ratio; None: choose the best one. max_depth_m: maximum depth of a
     push; None: that of the scene. The note reports an object that is so soft that the scene's
     tolerance of the sheet's position changes its force noticeably.
     """

@@ -109,7 +109,7 @@ class Planner(Node):
         mode = self.parameters.choose_compliance(scene)
         bounds = None
         if mode == "force_curve":
-            # SciPy loads its parts on first use, which must not delay a target.
+            # SciPy imports submodules on first use, which must not delay a sheet target.
             _ = scipy.interpolate
             bounds = load_or_compute_bounds(scene.camera.rate_hz, self.parameters.cache_dir)
         self._compliance = ComplianceController(

@@ -1,7 +1,7 @@
 """Compute and cache the deflection shapes of the pushed sheet.
 
-The computation takes half a minute. Shapes are stored for a few radii of the finger and widths of
-the sheet. Shapes between two stored radii are interpolated, and shapes of another width are scaled.
+The computation takes half a minute. Shapes are stored for a few finger radii and sheet widths.
+For other radii they are interpolated, and for other widths they are scaled.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
 
 
 def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
-    """Return how the shapes of a scene of `list_stored` are cached: key, inputs and format.
+    """Return the cache entry (key, inputs and format) for the shapes of a scene of `list_stored`.
 
     The shapes do not depend on the sheet's thickness and Young's modulus.
     """
@@ -91,7 +91,7 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 
 
 def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
-    """Return the scenes whose shapes are stored, each with its weight in the scene's shapes."""
+    """List scenes with stored radius and width, and their weights in the shapes of a scene."""
     width_m = WIDTH_STEP_M * max(round(scene.sheet.width_m / WIDTH_STEP_M), 1)
     sheet = scene.sheet.model_copy(update={"width_m": round(width_m, 6)})
     steps = max(scene.finger.radius_m - FIRST_RADIUS_M, 0.0) / RADIUS_STEP_M
@@ -107,7 +107,7 @@ def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
 
 
 def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> IndentationBasis:
-    """Return the shapes of a scene from the weighted shapes of `list_stored`."""
+    """Combine the weighted shapes of the scenes of `list_stored` into those of a scene."""
     rubber, _ = required_shapes(scene)
     stored = parts[0][1]
     wider = rubber.width_m / stored.rubber.width_m

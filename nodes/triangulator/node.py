@@ -89,7 +89,7 @@ class Triangulator(Node):
         return frozenset() if shows_check_marks(scene) else frozenset({"frame"})
 
     async def setup(self) -> None:
-        # SciPy loads its parts on first use, which must not delay an image.
+        # SciPy imports submodules on first use, which must not delay an image.
         _ = scipy.optimize, scipy.special
         if path := self.parameters.calibration:
             self.calibration = load_calibration(path)

@@ -135,7 +135,7 @@ class ArmMechanics:
         return np.asarray(one @ two @ three @ self._home)
 
     def _rotations(self, joints_rad: Floats) -> Floats:
-        """Return the motions exp(S q) (6, 4, 4) of all joints about their axes at zero angles."""
+        """Return the transforms exp(S q) (6, 4, 4) of all joints; see `forward`."""
         angles = joints_rad[:, None, None]
         return np.asarray(
             np.eye(4) + np.sin(angles) * self._cross + (1.0 - np.cos(angles)) * self._square
@@ -179,7 +179,7 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 
 RV_1A_MECHANICS = ArmMechanics(RV_1A)
-"""Mechanics of the arm that a scene has unless it names another one."""
+"""Mechanics of the RV-1A, the default arm of a scene."""
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:

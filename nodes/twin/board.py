@@ -191,7 +191,7 @@ class TwinBoard:
         spread = RAYS * self.sensor.blur_px
         smooth = cv2.GaussianBlur(fine, (0, 0), spread, borderType=cv2.BORDER_REPLICATE)
         size = fine.shape[1] // RAYS, fine.shape[0] // RAYS
-        # This interpolation averages the rays of each pixel.
+        # This interpolation method averages the rays of each pixel.
         return np.asarray(cv2.resize(smooth, size, interpolation=cv2.INTER_AREA), np.float32)
 
     def _seen(self, rays: Singles, eye_from_board: Floats) -> tuple[Singles, Singles]:
@@ -287,9 +287,9 @@ class TwinBoard:
 
 
 def _measure_rise(place: Singles) -> Singles:
-    """Return by how much values on rays (rows, columns) change from one ray to the next.
+    """Return the change of values (rows, columns) from one ray to the next.
 
-    The change varies little within a pixel, so that it is computed at one ray of each pixel.
+    The change varies little within a pixel, so it is computed at one ray per pixel.
     """
     rows, columns = place.shape
     step = RAYS if min(rows, columns) >= 2 * RAYS else 1

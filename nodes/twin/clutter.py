@@ -170,7 +170,7 @@ def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clut
     if share >= 1.0:
         edge = -3.0
     else:
-        from scipy.optimize import brentq  # imported late: it takes half a second
+        from scipy.optimize import brentq  # Imported here, because the import takes half a second.
 
         # Find the x = edge beyond which a segment of the unit disc has this area.
         edge = brentq(

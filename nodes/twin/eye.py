@@ -587,7 +587,7 @@ class EyeCamera:
     def take(
         self, projected: Image, situation: EyeSituation, *, eye: Floats
     ) -> tuple[Image, Image]:
-        """Render the image that the eye sees of a projected frame, and the one that it should see.
+        """Render the image of a projected frame that the eye sees, and the one that it should see.
 
         Both images are (rows, columns, 3). Raises NotConvergedError if the sheet's shape is not
         found, and ValueError if the object reaches the eye or its deformation is invalid.

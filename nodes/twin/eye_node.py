@@ -68,8 +68,8 @@ class TwinEyeParameters(SimulatorParameters):
 class TwinEyeNode(Node):
     """Render the eye's image of labelled frames, once per label, correction and eye.
 
-    Only frames with pixels and of a single view are rendered. A mono frame is seen from the
-    viewpoint of the parameters, a frame for one eye from that eye.
+    Only frames that contain the pixels of a single view are rendered. A mono frame is rendered from
+    the viewpoint in the parameters, and a frame for one eye from that eye.
 
     An image takes about a second. Further frames of a label that is waiting or was just rendered
     are therefore skipped; they do not count as lost. The sheet has its true shape at the time at

@@ -46,8 +46,9 @@ MAX_STEP_RADII = 0.7
 
 MAX_ITERATIONS = 80
 UNDAMPED_ROUNDS, MAX_FRICTION_ROUNDS = 6, 20
-"""Maximum number of equilibria that are solved per step of the finger while nodes slip, and the
-number after which the changes of the friction forces are halved, since they may alternate."""
+"""Limits of the number of equilibria that are solved per finger step while nodes slip. Above the
+first limit, changes of the friction forces are halved, since they may alternate. The second limit
+is the maximum."""
 FRICTION_TOLERANCE = 0.01
 """Relative change of the friction forces between two equilibria below which they are accepted."""
 GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
@@ -458,7 +459,7 @@ def solve_path(
 
     world_from_left_edge, world_from_right_edge: (4, 4) poses of the clamped edges; the origin is
     the centre of the edge, y points along it.
-    finger_tips: positions (3,) on one normal of the sheet, in the order of their depths.
+    finger_tips: positions (3,) on one normal of the sheet, sorted by depth.
     friction_coefficient: Coulomb coefficient between finger and sheet; None: touched nodes stick.
     cells: number of intervals between nodes along each side; even.
     slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a barely

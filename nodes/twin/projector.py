@@ -37,7 +37,7 @@ SPREAD_PX = 0.5
 """Blur (standard deviation) of a projected pixel on the sheet, due to lens and rubber."""
 
 WINDOW_MARGIN = 0.05
-"""Margin about the sheet's outline in an image, as slopes x/z and y/z of the rays."""
+"""Margin around the outline of the sheet in an image, in slopes x/z and y/z of rays."""
 
 FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
 OFFSET_DEVIATION_M, ROTATION_DEVIATION_RAD = 0.004, 0.006
@@ -160,7 +160,7 @@ class LitSheet:
             light = cv2.remap(thrown, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
             level = np.where(inside, np.float32(LIT_LEVEL / 255.0) * light + DARK_LEVEL, ROOM_LEVEL)
             level = cv2.GaussianBlur(level.astype(np.float32), (0, 0), RAYS * self._sensor.blur_px)
-            # This interpolation averages the rays of each pixel.
+            # This interpolation method averages the rays of each pixel.
             mean = np.asarray(
                 cv2.resize(level, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32
             )
@@ -175,7 +175,10 @@ class LitSheet:
     def _find_window(
         self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats
     ) -> tuple[slice, slice]:
-        """Return the rows and columns of the image that can show the sheet; all if it is behind."""
+        """Return the rows and columns of the image that can show the sheet.
+
+        Returns the whole image if a part of the sheet is behind the eye.
+        """
         height, width = self._camera.height_px, self._camera.width_px
         half = 0.5 * np.array([self._scene.sheet.width_m, self._scene.sheet.height_m])
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [*half, 0.0]
@@ -183,7 +186,7 @@ class LitSheet:
         if in_eye[:, 2].min() <= 0.0:
             return slice(0, height), slice(0, width)
         slopes = in_eye[:, :2] / in_eye[:, 2:]
-        # The margin covers the bend of the sheet and the blur of the lens.
+        # The margin allows for the bending of the sheet and the blur of the lens.
         low, high = slopes.min(axis=0) - WINDOW_MARGIN, slopes.max(axis=0) + WINDOW_MARGIN
         middle = rays[RAYS // 2 :: RAYS, RAYS // 2 :: RAYS]
         seen = ((middle >= low) & (middle <= high)).all(axis=2)

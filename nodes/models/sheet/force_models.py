@@ -1,11 +1,11 @@
-"""Compute the force of the pushed sheet by interchangeable models.
+"""Compute the force of the pushed sheet with interchangeable models.
 
 Inputs of a model are depths of a fingertip below the flat sheet, and a `SheetPush`: the stretch
 ratio, the position on the stretched sheet (x, y from its centre, m) and the fingertip's radius.
 Outputs are the normal force, its derivative with respect to the depth, and the force on each clamp.
 
-By increasing cost: `ScaledSheetModel`, `nodes.models.sheet.tabulated.TabulatedSheetModel`,
-`MembraneSheetModel`.
+In order of increasing cost, the models are `ScaledSheetModel`,
+`nodes.models.sheet.tabulated.TabulatedSheetModel` and `MembraneSheetModel`.
 """
 
 from __future__ import annotations

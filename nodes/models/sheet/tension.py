@@ -44,9 +44,9 @@ def strain_measure(stretch_ratio: float, mooney_ratio: float = 0.0) -> float:
 
 
 class SlackSheet(Protocol):
-    """Dimensions and modulus of a slack sheet, as in the scene, in `Rubber` and in arm limits.
+    """Interface of objects with the dimensions and the modulus of an unstretched sheet.
 
-    width_m: distance of the clamped edges. height_m: length of an edge.
+    width_m: distance between the clamped edges. height_m: length of an edge.
     """
 
     @property
