@@ -261,9 +261,11 @@ class OfflineEvaluator:
         return Evaluation(fingertip, sheet, image, felt, expected)
 
     def _touch(self, around_m: float, aside_m: float = 0.0) -> Contact:
-        """Return the sheet after rolling without slip from the object's front.
+        """Return the contact after the sheet has rolled over the object without slip.
 
-        around_m, aside_m: arc length to its new contact point, and distance to the right.
+        The sheet starts in contact with the front of the object. around_m, aside_m: position of the
+        new contact point relative to the front, m: arc length around the object, and distance to
+        the right.
         """
         place = np.array([aside_m, around_m, 0.0])
         point, above = map_to_surface(self._scene, place + np.outer([0.0, 1e-3], [0, 0, 1]))

@@ -72,7 +72,8 @@ class StabilitySettings:
     """Extent of the experiment.
 
     hands: number of random hands per group of HAND_RANGES, sampled with `seed`. rates_hz: camera
-    rates for the boundary. object_ratios: ratios of object stiffness to that of the scene's object.
+    rates at which the critical slope is measured. object_ratios: factors by which the stiffness of
+    the scene's object is multiplied. delays_s, jitters_s: delays of the loop and their jitter.
     """
 
     hands: int = 4
