@@ -311,9 +311,10 @@ async def _replay_run(
 
 @dataclass(frozen=True, slots=True)
 class NodeRun:
-    """Execution log of a node between two of its starts.
+    """Execution log of a node from one of its starts to the next.
 
-    steps: rows (input index or -1 - timer index, sequence, epoch, time in ns).
+    steps (n, 4): one row per executed step: index of the input, or -1 - index of the timer;
+    sequence number; epoch; time, ns.
     """
 
     clock_id: str
