@@ -244,8 +244,8 @@ class TwinFingerNode(Node):
     def expose(self, middle_ns: int) -> StereoPair:
         """Render the image pair with timestamp `middle_ns`; publish the true finger at that time.
 
-        The images are exposed at a slightly different time, as the apparatus states. A scene must
-        have arrived.
+        The actual exposure time differs from `middle_ns` by the timestamp error of the apparatus.
+        This method must not be called before a scene has been received.
         """
         assert self.camera is not None
         exposed_ns = middle_ns + self._stamp_error_ns()
