@@ -810,7 +810,7 @@ class ArmControl:
         return self._move(velocity, geometry, step_s)
 
     def _limit_velocity(self, goal_rad: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
-        """Return joint velocities (6,) rad/s towards a goal, assumed to keep its velocity."""
+        """Return joint velocities (6,), rad/s, towards a goal that moves at its last velocity."""
         before = self.commanded_rad if self._goal_rad is None else self._goal_rad
         return limit_velocity(
             self.commanded_rad,

@@ -75,10 +75,10 @@ def find_visible_region(
 
 
 def find_finger_regions(scene: Scene) -> Regions:
-    """Return the sensor region of each view in which a fingertip can appear.
+    """Return, for each of the two views, the sensor region in which a fingertip can appear.
 
-    The finger's volume is extended by the finger's radius and a margin.  Raises DeviceError if a
-    view does not show the volume.
+    The fingertip can appear in the box from finger.volume_min_m to finger.volume_max_m, extended
+    by the radius of the finger and a margin.  Raises DeviceError if a view does not show the box.
     """
     finger, rig = scene.finger, scene.camera
     low = np.asarray(finger.volume_min_m) - finger.radius_m

@@ -282,7 +282,7 @@ class Replay:
         return list_bags(self._folder)
 
     def open(self, name: str) -> None:
-        """Open a bag of the folder and show its start.  Raises BagError."""
+        """Open the named bag in the bag folder and play it from its start.  Raises BagError."""
         self.timeline = Timeline(self._folder / name)
         self.playing = True
 

@@ -104,7 +104,7 @@ class Tracker:
         return self._history[-1][1] if self._history else None
 
     def is_late(self, at_ns: int) -> bool:
-        """Return whether a point at `at_ns` is not newer than the newest one."""
+        """Return whether the time `at_ns` of a point is at or before the time of the estimate."""
         return self.estimate is not None and at_ns <= self.estimate.at_ns
 
     def state(self, at_ns: int) -> FingertipState:

@@ -333,7 +333,10 @@ class SmoothMeshShape:
         return _on_surface_only(feet)
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return the rise, as specified by `Shape.rise_m`, evaluated at the centres of the jets."""
+        """Return how far the object rises above its tangent plane at a surface point, m.
+
+        See `Shape.rise_m`. The height is evaluated only at the centres of the local quadratic fits.
+        """
         offset = self._centre[:-1] - point
         height = offset @ normal
         across = np.einsum("ji,ji->j", offset, offset) - height * height
