@@ -137,7 +137,10 @@ def find_loop_risk(
     table: OffsetBoundsTable,
     delay_s: float,
 ) -> LoopFinding | None:
-    """Return the risk of the feedback loop of sheet and hand at a delay; None without risk."""
+    """Return the risk of the feedback loop of sheet and hand at a delay.
+
+    Return None if there is no risk.
+    """
     bounded = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
     error_ratio = float(np.abs(bounded.centre.error_ratio).max())
     if not bounded.choose_filter_s()[1]:
