@@ -259,7 +259,10 @@ class ForceSample:
 
     @property
     def model_error_ratio(self) -> float | None:
-        """Return the error of the wanted force relative to the reference; None without one."""
+        """Return the error of the wanted force relative to the reference.
+
+        Return None if there is no reference.
+        """
         if self.reference is None:
             return None
         return _relative_error(self.wanted_n, self.reference.force_n)
