@@ -39,7 +39,10 @@ class MeasuredLag:
 
 
 def read_measured_lags(bag: Path) -> dict[Side, MeasuredLag]:
-    """Return the newest lags that the bridges measured in a bag; raises DelaysError without one."""
+    """Return the newest lags that the bridges measured in a bag.
+
+    Raises DelaysError if there are none.
+    """
     found: dict[Side, MeasuredLag] = {}
     for _, message, _, _ in BagReader(bag, topics=["arm_left", "arm_right"]):
         if not isinstance(message, ArmState) or message.servo_lag_s is None:

@@ -237,7 +237,7 @@ def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: R
 
 
 def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
-    """Draw modulus and width of the sheet; empty without a calibration."""
+    """Draw errors of the modulus and width of the sheet; none if there is no calibration."""
     sheet = known.calibrations.sheet
     if sheet is None:
         return {}

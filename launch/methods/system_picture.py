@@ -111,7 +111,10 @@ def _failing(point: Mapping[str, Any]) -> str:
 
 
 def _bars(one: Interval, y: float) -> list[list[float]] | None:
-    """Return the lengths of the error bars below and above y; None without a finite interval."""
+    """Return the lengths of the error bars below and above y.
+
+    Return None if there is no finite interval.
+    """
     if not np.isfinite([one.low, one.high]).all():
         return None
     return [[max(y - max(one.low, MIN_RATIO), 0.0)], [max(one.high - y, 0.0)]]
