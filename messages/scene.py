@@ -641,7 +641,7 @@ def require_material(scene: Scene) -> Material:
 
 
 def require_support(scene: Scene) -> Support:
-    """Return the fixed part of the object's skin; raises MissingPartError without one."""
+    """Return the fixed part of the object's skin; raises MissingPartError if there is none."""
     if scene.object.support is None:
         raise MissingPartError(
             f'scene "{scene.name}": object.support is missing; a soft object needs it'

@@ -409,7 +409,10 @@ class ConsoleController:
 
 
 def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> ConsoleState:
-    """Load the state of the previous console; without one, make a state with the first scene."""
+    """Load the state of the previous console.
+
+    If there is none, make a state with the first scene.
+    """
     try:
         state = load_state(files.state)
     except scenes.SceneChoiceError as error:

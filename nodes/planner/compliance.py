@@ -353,7 +353,7 @@ class Compliance:
     ) -> Floats:
         """Return the sheet's distance (n,), m, behind the object's tangent plane; < 0 in front.
 
-        It is 0 without contact, smooth (C1) over the depth and continuous over the position.
+        It is 0 if there is no contact, smooth (C1) over the depth and continuous over the position.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
         result: Floats = depths - self.indentation_m(depths, position_m)
