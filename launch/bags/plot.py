@@ -1,4 +1,4 @@
-"""Plot fields of recorded topics over time."""
+"""Plot fields of recorded topics against time."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class Verification:
 
     @property
     def repeatable(self) -> bool:
-        """Return whether both replays gave the same bytes, without an error."""
+        """Return whether both replays succeeded and gave the same bytes."""
         return self.same_bytes and self.errors == 0
 
     @property

@@ -168,7 +168,7 @@ class ComplianceRecording:
     """Data of a compliance experiment, read from a bag.
 
     windows_ns: (start, end) of each finger path, by label. edges: true flange poses of both arms
-    as rows (16,). curves: object force over depth, (m, 2) each, published at `curve_times_ns`.
+    as rows (16,). curves: object force against depth, (m, 2) each, published at `curve_times_ns`.
     methods: the soft body's method that computed each curve.
     forces: times (ns) and values (N) of the valid measured contact forces (k, 2).
     """

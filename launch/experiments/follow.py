@@ -159,7 +159,7 @@ def _directions(count: int) -> Floats:
 
 
 def _differences(steps: int, order: int) -> csr_array:
-    """Return the matrix (steps - order, steps) of finite differences of an order over time."""
+    """Return the matrix (steps - order, steps) of finite differences in time of an order."""
     return csr_array(np.diff(np.eye(steps), n=order, axis=0))
 
 

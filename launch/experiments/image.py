@@ -202,8 +202,9 @@ def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, Er
 def summarize_eyes(left: ErrorMap, right: ErrorMap) -> dict[str, float | None]:
     """Return the mean error of each eye's image, and of the disparity, mm.
 
-    A mean is None if there are no points. The disparity error is the right eye's error minus the left eye's, horizontal and vertical. It
-    is computed at screen positions at which both eyes see the object.
+    A mean is None if there are no points. The disparity error is the right eye's error minus the
+    left eye's, horizontal and vertical. It is computed at screen positions at which both eyes see
+    the object.
     """
     disparity_mm = 1e3 * np.abs(right.errors_m - left.errors_m)
     across_mm, up_mm = (

@@ -233,7 +233,10 @@ class OfflineEvaluator:
     def evaluate(
         self, apparatus: Apparatus, metrics: frozenset[Metric] = ALL_METRICS
     ) -> Evaluation:
-        """Evaluate the given metrics of an apparatus. Raises ExperimentError without a solution."""
+        """Evaluate the given metrics of an apparatus.
+
+        Raises ExperimentError if there is no solution.
+        """
         try:
             return self._evaluate(apparatus, metrics)
         except (NotConvergedError, ValueError) as error:
@@ -455,7 +458,7 @@ class OfflineEvaluator:
 
         The crosses lie on the object, and are drawn for each eye of the scene on the sheet in front
         of it. The sheet then moves to the finger, which touches it where the tracker measures the
-        position of the cross. Raises ExperimentError without a solution.
+        position of the cross. Raises ExperimentError if there is no solution.
         """
         scene = apply_apparatus(self._scene, apparatus)
         arms = ArmPair(self._scene, apparatus)
@@ -536,7 +539,7 @@ class OfflineEvaluator:
         return corrected
 
     def _parallax(self, eye: Floats) -> Floats:
-        """Return the shift of object points on the screen plane for another eye position, m.
+        """Return the shift of object points on the screen plane if the eye is moved, m.
 
         Shape (rows, columns, 2), for the pixels of `_object_points`; NaN where the scene's eye sees
         no object.

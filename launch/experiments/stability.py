@@ -8,8 +8,8 @@ Two simulations run in the time domain, without running nodes:
 - map: the offset that the planner uses for objects of several stiffnesses, with each random hand at
   several delays, packet jitters and depths, with and without the planner's stability bounds.
 
-The random hands are sampled from the ranges in the literature with a separate seed. So the bounds
-are tested with other hands than those from which they were derived.
+The random hands are sampled from the ranges in the literature with a separate seed. The bounds
+are therefore tested with hands that were not used to derive them.
 """
 
 from __future__ import annotations
