@@ -50,7 +50,7 @@ SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 
 
 def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
-    """Return the object's force over depth (n, 2), m and N, on the side that faces the user.
+    """Return the object's force against depth (n, 2), m and N, on the side that faces the user.
 
     The cached nonlinear table of the object is used if it exists. Otherwise the linear method is
     used, and computed if necessary. cache_dir: None for the user's cache folder.

@@ -22,7 +22,7 @@ SEED = 20261123
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
-    """Return the configuration names in another random order for each block."""
+    """Return the configuration names in a different random order for each block."""
     random = np.random.default_rng(seed)
     return [[names[i] for i in random.permutation(len(names))] for _ in range(blocks)]
 
