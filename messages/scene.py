@@ -603,7 +603,10 @@ class UnfitGeometryError(FlexsheetError, ValueError):
 
 
 def require_cylinder(scene: Scene) -> Cylinder:
-    """Return the scene's cylinder; raises UnfitGeometryError for another shape."""
+    """Return the scene's cylinder.
+
+    Raises UnfitGeometryError if the object has a different shape.
+    """
     geometry = scene.object.geometry
     if not isinstance(geometry, Cylinder):
         raise UnfitGeometryError(
