@@ -869,8 +869,9 @@ class ArmControl:
     def _restart_refusal(self, measured: Floats, geometry: ArmGeometry) -> str | None:
         """Return why a motion must not restart from the measured joints, or None.
 
-        The arm must be at rest.  At its last commanded position it may restart.  At another one,
-        either the arm has not followed, or the measurement is wrong and would make the arm jump.
+        The arm must be at rest.  At its last commanded position it may restart.  At any other
+        position, either the arm has not followed, or the measurement is wrong and would make the
+        arm jump.
         """
         lowest, highest = geometry.range_rad
         beyond = max(float((lowest - measured).max()), float((measured - highest).max()))

@@ -253,7 +253,7 @@ class PathChecker:
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
         """Return a finished request with its result, or None; must be called in every cycle.
 
-        request: check to start unless another one runs; None: no check is wanted.
+        request: check to start unless a check is already running; None: no check is wanted.
         """
         if self._running is None:
             if request is not None:

@@ -94,7 +94,7 @@ class UnfitCurveError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ObjectCurve:
-    """Force of the object over depth: n ascending points from (0, 0).
+    """Force of the object against depth: n ascending points from (0, 0).
 
     Between the points the curve is a monotone cubic, beyond the last a line with the last slope.
     """
@@ -145,7 +145,7 @@ class StretchLimits:
     """Limits of the sheet, of the arms that stretch it, and of the control loop with the hand.
 
     edge_force_n: maximum force on each clamp.
-    bounds: bounds on the offset's slope; None for an analysis without a hand.
+    bounds: bounds on the offset's slope; None for an analysis that has no hand.
     """
 
     min_stretch_ratio: float
@@ -360,7 +360,7 @@ class Compliance:
         return result
 
     def offset_per_depth(self, depth_m: float, position_m: SheetPosition = CENTRE) -> float:
-        """Return the slope of the offset over depth: -`limits.max_advance_per_depth` to 1."""
+        """Return the change of the offset per depth: -`limits.max_advance_per_depth` to 1."""
         if depth_m <= 0.0:
             return 0.0
         if depth_m >= self.max_depth_m:

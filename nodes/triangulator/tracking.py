@@ -108,7 +108,7 @@ class Tracker:
         return self.estimate is not None and at_ns <= self.estimate.at_ns
 
     def state(self, at_ns: int) -> FingertipState:
-        """Return the state of the track at a time that is not earlier than its newest point."""
+        """Return the state of the track at `at_ns`, which must be at or after its newest point."""
         if not self._is_alive(at_ns):
             return "acquiring" if self._tentative_track else "lost"
         assert self.estimate is not None
@@ -117,7 +117,7 @@ class Tracker:
     def gate(self, at_ns: int) -> Gate | None:
         """Return the gate at a time after the newest point.
 
-        Return None if there is no track, or if the time is not after its newest point.
+        Return None if there is no track, or if the time is at or before its newest point.
         """
         if not self._is_alive(at_ns) or self.is_late(at_ns):
             return None
@@ -138,7 +138,7 @@ class Tracker:
         )
 
     def predict_at(self, at_ns: int, horizons_s: Floats) -> TrackPrediction:
-        """Predict position, velocity and path at a time that is not before the newest point.
+        """Predict position, velocity and path at a time at or after the newest point.
 
         horizons_s: (n,) times of the path's points after `at_ns`.  The first must be 0.
         If the track is lost, the predicted finger stays at its last position.

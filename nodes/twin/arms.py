@@ -179,7 +179,7 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 
 RV_1A_MECHANICS = ArmMechanics(RV_1A)
-"""Mechanics of the arm that a scene has unless it names another one."""
+"""Mechanics of the arm that is used if the scene names none."""
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:

@@ -63,7 +63,7 @@ class SlackSheet(Protocol):
 
 
 def edge_force_n(stretch_ratio: float, sheet: SlackSheet, *, mooney_ratio: float = 0.0) -> float:
-    """Return the force (N) on each clamped edge without a push; 0 for a slack sheet."""
+    """Return the force (N) on each clamped edge if nothing pushes it; 0 if the sheet is slack."""
     return _area_modulus_n(sheet) * strain_measure(stretch_ratio, mooney_ratio)
 
 
