@@ -537,7 +537,7 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class StrokeErrors:
-    """Errors of a stroke over time, m and rad.
+    """Errors of a stroke as functions of time, m and rad.
 
     seconds: (n,), times of the measured errors since the start of the stroke. These are exposures
     with a valid fingertip. true_seconds: (m,), times of the true errors. These are all exposures,

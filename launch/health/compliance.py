@@ -137,7 +137,7 @@ def find_loop_risk(
     table: OffsetBoundsTable,
     delay_s: float,
 ) -> LoopFinding | None:
-    """Return the risk of the feedback loop of sheet and hand at a delay.
+    """Return the risk of the feedback loop of sheet and hand at the given delay.
 
     Return None if there is no risk.
     """

@@ -1,4 +1,4 @@
-"""Describe the apparatus of a scene as a tree of links and joints, as URDF does.
+"""Describe the apparatus of a scene as a tree of links and joints, like a URDF file.
 
 Links: `world`, for each side `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and
 `SIDE_clamp`, then `camera_left`, `camera_right`, `projector` and `screen`. Joints that move:
