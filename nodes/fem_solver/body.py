@@ -50,8 +50,8 @@ def make_soft_body_spec(
     """Return the inputs of the precomputation for the object of a scene.
 
     skin_spacing_m: distance between skin nodes. sticking: whether the finger sticks to the skin.
-    Raises ValueError as `mesh_spec`, and for a skin spacing above the radius of the fingertip. Such
-    a skin would be too stiff: the force is twice as large as it should be at a spacing of 1.7
+    Raises ValueError like `mesh_spec`, and if the skin spacing exceeds the radius of the fingertip.
+    Such a skin would be too stiff: the force is twice as large as it should be at a spacing of 1.7
     radii, and seven times at 7 radii.
     """
     if skin_spacing_m > scene.finger.radius_m:
