@@ -142,7 +142,7 @@ class Alignment:
     duration_s: float
 
     def joints_at(self, time_s: float) -> Floats:
-        """Return the joints (6,) rad at a time since the start."""
+        """Return the joints (6,), rad, at `time_s` after the start, s."""
         part = min(1.0, time_s / self.duration_s) if self.duration_s > 0.0 else 1.0
         joints: Floats = self.from_rad + smoothstep(np.array(part)) * (self.to_rad - self.from_rad)
         return joints

@@ -229,7 +229,7 @@ class TwinFingerNode(Node):
         self.path_stroke_s = path.stroke_s
 
     def truth(self, at_ns: int) -> FingerState:
-        """Return the true state of the fingertip at a time of this node's clock."""
+        """Return the true state of the fingertip at the time `at_ns` of this node's clock."""
         state = self.motion.at((at_ns - self.motion_from_ns) * 1e-9)
         if self.coupled is None or not self.edges:
             return state

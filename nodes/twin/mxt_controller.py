@@ -131,7 +131,7 @@ class MxtController:
         self.restart()
 
     def restart(self) -> None:
-        """Clear the error and restart the program, as an operator does."""
+        """Clear the error and restart the program, as an operator would."""
         self.error = ""
         self._master: Address | None = None
         self._moved = False

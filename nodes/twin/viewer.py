@@ -31,7 +31,7 @@ class Viewer:
         self._eyes, self._sway, self._random = true_scene.eyes, sway, random
 
     def locate_eye(self, side: Side, time_s: float) -> Floats:
-        """Return the position (3,) of an eye at a time, m."""
+        """Return the position (3,) of an eye at `time_s`, m."""
         aside_m = (0.5 if side == "right" else -0.5) * self._eyes.interocular_m
         moved = np.zeros(3) if self._sway is None else self._sway.at(time_s)
         return np.asarray(self._eyes.centre_world_m + aside_m * np.eye(3)[0] + moved)
