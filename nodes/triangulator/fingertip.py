@@ -112,7 +112,7 @@ class BlobPair:
         is no gate.
     cost: mismatch of rays, sizes, heights and distance from the gate's centre, in squared standard
         deviations.
-    rejection_reason: None if the pair may be a marker in the finger's volume.
+    rejection_reason: None if the pair may be a marker in the box that the finger can reach.
     """
 
     left: Blob

@@ -170,7 +170,7 @@ def fit_discs(
 def fit_ellipses(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> list[DiscFit]:
-    """Fit one ellipse at rest in each image, as `fit_discs` fits discs.
+    """Fit one ellipse at rest in each image, in the way in which `fit_discs` fits discs.
 
     Starting values describe a moving disc; the ellipse starts with the same second moments.  Each
     ellipse is fitted alone, because the time grows with the third power of its size.
@@ -410,7 +410,7 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Render ellipses; return the same arrays as `_render_disc`."""
+    """Render ellipses; return arrays like those of `_render_disc`."""
     x, y = (each.ravel() for each in np.broadcast_arrays(x[0], y[0]))
     coverage, by_shape = integrate_ellipse(found[:, ELLIPSE], x, y)
     columns = found.T[:, :, None]

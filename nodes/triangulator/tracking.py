@@ -46,7 +46,7 @@ class TrackingSettings:
 
 @dataclass(frozen=True, slots=True)
 class PositionMeasurement:
-    """Measured marker position (3,) m at a time, with its covariance (3, 3) m^2."""
+    """Measured marker position (3,) m at `at_ns`, with its covariance (3, 3) m^2."""
 
     at_ns: int
     measured: Floats
