@@ -330,7 +330,7 @@ def read_runs(bag: Path, name: str) -> list[NodeRun]:
     for _, message, header, _ in BagReader(bag, ["status"]):
         if isinstance(message, Status) and message.node == name and len(message.execution_log):
             before = logs.setdefault(header.epoch, [])
-            # For some seconds after its start, a node publishes its whole log again each time.
+            # For a few seconds after its start, a node publishes its whole log again each time.
             if before and (before[0][0] == message.execution_log[0]).all():
                 before.clear()
             before.append(message.execution_log)

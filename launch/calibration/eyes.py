@@ -232,7 +232,7 @@ def _rest(position: Floats, _time_s: float) -> Floats:
 def simulate_alignments(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> list[Alignment]:
-    """Simulate alignments of a viewer, as the simulated stereo camera sees them.
+    """Simulate alignments of a viewer that the simulated stereo camera observes.
 
     The arms hold the flat sheet at the screen. Alignments are left out if the sheet is not behind
     the bead, or if the detector rejects one of the points. calibration: camera parameters that the

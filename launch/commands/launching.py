@@ -144,7 +144,7 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
 
 
 def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
-    """Start `warn_of_loop_risk` on the planner's host in a thread, as it takes half a second."""
+    """Start `warn_of_loop_risk` in a thread on the planner's host, because it takes 0.5 s."""
     if any(
         issubclass(node_class(node.type), node_class("planner")) for node in plan.nodes_on(host)
     ):
