@@ -132,7 +132,7 @@ class StripSupport(Part):
 
 
 class BaseSupport(Part):
-    """Support that fixes the lowest part of the surface, as for an object on a table."""
+    """Support that fixes the lowest part of the surface, like a table under the object."""
 
     kind: Literal["base"] = "base"
     height_m: Positive = Field(

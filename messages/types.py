@@ -614,7 +614,7 @@ class NodeOmission(MessagePart):
 
 
 class HostKey(MessagePart):
-    """Public key of a host, as the reporting host has it."""
+    """Public key of a host that the reporting host stores."""
 
     host: str
     key: str
