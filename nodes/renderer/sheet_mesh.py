@@ -45,7 +45,7 @@ def flat_mesh(sheet: SheetPose) -> SheetMesh:
 
 
 def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return four triangles between corners and pushed point, as in Furukawa et al. 2007."""
+    """Return the four triangles between corners and pushed point that Furukawa et al. 2007 use."""
     if sheet.pushed_point is None:
         return flat_mesh(sheet)
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)

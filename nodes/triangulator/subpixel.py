@@ -54,7 +54,7 @@ PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
 """Inverse variances of the parameters' starting values.  They matter only where the pixels contain
-no information, as for the level of a saturated marker."""
+no information, for example about the level of a saturated marker."""
 
 MIN_SHAPE = np.array([0.5, 0.3])
 MAX_SHAPE = np.array([40.0, 8.0])

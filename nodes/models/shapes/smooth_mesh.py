@@ -107,7 +107,7 @@ class SmoothMeshShape:
     """Closed mesh, smoothed over the length `smoothing_m`; see the module docstring."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
-        """Fit the jets that define the smooth surface of a closed mesh.
+        """Fit the local quadratics (jets) that define the smooth surface of a closed mesh.
 
         Raises MeshError for a mesh that does not bound a solid or is too small for the smoothing
         length, and ValueError for a length that is not positive.
@@ -379,7 +379,7 @@ class SmoothMeshShape:
         return table, counts
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate f, as a `LevelSet`, at points (n, 3) near the surface.
+        """Evaluate f at points (n, 3) near the surface; this implements a `LevelSet`.
 
         The last result (n,) is the sum of the weights w_i.
         """
@@ -438,9 +438,9 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """Function that evaluates f of a `SmoothMeshShape` along one projection, as a `LevelAt`.
+    """Function (`LevelAt`) that evaluates f of a `SmoothMeshShape` along one projection.
 
-    To save time, the list of nearby jets is updated only when the point has moved by
+    To save time, the list of nearby local fits (jets) is updated only when the point has moved by
     `MEMBERS_KNOWN` times `rho`.
     """
 

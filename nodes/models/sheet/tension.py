@@ -44,7 +44,7 @@ def strain_measure(stretch_ratio: float, mooney_ratio: float = 0.0) -> float:
 
 
 class SlackSheet(Protocol):
-    """Dimensions and modulus of a slack sheet, as in the scene, in `Rubber` and in arm limits.
+    """Dimensions and modulus of a slack sheet, which scene, `Rubber` and arm limits provide.
 
     width_m: distance of the clamped edges. height_m: length of an edge.
     """
