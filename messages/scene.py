@@ -208,7 +208,7 @@ class Appearance(Part):
 
 
 class VirtualObject(Part):
-    """Virtual object; without a material it is rigid.
+    """Virtual object; if it has no material, it is rigid.
 
     `support_angle_rad: x` in a scene file is short for `support: {kind: strip, angle_rad: x}`.
     """

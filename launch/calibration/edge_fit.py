@@ -68,7 +68,7 @@ class EdgeFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class EdgeMark:
-    """Mark on a clamp: arm, known position (3,) in the frame of the edge, and measured one, m."""
+    """Mark on a clamp: arm, known position (3,) in the edge's frame and measured one in the world."""
 
     side: Side
     mark_edge_m: Floats

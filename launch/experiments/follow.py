@@ -317,7 +317,7 @@ def bound_errors(
     times_s: (n,), increasing. positions_world: (n, 3), true fingertip. The result contains the mean
     and the 95 % quantile (p95) over the steps in contact, for the motion with the least mean. Steps
     whose exact sheet the arms cannot reach, and windows without a solution, count as zero.
-    Raises ExperimentError for a path without contact.
+    Raises ExperimentError if the path never touches the object.
     """
     followed = FollowedContact(scene, apparatus)
     grid = np.arange(times_s[0], times_s[-1], STEP_S)

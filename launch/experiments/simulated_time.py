@@ -300,7 +300,7 @@ class SimulatedLoop:
 
     @property
     def delay_s(self) -> float:
-        """Return the time from an exposure until the sheet has moved, as the planner uses it, s."""
+        """Return the delay, s, that the planner assumes from an exposure to the sheet's motion."""
         return self._horizon_s
 
     def run_cycles(self, until_s: float) -> None:

@@ -63,7 +63,7 @@ class NodeEntry:
         return found
 
     def disconnect_optional(self, written: Container[str]) -> None:
-        """Disconnect optional inputs without a writer, unless the launch file names a topic."""
+        """Disconnect optional inputs that have no writer, unless the launch file names a topic."""
         if self.type is None:
             return
         self.disconnect(
