@@ -86,7 +86,7 @@ class SceneBody:
     method: method that computes the response. front (3,): surface point nearest to the user, mesh
     frame. rest (s, 3): undeformed skin nodes, mesh frame. linear_depth_m: maximum depth of the
     linear method, at which the stiffness is evaluated. friction_ratio: friction coefficient; with
-    0 the finger slides without friction. force_error_ratio: stated relative error of the force.
+    0 the finger slides freely. force_error_ratio: stated relative error of the force.
     """
 
     method: SoftBodyMethod
@@ -128,7 +128,7 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact, with the stiffness at the front.
+        """Return the response if there is no contact; the stiffness is that at the front.
 
         The front is the surface point that faces the user.
         """

@@ -169,7 +169,8 @@ def make_stretch_limits(
 ) -> StretchLimits:
     """Return the stretch limits within the usable fraction of the scene's limits.
 
-    They apply to the sheet without a push.  A push adds edge force, which `render_force` limits.
+    They apply to the sheet if nothing pushes it.  A push adds edge force, which `render_force`
+    limits.
     bounds: bounds on the offset's slope for a stable loop with the hand.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
@@ -186,7 +187,7 @@ def make_stretch_limits(
 
 
 def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
-    """Return the force (N) on each clamp of the sheet without a push."""
+    """Return the force (N) on each clamp of the sheet if nothing pushes it."""
     push = SheetPush(stretch_ratio, finger_radius_m=0.03 * model.rubber.width_m)
     return float(model.evaluate(push, np.zeros(1)).edge_force_n[0])
 
