@@ -104,7 +104,7 @@ STALE_REASONS = {
 }
 
 MAX_WAIT_FOR_OTHER_S = 1.0
-"""An armed arm is disarmed if the other one is not armed within this time."""
+"""An armed arm is disarmed if the other arm is not armed within this time."""
 
 MAX_ARMING_AGE_S = 1.0
 """Maximum age of an arming command.  The operator may no longer intend an older one."""
@@ -727,7 +727,7 @@ class ArmControl:
     def _slacken(
         self, reason: str, geometry: ArmGeometry, other: OtherArm | None, step_s: float
     ) -> Command:
-        """Stop; once at rest, slacken the sheet by moving this edge towards the other one."""
+        """Stop; once at rest, slacken the sheet by moving this edge towards the other edge."""
         self._settle()
         measured = self.measured_rad
         starts = self._state is State.TAUT

@@ -147,7 +147,7 @@ class ArmGeometry:
         return np.asarray(joints_rad - offsets_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
-        """Return the sheet at rest between this arm's edge and the other one.
+        """Return the sheet at rest between this arm's edge and that of the other arm.
 
         own_edge, other_edge: world poses (4, 4) that the edges would have if the arms were rigid.
         """

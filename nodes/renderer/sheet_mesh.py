@@ -39,7 +39,7 @@ class SheetMesh:
 
 
 def flat_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the mesh of a sheet without a push: four triangles between corners and centre."""
+    """Return the mesh of a sheet that nothing pushes: four triangles between corners and centre."""
     vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
     return SheetMesh(vertices, PYRAMID)
 

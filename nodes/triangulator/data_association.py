@@ -92,7 +92,7 @@ SOLE_CANDIDATE_TIME_S = 1.0
 """Time after which an ambiguous marker is assigned to the finger if it is the only one in view."""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""Time without the finger after which moving clutter is ambiguous: it may be the finger."""
+"""Time since the finger was last seen after which moving clutter may be the finger."""
 
 
 @dataclass(slots=True)

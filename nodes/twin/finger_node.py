@@ -180,7 +180,7 @@ class TwinFingerNode(Node):
         return (at_ns - self.started_ns) * 1e-9
 
     def _voluntary(self, at_s: float) -> tuple[Floats, Floats]:
-        """Return position and velocity, each (3,), that the finger would have without contact."""
+        """Return position and velocity, each (3,), of the finger if it touched nothing."""
         state = self.motion.at(at_s - self._seconds(self.motion_from_ns))
         return state.position, state.velocity
 
