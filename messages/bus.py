@@ -222,7 +222,7 @@ class Publisher:
             self._open(self.endpoints)
 
     def interrupt(self) -> None:
-        """Disconnect all readers, in the way in which the end of this process would.
+        """Disconnect all readers, just as if this process had ended.
 
         They connect again by themselves. Messages sent before are still delivered.
         """

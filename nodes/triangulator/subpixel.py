@@ -170,7 +170,7 @@ def fit_discs(
 def fit_ellipses(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> list[DiscFit]:
-    """Fit one ellipse at rest in each image, in the way in which `fit_discs` fits discs.
+    """Fit one ellipse at rest in each image; `fit_discs` does the same for discs.
 
     Starting values describe a moving disc; the ellipse starts with the same second moments.  Each
     ellipse is fitted alone, because the time grows with the third power of its size.
