@@ -36,7 +36,7 @@ class ArraySpec:
     finite: bool = True
 
     def validate(self, value: object) -> NDArray[Any]:
-        """Return `value` as an array of this type; raises ValueError for another type or shape.
+        """Return `value` as an array of this type; raises ValueError if its type or shape differs.
 
         Arrays must have the exact dtype, because a silent conversion from float64 to float32 would
         lose digits. Nested lists, as in a scene file, are converted.

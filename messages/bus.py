@@ -216,7 +216,7 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Reopen the socket if the key of this host or of another one in the ring has changed."""
+        """Reopen the socket if the key of any host in the ring, including this one, has changed."""
         if self._keys is not None and not self._socket.closed and (change.own or change.hosts):
             self._close_socket(unbind=True)
             self._open(self.endpoints)

@@ -35,7 +35,7 @@ class CalibrationFileError(FlexsheetError, ValueError):
 
 
 class CalibrationMismatchError(FlexsheetError, ValueError):
-    """Raised if a calibration is of another device (camera, sheet, ...) than the scene's."""
+    """Raised if a calibration was made for a camera, sheet or other device not in the scene."""
 
     code = "calibration-mismatch"
     exit_code = 2

@@ -23,7 +23,10 @@ def read_boot_id() -> str:
 
 
 def read_namespace_offset() -> str:
-    """Return the time namespace's offset of CLOCK_MONOTONIC, as "+36000.0"; empty without one."""
+    """Return the time namespace's offset of CLOCK_MONOTONIC, such as "+36000.0".
+
+    Return an empty string if there is none.
+    """
     try:
         lines = Path("/proc/self/timens_offsets").read_text().splitlines()
     except FileNotFoundError:

@@ -63,7 +63,10 @@ def make_write_error(
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the free bytes for this user on a folder's disk; raises OSError without the folder."""
+    """Return the free bytes for this user on a folder's disk.
+
+    Raises OSError if the folder does not exist.
+    """
     state = os.statvfs(folder)
     return state.f_bavail * state.f_frsize
 

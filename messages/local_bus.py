@@ -149,9 +149,8 @@ class LocalConnection:
     """Connection of a subscriber to the writers in its own process.
 
     writers: names that these writers may have; None: any.
-    max_waiting: length of the queue.  A full queue refuses the newest message, as a socket does;
-    the
-      subscriber counts it as a gap.
+    max_waiting: length of the queue.  A full queue refuses the newest message, like a socket;
+      the subscriber counts it as a gap.
     """
 
     def __init__(

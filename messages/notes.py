@@ -83,7 +83,7 @@ class NodeNote(Enum):
     )
     CHECKING_PATH = (
         "checks the path to the target",
-        "Wait: the arms search for a path without collision. It takes at most some seconds.",
+        "Wait: the arms search for a path without collision. It takes at most a few seconds.",
     )
     MEASURED_VIOLATION = (
         "measured:",
@@ -151,7 +151,7 @@ class NodeNote(Enum):
     )
     CLOCK_NOT_MEASURED = (
         "is not measured",
-        "Wait some seconds after a start. If the note remains, the clock node or the network of "
+        "Wait a few seconds after a start. If the note remains, the clock node or the network of "
         "that host is down (docs/clocks.md).",
     )
     CLOCK_UNCERTAIN = (

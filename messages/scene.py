@@ -132,7 +132,7 @@ class StripSupport(Part):
 
 
 class BaseSupport(Part):
-    """Support that fixes the lowest part of the surface, as for an object on a table."""
+    """Support that fixes the lowest part of the surface, like a table under the object."""
 
     kind: Literal["base"] = "base"
     height_m: Positive = Field(
@@ -208,7 +208,7 @@ class Appearance(Part):
 
 
 class VirtualObject(Part):
-    """Virtual object; without a material it is rigid.
+    """Virtual object; if it has no material, it is rigid.
 
     `support_angle_rad: x` in a scene file is short for `support: {kind: strip, angle_rad: x}`.
     """
@@ -603,7 +603,10 @@ class UnfitGeometryError(FlexsheetError, ValueError):
 
 
 def require_cylinder(scene: Scene) -> Cylinder:
-    """Return the scene's cylinder; raises UnfitGeometryError for another shape."""
+    """Return the scene's cylinder.
+
+    Raises UnfitGeometryError if the object has a different shape.
+    """
     geometry = scene.object.geometry
     if not isinstance(geometry, Cylinder):
         raise UnfitGeometryError(
@@ -641,7 +644,7 @@ def require_material(scene: Scene) -> Material:
 
 
 def require_support(scene: Scene) -> Support:
-    """Return the fixed part of the object's skin; raises MissingPartError without one."""
+    """Return the fixed part of the object's skin; raises MissingPartError if there is none."""
     if scene.object.support is None:
         raise MissingPartError(
             f'scene "{scene.name}": object.support is missing; a soft object needs it'

@@ -203,7 +203,7 @@ class KeyRing:
 
 
 def write_ring(file: Path, *, host: str, secret_file: Path, public: dict[str, str]) -> None:
-    """Write the file that `KeyRing` reads, atomically."""
+    """Write, atomically, the file that `KeyRing` reads."""
     text = json.dumps({"host": host, "secret_file": str(secret_file), "public": public})
     write_file(file, text)
 

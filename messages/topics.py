@@ -132,7 +132,7 @@ def find_topic(name: str) -> Topic:
     except KeyError:
         if name in RENAMED_TOPICS:
             raise UnknownTopicError(
-                f'unknown topic "{name}"; it is now "{RENAMED_TOPICS[name]}"'
+                f'unknown topic "{name}"; it was renamed to "{RENAMED_TOPICS[name]}"'
             ) from None
         near = get_close_matches(name, TOPICS, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; topics: {', '.join(TOPICS)}"

@@ -323,7 +323,10 @@ class Force(Message):
 
 
 class Eye(Message):
-    """Position of the user's eyes from a head tracker; without one, the scene's `eyes` are used."""
+    """Position of the user's eyes from a head tracker.
+
+    If there is no tracker, the scene's `eyes` are used.
+    """
 
     valid: bool = Field(
         description="false: the eyes are not detected; the other fields hold the last valid values"
@@ -411,7 +414,7 @@ class Frame(Message):
     marks_finger_ratio: Annotated[NDArray[np.float64], ArraySpec("<f8", ("marks",))] = Field(
         default_factory=lambda: np.zeros(0),
         description="displacement of the sheet at these marks, along its normal, divided by that "
-        "of the fingertip; 0 without contact",
+        "of the fingertip; 0 if there is no contact",
     )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector images, top row first: none, or one (mono or packed stereo)"
@@ -611,7 +614,7 @@ class NodeOmission(MessagePart):
 
 
 class HostKey(MessagePart):
-    """Public key of a host, as the reporting host has it."""
+    """Public key of a host that the reporting host stores."""
 
     host: str
     key: str

@@ -155,7 +155,7 @@ def _remove_leftovers(path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointStore:
-    """Store for finished parts of a computation, each in one file of a folder."""
+    """Store for finished parts of a computation; each part is one file in a folder."""
 
     folder: Path
 

@@ -337,7 +337,7 @@ class Node:
 
         topics: topic names by port, where they differ from the port's name: {"arm": "arm_left"}.
         epoch: number that identifies one start of the node; default: the time of the start, ns.
-        Raises TypeError for a topic of another message type.
+        Raises TypeError if the message type of a topic differs from that of its port.
         """
         self.parameters = parameters
         self.name, self.clock, self.plan_hash = name, clock, plan_hash

@@ -81,7 +81,7 @@ class NodeConfig(BaseModel):
 class ProcessConfig(BaseModel):
     """Configuration of a process with its nodes.
 
-    ready_fd: file descriptor of a pipe to the launcher; None without a launcher.
+    ready_fd: file descriptor of a pipe to the launcher; None if there is no launcher.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -326,7 +326,7 @@ async def run_node(
 ) -> None:
     """Build and connect a node, and run it until `stop` is set or one of its tasks fails.
 
-    heartbeat: pipe to the launcher; None without one.  local: see `NodeTransport`.
+    heartbeat: pipe to the launcher; None if there is no launcher.  local: see `NodeTransport`.
     """
     heartbeat = heartbeat or Heartbeat(None)
     class_ = node_class(config.type)
@@ -390,7 +390,7 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
 class Heartbeat:
     """Pipe to the launcher.  It reports first that all nodes are ready, then that they run.
 
-    fd: write end of the pipe; None without a launcher.  Writing never blocks.
+    fd: write end of the pipe; None if there is no launcher.  Writing never blocks.
     nodes: number of nodes in the process.
     """
 

@@ -20,7 +20,7 @@ Kind = Literal["launcher", "node"]
 REQUEST, ANSWER = b"stop ", b"stopped"
 MAX_REQUEST_BYTES = 4096
 MAX_CONNECTIONS = 32
-"""Maximum number of open connections; when another one opens, the oldest is closed."""
+"""Maximum number of open connections; when one more opens, the oldest is closed."""
 
 _PEER = struct.Struct("3i")
 

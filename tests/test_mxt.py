@@ -253,7 +253,7 @@ def near(change: Floats | float) -> Floats:
         ),
         (
             [encode(COMMAND_NONE), encode(COMMAND_MOVE, send_type=TYPE_JOINTS, data=[9.0] * 6)],
-            "out of range",
+            "outside the allowed range",
         ),
         ([encode(COMMAND_NONE), encode(COMMAND_MOVE, send_type=1, data=[9e3] * 3)], "type 1"),
         ([encode(COMMAND_NONE), *[b""] * 20], "no packet in time"),

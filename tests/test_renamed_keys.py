@@ -53,7 +53,7 @@ def test_an_old_parameter_gets_an_error_that_names_the_new_one(
     file = tmp_path / "old.yaml"
     nodes = {"one": {"type": node_type, "parameters": {old: 0.1}}}
     YAML().dump({"nodes": nodes}, file)
-    with pytest.raises(BadInputError, match=f'unknown key "{old}"; it is now "{new}"'):
+    with pytest.raises(BadInputError, match=f'unknown key "{old}"; it was renamed to "{new}"'):
         load_graph(file)
 
 
@@ -61,7 +61,7 @@ def test_a_class_path_of_a_shipped_node_gets_the_same_error(tmp_path: Path) -> N
     file = tmp_path / "old.yaml"
     node_type = "flexsheet.nodes.renderer.node:Renderer"
     YAML().dump({"nodes": {"one": {"type": node_type, "parameters": {"lead_s": 0.1}}}}, file)
-    with pytest.raises(BadInputError, match='it is now "prediction_horizon_s"'):
+    with pytest.raises(BadInputError, match='it was renamed to "prediction_horizon_s"'):
         load_graph(file)
 
 
@@ -70,7 +70,7 @@ def test_the_former_key_of_external_topics_gets_an_error_that_names_the_new_one(
 ) -> None:
     file = tmp_path / "old.yaml"
     YAML().dump({"nodes": {}, "from_tools": ["fingertip"]}, file)
-    with pytest.raises(BadInputError, match='"from_tools"; it is now "external_topics"'):
+    with pytest.raises(BadInputError, match='"from_tools"; it was renamed to "external_topics"'):
         load_graph(file)
 
 
@@ -82,7 +82,7 @@ def test_an_old_value_of_a_parameter_gets_an_error_that_names_the_new_one(
     nodes = {"one": {"type": "planner", "parameters": {"compliance_mode": old}}}
     YAML().dump({"nodes": nodes}, file)
     new = renamed_keys.VALUES["compliance_mode"][old]
-    with pytest.raises(BadInputError, match=f'compliance_mode.*it is now "{new}"'):
+    with pytest.raises(BadInputError, match=f'compliance_mode.*it was renamed to "{new}"'):
         load_graph(file)
 
 
@@ -95,7 +95,7 @@ def test_an_old_method_in_a_scene_gets_an_error_that_names_the_new_one(
     file = tmp_path / "scene.yaml"
     YAML().dump(content, file)
     new = renamed_keys.VALUES["sheet_shape"][old]
-    with pytest.raises(BadInputError, match=f'sheet_shape.*it is now "{new}"'):
+    with pytest.raises(BadInputError, match=f'sheet_shape.*it was renamed to "{new}"'):
         load_scene(file)
 
 
@@ -225,7 +225,9 @@ def test_a_recorded_value_within_a_list_of_parts_is_read() -> None:
 @pytest.mark.parametrize(("old", "new"), migrations.RENAMED_TOPICS.items())
 def test_an_old_topic_gets_an_error_that_names_the_new_one(old: str, new: str) -> None:
     assert new in TOPICS
-    with pytest.raises(UnknownTopicError, match=f'unknown topic "{old}"; it is now "{new}"'):
+    with pytest.raises(
+        UnknownTopicError, match=f'unknown topic "{old}"; it was renamed to "{new}"'
+    ):
         find_topic(old)
 
 
@@ -243,5 +245,7 @@ def test_an_old_arming_gets_an_error_that_names_the_new_one(tmp_path: Path, old:
     file = tmp_path / "old.yaml"
     nodes = {"one": {"type": "arm_bridge", "parameters": {"side": "left", "arming": old}}}
     YAML().dump({"nodes": nodes}, file)
-    with pytest.raises(BadInputError, match=f'it is now "{renamed_keys.VALUES["arming"][old]}"'):
+    with pytest.raises(
+        BadInputError, match=f'it was renamed to "{renamed_keys.VALUES["arming"][old]}"'
+    ):
         load_graph(file)

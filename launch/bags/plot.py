@@ -1,4 +1,4 @@
-"""Plot fields of recorded topics over time."""
+"""Plot fields of recorded topics against time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CHART_SIZE_IN = (8.0, 2.4)
 
 @dataclass(frozen=True, slots=True)
 class FieldSeries:
-    """Values of a message field over time.
+    """Values of a message field as a function of time.
 
     name: "TOPIC.FIELD". times_s: (n,), source times relative to the start of the bag. values:
     (n, components).

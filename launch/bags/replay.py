@@ -115,7 +115,7 @@ class Verification:
 
     @property
     def repeatable(self) -> bool:
-        """Return whether both replays gave the same bytes, without an error."""
+        """Return whether both replays succeeded and gave the same bytes."""
         return self.same_bytes and self.errors == 0
 
     @property
@@ -311,9 +311,10 @@ async def _replay_run(
 
 @dataclass(frozen=True, slots=True)
 class NodeRun:
-    """Execution log of a node between two of its starts.
+    """Execution log of a node from one of its starts to the next.
 
-    steps: rows (input index or -1 - timer index, sequence, epoch, time in ns).
+    steps (n, 4): one row per executed step: index of the input, or -1 - index of the timer;
+    sequence number; epoch; time, ns.
     """
 
     clock_id: str
@@ -329,7 +330,7 @@ def read_runs(bag: Path, name: str) -> list[NodeRun]:
     for _, message, header, _ in BagReader(bag, ["status"]):
         if isinstance(message, Status) and message.node == name and len(message.execution_log):
             before = logs.setdefault(header.epoch, [])
-            # For some seconds after its start, a node publishes its whole log again each time.
+            # For a few seconds after its start, a node publishes its whole log again each time.
             if before and (before[0][0] == message.execution_log[0]).all():
                 before.clear()
             before.append(message.execution_log)

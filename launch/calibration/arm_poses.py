@@ -114,7 +114,7 @@ class PoseRow:
 
 
 def read_pose_table(folder: Path) -> list[PoseRow]:
-    """Read the rows of a folder's table; raises ArmPosesError with row and column."""
+    """Read the rows of the table in a folder; raises ArmPosesError with row and column."""
     path = folder / TABLE
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -179,7 +179,7 @@ def _parse_numbers(
 def read_detections(
     folder: Path, board: Board, rig: LensRig, size: tuple[int, int], progress: Progress
 ) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
-    """Detect the board in the images of a folder.
+    """Detect the board in the images in a folder.
 
     Return the detections, and the poses without a detected board as (name, reason). size: required
     (width, height) of the images, px. Raises ArmPosesError and CalibrationError.

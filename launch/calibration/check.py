@@ -267,7 +267,7 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Cross-validate: calibrate without `leave_out` pairs at a time, and measure those pairs.
+    """Cross-validate: calibrate with `leave_out` pairs left out at a time, and measure those.
 
     The pairs i, i+G, i+2G, ... form a group that is left out together, because consecutive images
     are similar. For chessboards, the same is done with plain OpenCV for comparison. Raises

@@ -68,7 +68,10 @@ class EdgeFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class EdgeMark:
-    """Mark on a clamp: arm, known position (3,) in the frame of the edge, and measured one, m."""
+    """Mark on a clamp of an arm.
+
+    mark_edge_m: known position (3,) in the frame of the edge. position_world_m: measured position.
+    """
 
     side: Side
     mark_edge_m: Floats

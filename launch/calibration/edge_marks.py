@@ -135,7 +135,10 @@ class MarkDetector:
         )
 
     def find(self, left: Image, right: Image, *, near_world_m: Floats) -> Floats | None:
-        """Return the position (3,) of the mark near a given position; None without a clear mark."""
+        """Return the position (3,) of the mark near a given position.
+
+        Return None if there is no clear mark.
+        """
         found = detect_all(
             left,
             right,

@@ -22,7 +22,7 @@ OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm", "unloading")
 COLUMNS = (*STRETCH, *REQUIRED, *OPTIONAL)
 
 MAX_PROBLEMS = 20
-"""Maximum number of problems that are listed; further ones are only counted."""
+"""Maximum number of problems that are listed; further problems are only counted."""
 
 MAX_LENGTH_RATIO = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
 """Maximum plausible length divided by the sheet's width; a larger one has probably another unit."""

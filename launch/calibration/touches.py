@@ -143,7 +143,7 @@ SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20),
                        (12, -18), (12, 18), (0, 12), (10, 10), (-10, 10), (20, 0), (0, -12),
                        (10, -10), (-10, -10), (-10, 0), (25, 10), (25, -10), (0, 18),
                        (30, 0), (20, 20), (-25, 10), (8, 25))  # fmt: skip
-"""Orientations that are tried until MAX_TOUCHES show the marker, as a person would do."""
+"""Orientations that are tried, like a person would, until MAX_TOUCHES show the marker."""
 MAX_TOUCHES = 15
 SIMULATED_POINT_M = np.array([0.01, 0.02, 0.01])
 SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, math.radians(1.0)
@@ -157,7 +157,7 @@ def simulate_touches(
     calibration: StereoCalibration | None,
     seed: int,
 ) -> list[Touch]:
-    """Simulate touches of a known point, as the simulated stereo camera sees them.
+    """Simulate touches of a known point that the simulated stereo camera observes.
 
     The orientations of `SIMULATED_TILTS_DEG`, relative to the usual orientation of the finger, are
     used in sequence. The fit takes the usual one for `direction_world`, so that its offset is right

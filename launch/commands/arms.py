@@ -256,9 +256,10 @@ async def _command(
     done: Callable[[dict[str, ArmState]], bool],
     as_json: bool,
 ) -> int:
-    """Publish a command to both arms, wait until `done`, and print the states of the arms.
+    """Publish a command to both arms, wait for its effect, and print the states of the arms.
 
-    command: topic and message; None only prints. Returns the exit code.
+    command: topic and message; if None, nothing is published. done: function that decides from the
+    states whether the wait is over. Returns the exit code.
     """
     from flexsheet.launch.running.tools import tools_host
 

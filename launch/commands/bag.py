@@ -396,7 +396,7 @@ def plot(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Plot fields of recorded topics over time; with --json, print their values instead.
+    """Plot fields of recorded topics against time; with --json, print their values instead.
 
     With --json, an image is written only if --output is given.
     """

@@ -435,7 +435,10 @@ def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
 
 
 def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
-    """Load a stereo calibration and check that it fits the scene's camera; None without a path."""
+    """Load a stereo calibration and check that it fits the scene's camera.
+
+    Return None if there is no path.
+    """
     from flexsheet.messages.calibration import load_calibration, refuse_other_camera
     from flexsheet.messages.calibration_file import CalibrationMismatchError
 
@@ -458,7 +461,7 @@ def require_twin(apparatus: str | None, *, simulated: bool) -> None:
 def load_true_devices(
     text: str | None, scene: Scene, scene_file: Path | None = None
 ) -> Apparatus | None:
-    """Load the apparatus of a simulated calibration; None without a text.
+    """Load the apparatus of a simulated calibration; None if no text is given.
 
     It is described in the world frame that the stereo camera defines, to which all calibrations
     refer.

@@ -281,7 +281,7 @@ async def record_poses(
     images: asyncio.Queue[tuple[Any, float]] = asyncio.Queue(maxsize=1)
 
     def on_stereo(pair: Any, _: Any) -> None:
-        # Image pairs that arrive while another one is processed are dropped and not needed.
+        # Image pairs that arrive while an earlier pair is processed are dropped and not needed.
         if images.empty():
             images.put_nowait((pair, time.monotonic()))
 

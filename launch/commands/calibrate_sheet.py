@@ -258,7 +258,7 @@ def _read_bag(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
 def simulate_pushes(
     scene: Scene, apparatus: Apparatus | None, *, places: bool, noise_n: float, seed: int
 ) -> list[MeasuredPush]:
-    """Simulate pushes as `simulate_rows` does, with a progress bar."""
+    """Simulate pushes like `simulate_rows`, and show a progress bar."""
     from rich.progress import Progress
 
     from flexsheet.launch.calibration.sheet_rows import simulate_rows

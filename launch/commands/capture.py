@@ -76,9 +76,10 @@ def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Vie
 def simulate_views(
     scene: Scene, board: Board, apparatus: Apparatus | None = None, *, pairs: int, seed: int
 ) -> Iterator[Views]:
-    """Yield one simulated image pair per pose of a board, by the camera of an apparatus.
+    """Yield simulated image pairs of a chessboard at sampled poses, one pair per pose.
 
-    Raises CommandError for a board that cannot be rendered.
+    The images are those of the scene's camera with the errors of the apparatus, if there is one.
+    Raises CommandError if the board cannot be rendered.
     """
     from flexsheet.nodes.twin.board import TwinBoard
     from flexsheet.nodes.twin.rig import make_true_camera

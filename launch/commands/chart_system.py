@@ -21,7 +21,10 @@ def measure_system(
     configurations: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Measure configurations and draw a chart; continue the measurement of an existing folder."""
+    """Measure configurations of the system and draw a chart of the results.
+
+    If the output folder contains an earlier measurement, continue it.
+    """
     import json
 
     from flexsheet.launch.methods.results import describe_load, replace_non_finite

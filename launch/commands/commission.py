@@ -72,7 +72,7 @@ def commission(
         str,
         typer.Option(
             metavar="COLUMNSxROWS",
-            help="Numbers of inner corners of the chessboard for the camera.",
+            help="Inner corners per row and column of the chessboard for the camera calibration.",
         ),
     ] = "9x6",
     square_mm: Annotated[
@@ -83,7 +83,7 @@ def commission(
         str,
         typer.Option(
             metavar="COLUMNSxROWS",
-            help="Numbers of inner corners of the chessboard on the flanges.",
+            help="Inner corners per row and column of the chessboard on the flanges.",
         ),
     ] = "7x5",
     flange_square_mm: Annotated[

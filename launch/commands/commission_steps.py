@@ -272,7 +272,9 @@ class Laboratory:
                 scene, pushes, lines, source=source, with_mooney=False, with_table=False
             )
         except SheetModelFitError as error:
-            raise CommissionError(f"step sheet, {source}: {error}") from error
+            raise CommissionError(
+                f"the sheet cannot be calibrated with the data of {source}: {error}"
+            ) from error
         modulus, width_m = found.modulus_thickness_n_per_m, round(found.slack_width_m.value, 6)
         wider = width_m / scene.sheet.width_m
         # Stretch ratios refer to the width of the scene, which becomes the measured one.

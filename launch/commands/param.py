@@ -36,7 +36,7 @@ ParameterArgument = Annotated[
     str,
     typer.Argument(
         metavar="NODE.PARAM",
-        help="Names of node and parameter, such as planner.max_age_s.",
+        help="Node and parameter, separated by a dot, such as planner.max_age_s.",
         autocompletion=complete.node_parameters,
     ),
 ]

@@ -116,7 +116,8 @@ def echo(
     timeout: Annotated[
         float | None,
         typer.Option(
-            metavar="SECONDS", help="Time without a message after which the command fails, s."
+            metavar="SECONDS",
+            help="Maximum time to wait for a message before the command fails, s.",
         ),
     ] = None,
     field: Annotated[

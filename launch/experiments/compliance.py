@@ -168,7 +168,7 @@ class ComplianceRecording:
     """Data of a compliance experiment, read from a bag.
 
     windows_ns: (start, end) of each finger path, by label. edges: true flange poses of both arms
-    as rows (16,). curves: object force over depth, (m, 2) each, published at `curve_times_ns`.
+    as rows (16,). curves: object force against depth, (m, 2) each, published at `curve_times_ns`.
     methods: the soft body's method that computed each curve.
     forces: times (ns) and values (N) of the valid measured contact forces (k, 2).
     """
@@ -259,7 +259,10 @@ class ForceSample:
 
     @property
     def model_error_ratio(self) -> float | None:
-        """Return the error of the wanted force relative to the reference; None without one."""
+        """Return the error of the wanted force relative to the reference.
+
+        Return None if there is no reference.
+        """
         if self.reference is None:
             return None
         return _relative_error(self.wanted_n, self.reference.force_n)
@@ -285,7 +288,10 @@ class ForceReference:
         self._curves: dict[str, ReferenceForceCurve | None] = {}
 
     def evaluate(self, at_ns: int, press: Press) -> ForceSample:
-        """Return the forces at a time; the depth is measured from the pushed surface point."""
+        """Return the forces at the given time.
+
+        The depth is measured from the pushed surface point.
+        """
         tip, left, right = self._read_poses(at_ns)
         depth_m = float((press.surface - tip) @ press.normal)
         if press.place not in self._curves:
@@ -304,7 +310,7 @@ class ForceReference:
         )
 
     def _read_poses(self, at_ns: int) -> tuple[Floats, Floats, Floats]:
-        """Return the fingertip (3,) and the poses of both clamped edges (4, 4) at a time."""
+        """Return the fingertip (3,) and the poses of both clamped edges (4, 4) at `at_ns`."""
         times = np.array([at_ns])
         left, right = (
             edges.interpolate(times)[0].reshape(4, 4) @ clamp
@@ -328,7 +334,7 @@ class ForceReference:
         return float(pressed.finger_force_n @ press.normal)
 
     def _history_ratio(self, at_ns: int, press: Press) -> float:
-        """Return the ratio of the rubber's force to the elastic sheet's at a time of a push."""
+        """Return the ratio of the rubber's force to the elastic sheet's at `at_ns` of a push."""
         if ForceHistory.of(self._recorded.apparatus) is None:
             return 1.0
         label = press.path.label

@@ -159,7 +159,7 @@ def _directions(count: int) -> Floats:
 
 
 def _differences(steps: int, order: int) -> csr_array:
-    """Return the matrix (steps - order, steps) of finite differences of an order over time."""
+    """Return the matrix (steps - order, steps) of finite differences in time of an order."""
     return csr_array(np.diff(np.eye(steps), n=order, axis=0))
 
 
@@ -317,7 +317,7 @@ def bound_errors(
     times_s: (n,), increasing. positions_world: (n, 3), true fingertip. The result contains the mean
     and the 95 % quantile (p95) over the steps in contact, for the motion with the least mean. Steps
     whose exact sheet the arms cannot reach, and windows without a solution, count as zero.
-    Raises ExperimentError for a path without contact.
+    Raises ExperimentError if the path never touches the object.
     """
     followed = FollowedContact(scene, apparatus)
     grid = np.arange(times_s[0], times_s[-1], STEP_S)
@@ -390,7 +390,8 @@ def run_follow(
 ) -> dict[str, Any]:
     """Follow a finger path; return the results of `experiment follow --json`.
 
-    bag: file in which to record the running graph; None to follow in simulated time, without one.
+    bag: file in which to record the running graph; None to follow the
+    path in simulated time, which needs no running graph.
     """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
     scene, truth = require_scene(plan), plan.apparatus_message()

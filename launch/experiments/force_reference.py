@@ -1,4 +1,4 @@
-"""Read stored curves of force over depth that an independent solver computed for a cylinder.
+"""Read stored curves of force against depth that an independent solver computed for a cylinder.
 
 `benchmarks.force_reference` computes the curves and describes the method. They are dimensionless:
 lengths are in finger radii, forces in Young's modulus times the squared finger radius. Therefore
@@ -31,7 +31,7 @@ class ReferenceForce:
 
 
 class ReferenceForceCurve:
-    """Force over depth from an independent solver, at one position of the object of a scene."""
+    """Force against depth from an independent solver, at one position of the object of a scene."""
 
     def __init__(self, curve: dict[str, Any], *, finger_radius_m: float, modulus_pa: float) -> None:
         """Interpolate a curve of the file; it must contain two or more depths."""

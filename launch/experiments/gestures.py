@@ -187,7 +187,10 @@ def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
 
 
 def error_mm(errors: Floats) -> dict[str, float | None]:
-    """Return rms, 99 % quantile and maximum length of errors (n, 3) m, in mm; None without any."""
+    """Return rms, 99 % quantile and maximum length of errors (n, 3) m, in mm.
+
+    Return None if there are no errors.
+    """
     if len(errors) == 0:
         return {"rms": None, "p99": None, "max": None}
     lengths = 1e3 * np.linalg.norm(errors, axis=1)

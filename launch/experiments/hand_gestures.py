@@ -273,7 +273,7 @@ def run_gestures(
     *,
     apparatus: str | None = None,
 ) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
-    """Perform the gestures in a running graph; return the same as `hand_gestures_result`.
+    """Perform the gestures in a running graph; return results like `hand_gestures_result`.
 
     The force is sampled at the exposures only, so that shorter peaks are missed. apparatus: file
     with the true parameters of the simulated hardware, among them the hand's impedance.

@@ -137,7 +137,10 @@ class HeldOffset:
         return np.asarray(self._rest_m + self._cases.gain * (offsets_m - self._rest_m))
 
     def advance(self, step: int) -> Floats:
-        """Return the sheet's offset (n,), m, at a time step; call it for each step in order."""
+        """Return the sheet's offset (n,), m, at the given time step.
+
+        Call it for each step in order.
+        """
         row = step % self._ring
         due = self._due[row] & (self._sampled[row] > self._newest)
         self._newest = np.where(due, self._sampled[row], self._newest)

@@ -200,10 +200,11 @@ def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, Er
 
 
 def summarize_eyes(left: ErrorMap, right: ErrorMap) -> dict[str, float | None]:
-    """Return the mean error of each eye's image, and of the disparity, mm; None without points.
+    """Return the mean error of each eye's image, and of the disparity, mm.
 
-    The disparity error is the right eye's error minus the left eye's, horizontal and vertical. It
-    is computed at screen positions at which both eyes see the object.
+    A mean is None if there are no points. The disparity error is the right eye's error minus the
+    left eye's, horizontal and vertical. It is computed at screen positions at which both eyes see
+    the object.
     """
     disparity_mm = 1e3 * np.abs(right.errors_m - left.errors_m)
     across_mm, up_mm = (
@@ -270,7 +271,10 @@ def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, flo
 
 
 def summarize_map(errors: ErrorMap) -> dict[str, float | None]:
-    """Return mean, 95 % quantile and maximum error of all visible points, mm; None without any."""
+    """Return mean, 95 % quantile and maximum error of all visible points, mm.
+
+    Return None if there are no visible points.
+    """
     sizes_mm = 1e3 * errors.sizes_m
     if len(sizes_mm) == 0:
         return dict.fromkeys(("map_mean_mm", "map_p95_mm", "map_max_mm"))

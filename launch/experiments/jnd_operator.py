@@ -31,7 +31,10 @@ Instructions for the operator
 
 
 class PeakMonitor:
-    """Maximum push depth and measured force since the last reset; None without measurements."""
+    """Maximum push depth and measured force since the last reset.
+
+    Both are None if there are no measurements.
+    """
 
     def __init__(self) -> None:
         self.reset()

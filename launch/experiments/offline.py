@@ -233,7 +233,10 @@ class OfflineEvaluator:
     def evaluate(
         self, apparatus: Apparatus, metrics: frozenset[Metric] = ALL_METRICS
     ) -> Evaluation:
-        """Evaluate the given metrics of an apparatus. Raises ExperimentError without a solution."""
+        """Evaluate the given metrics of an apparatus.
+
+        Raises ExperimentError if there is no solution.
+        """
         try:
             return self._evaluate(apparatus, metrics)
         except (NotConvergedError, ValueError) as error:
@@ -261,9 +264,11 @@ class OfflineEvaluator:
         return Evaluation(fingertip, sheet, image, felt, expected)
 
     def _touch(self, around_m: float, aside_m: float = 0.0) -> Contact:
-        """Return the sheet after rolling without slip from the front of the object.
+        """Return the contact after the sheet has rolled over the object without slip.
 
-        around_m: arc length to the new contact point, m. aside_m: its distance to the right, m.
+        The sheet starts in contact with the front of the object. around_m, aside_m: position of the
+        new contact point relative to the front, m: arc length around the object, and distance to
+        the right.
         """
         place = np.array([aside_m, around_m, 0.0])
         point, above = map_to_surface(self._scene, place + np.outer([0.0, 1e-3], [0, 0, 1]))
@@ -453,7 +458,7 @@ class OfflineEvaluator:
 
         The crosses lie on the object, and are drawn for each eye of the scene on the sheet in front
         of it. The sheet then moves to the finger, which touches it where the tracker measures the
-        position of the cross. Raises ExperimentError without a solution.
+        position of the cross. Raises ExperimentError if there is no solution.
         """
         scene = apply_apparatus(self._scene, apparatus)
         arms = ArmPair(self._scene, apparatus)
@@ -534,7 +539,7 @@ class OfflineEvaluator:
         return corrected
 
     def _parallax(self, eye: Floats) -> Floats:
-        """Return the shift of object points on the screen plane for another eye position, m.
+        """Return the shift of object points on the screen plane if the eye is moved, m.
 
         Shape (rows, columns, 2), for the pixels of `_object_points`; NaN where the scene's eye sees
         no object.

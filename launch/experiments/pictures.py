@@ -70,8 +70,9 @@ def compute_outline(image: np.ndarray) -> tuple[float, float, float, float] | No
 
 
 def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
-    """Draw position and angle errors over time, one column per stroke, with the mean error of the
-    same stroke in Furukawa et al. 2007.
+    """Draw position and angle errors against time, one column per stroke.
+
+    The mean error of the same stroke in Furukawa et al. 2007 is included.
     """
     figure = Figure(figsize=(5.5 * len(errors), 6), layout="constrained")
     axes = figure.subplots(2, len(errors), squeeze=False)
@@ -126,7 +127,7 @@ def draw_latency(recording: StrokeRecording, path: Path) -> None:
 
 
 def draw_compliance(result: dict[str, Any], path: Path) -> None:
-    """Draw the object's and the felt force over depth, one panel per position.
+    """Draw the object's and the felt force against depth, one panel per position.
 
     Bands show the just-noticeable difference (JND) of forces.
     """
@@ -227,7 +228,7 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
 
 
 def draw_hand_gestures(forces: Mapping[tuple[str, str], FeltForce], path: Path) -> None:
-    """Draw felt and wanted force over time, one row per hand and one column per gesture.
+    """Draw felt and wanted force against time, one row per hand and one column per gesture.
 
     forces: felt and wanted forces by hand and gesture.
     """

@@ -192,7 +192,7 @@ def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
 def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Return median, 95 % quantile and maximum of each metric, and the seed of the maximum.
 
-    For a metric without values they are None. Also count the trials with the metric, the trials
+    They are None if a metric has no values. Also count the trials with the metric, the trials
     out of tolerance, and among these the trials in which no self-check suspected a cause.
     """
     summary: dict[str, dict[str, float | None]] = {}

@@ -112,7 +112,7 @@ def run_sensitivity(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Vary one parameter at a time and return the results of `experiment sensitivity --json`.
+    """Vary the parameters one by one and return the results of `experiment sensitivity --json`.
 
     folder: where the results of finished trials are stored. with_graph: also run the graph for
     parameters whose effect occurs only in motion. seconds: duration of a stroke.

@@ -86,7 +86,7 @@ class LoopSettings:
     """Settings of a run.
 
     tracking: tracking method. planner: parameters of the planner by name. lag_known: whether the
-    bridges know the true servo lag of the arms, as a reference for runs in which they measure it.
+    bridges know the true servo lag of the arms, for comparison with runs in which they measure it.
     computing_s: time from the end of the read-out to the published target. calibrations: those of
     the nodes, with which they see the finger through the true camera; None: they know camera,
     marker and exposure times exactly.
@@ -300,7 +300,7 @@ class SimulatedLoop:
 
     @property
     def delay_s(self) -> float:
-        """Return the time from an exposure until the sheet has moved, as the planner uses it, s."""
+        """Return the delay, s, that the planner assumes from an exposure to the sheet's motion."""
         return self._horizon_s
 
     def run_cycles(self, until_s: float) -> None:

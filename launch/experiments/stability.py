@@ -8,8 +8,8 @@ Two simulations run in the time domain, without running nodes:
 - map: the offset that the planner uses for objects of several stiffnesses, with each random hand at
   several delays, packet jitters and depths, with and without the planner's stability bounds.
 
-The random hands are sampled from the ranges in the literature with a separate seed. So the bounds
-are tested with other hands than those from which they were derived.
+The random hands are sampled from the ranges in the literature with a separate seed. The bounds
+are therefore tested with hands that were not used to derive them.
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ class StabilitySettings:
     """Extent of the experiment.
 
     hands: number of random hands per group of HAND_RANGES, sampled with `seed`. rates_hz: camera
-    rates for the boundary. object_ratios: ratios of object stiffness to that of the scene's object.
+    rates at which the critical slope is measured. object_ratios: factors by which the stiffness of
+    the scene's object is multiplied. delays_s, jitters_s: delays of the loop and their jitter.
     """
 
     hands: int = 4

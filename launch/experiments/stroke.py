@@ -196,7 +196,7 @@ def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
     """
     if len(samples) < 2:
         raise ExperimentError(
-            f"the bag contains {len(samples)} samples of {name}, at least 2 are required; "
+            f"the bag contains {len(samples)} samples of {name}, but at least 2 are required; "
             "record the experiment again"
         )
     times = np.array([time for time, _ in samples], dtype=np.int64)
@@ -526,7 +526,7 @@ def summary(values: Floats, scale: float) -> dict[str, float]:
 
 
 def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
-    """Return the median and 99 % quantile of durations (n,) s, in ms; None without values."""
+    """Return median and 99 % quantile, ms, of durations (n,), s; None if there are none."""
     if len(values_s) == 0:
         return {"p50": None, "p99": None}
     return {
@@ -537,7 +537,7 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class StrokeErrors:
-    """Errors of a stroke over time, m and rad.
+    """Errors of a stroke as functions of time, m and rad.
 
     seconds: (n,), times of the measured errors since the start of the stroke. These are exposures
     with a valid fingertip. true_seconds: (m,), times of the true errors. These are all exposures,

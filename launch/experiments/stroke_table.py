@@ -90,7 +90,7 @@ def _make_ablations(
 
 
 def write_radius_variant(launch_file: Path, folder: Path, radius_m: float) -> Path:
-    """Write a copy of a launch file, with a cylinder of another radius whose front does not move.
+    """Write a launch file with a cylinder of a different radius whose front does not move.
 
     Return the path of the copy. Relative paths in it become absolute.
     """
@@ -123,7 +123,10 @@ def run_stroke_table(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Run several strokes of each variant, each with another seed; return the result for JSON."""
+    """Run several strokes of each variant, each with a different seed.
+
+    Return the result for JSON.
+    """
     common = {
         "experiment": "stroke",
         "seconds": seconds,

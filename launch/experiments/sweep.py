@@ -210,7 +210,9 @@ def execute_trial(trial: Mapping[str, Any]) -> Row:
     try:
         row = json.loads(output.splitlines()[-1])
     except (IndexError, ValueError) as error:
-        raise TrialError(f"the trial printed no row: {error}") from error
+        raise TrialError(
+            f"the last line that the trial printed is not a JSON result: {error}"
+        ) from error
     return dict(row)
 
 

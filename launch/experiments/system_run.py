@@ -322,7 +322,7 @@ def _iterate_force_errors(bag: Path) -> Iterator[float]:
 
 
 def summarize_errors(values: Floats) -> dict[str, float] | None:
-    """Return mean, 95 % quantile and maximum of values (n,); None without values."""
+    """Return mean, 95 % quantile and maximum of values (n,); None if there are no values."""
     if len(values) == 0:
         return None
     return {
@@ -333,7 +333,10 @@ def summarize_errors(values: Floats) -> dict[str, float] | None:
 
 
 def summarize_latency(values_s: Floats) -> dict[str, float] | None:
-    """Return median, 95 % and 99 % quantile of delays (n,) s, in ms; None without values."""
+    """Return the median and the 95 % and 99 % quantiles, in ms, of delays (n,) in s.
+
+    Return None if there are no delays.
+    """
     if len(values_s) == 0:
         return None
     p50, p95, p99 = 1e3 * np.quantile(values_s, (0.5, 0.95, 0.99))

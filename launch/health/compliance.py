@@ -50,7 +50,7 @@ SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 
 
 def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
-    """Return the object's force over depth (n, 2), m and N, on the side that faces the user.
+    """Return the object's force against depth (n, 2), m and N, on the side that faces the user.
 
     The cached nonlinear table of the object is used if it exists. Otherwise the linear method is
     used, and computed if necessary. cache_dir: None for the user's cache folder.
@@ -137,7 +137,10 @@ def find_loop_risk(
     table: OffsetBoundsTable,
     delay_s: float,
 ) -> LoopFinding | None:
-    """Return the risk of the feedback loop of sheet and hand at a delay; None without risk."""
+    """Return the risk of the feedback loop of sheet and hand at the given delay.
+
+    Return None if there is no risk.
+    """
     bounded = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
     error_ratio = float(np.abs(bounded.centre.error_ratio).max())
     if not bounded.choose_filter_s()[1]:

@@ -22,7 +22,7 @@ SEED = 20261123
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
-    """Return the configuration names in another random order for each block."""
+    """Return the configuration names in a different random order for each block."""
     random = np.random.default_rng(seed)
     return [[names[i] for i in random.permutation(len(names))] for _ in range(blocks)]
 
@@ -30,8 +30,8 @@ def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[s
 def bootstrap_median(values: Floats) -> Interval | None:
     """Return the median of values (n,), one per block, with its confidence interval.
 
-    NaN marks a failed run. None without finite values. If only one block has a value, the limits
-    are infinite.
+    NaN marks a failed run. None if there are no finite values. If only one block has a value, the
+    limits are infinite.
     """
     known = values[np.isfinite(values)]
     if len(known) == 0:

@@ -133,7 +133,7 @@ def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> 
 
 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
-    """Draw error over time on logarithmic axes, with a line along the Pareto front of each case.
+    """Draw error against time on logarithmic axes, with a line along the Pareto front of each case.
 
     If the family has a `sweep_key`, a property that varies over the cases, also draw errors and
     extra metrics over it. A band shows the reference's uncertainty.
@@ -160,7 +160,7 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
 
 
 def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
-    """Draw error over time, with the tolerance as a dashed line.
+    """Draw error against time, with the tolerance as a dashed line.
 
     Bars extend to the 99 % quantile of the time, and over the error's confidence interval. Errors
     below 1e-4 of the tolerance are rounding errors; they are drawn at that value.

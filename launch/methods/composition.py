@@ -69,7 +69,10 @@ class Unexplained:
     parts: Figures = field(default_factory=dict)
 
     def learn(self, predicted: Figures, measured: Figures) -> Unexplained:
-        """Return the excess updated with a run; `predicted` are its metrics without any excess."""
+        """Return the excess updated with a run.
+
+        predicted: metrics predicted for the run, excluding any excess.
+        """
         parts = dict(self.parts)
         for metric, value in measured.items():
             known = predicted.get(metric, 0.0)

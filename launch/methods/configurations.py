@@ -180,7 +180,7 @@ def select_configurations(scene: Scene, names: Collection[str]) -> list[Configur
 
 
 def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path:
-    """Write a copy of a launch file with another scene; relative paths become absolute."""
+    """Write a copy of a launch file with a different scene; relative paths become absolute."""
     with edit_yaml(launch_file, target) as launch:
         launch["scene"] = str(scene_file.resolve())
         launch.pop("record", None)

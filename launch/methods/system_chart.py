@@ -250,7 +250,10 @@ def list_tolerances(scene: Scene) -> dict[str, float]:
 
 
 def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[str, Any]]:
-    """Summarize each configuration of a scene in a point; omit those without a successful run."""
+    """Summarize each configuration of a scene in a point.
+
+    Omit those that have no successful run.
+    """
     found: dict[str, dict[int, Row]] = {}
     for name, row in rows.items():
         block, configuration = planned.places[name]
@@ -345,7 +348,7 @@ def upper_limit(one: Interval) -> float:
 
 
 def scale(one: Interval, factor: float) -> Interval:
-    """Multiply an interval by a factor, for another unit."""
+    """Multiply an interval by a factor in order to convert its unit."""
     return Interval(one.value * factor, one.low * factor, one.high * factor)
 
 

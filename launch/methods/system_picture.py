@@ -29,9 +29,11 @@ ROW_HEIGHT = 4.2
 
 
 def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
-    """Draw one row per scene: worst error over latency, and all errors of each configuration.
+    """Draw one row of two diagrams per scene and save it as SVG.
 
-    Filled points meet all tolerances, crosses do not. Bars are 95 % confidence intervals.
+    The left diagram shows the worst error against the latency, the right diagram shows all errors
+    of each configuration. Filled points meet all tolerances, crosses do not. Bars are 95 %
+    confidence intervals.
     """
     from matplotlib.figure import Figure
 
@@ -109,7 +111,10 @@ def _failing(point: Mapping[str, Any]) -> str:
 
 
 def _bars(one: Interval, y: float) -> list[list[float]] | None:
-    """Return the lengths of the error bars below and above y; None without a finite interval."""
+    """Return the lengths of the error bars below and above y.
+
+    Return None if there is no finite interval.
+    """
     if not np.isfinite([one.low, one.high]).all():
         return None
     return [[max(y - max(one.low, MIN_RATIO), 0.0)], [max(one.high - y, 0.0)]]

@@ -567,7 +567,7 @@ def _draft_path(target: Path) -> Path:
 
 
 def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None:
-    """Write the choices into a scene file or into a copy of it, atomically.
+    """Write the choices atomically into a scene file or into a copy of it.
 
     If the file is a symbolic link, the file that it points to is written. Raises BadInputError if
     other parts of the scene would change, or the target cannot be written.

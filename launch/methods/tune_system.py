@@ -1,4 +1,4 @@
-"""Choose methods with which the whole system meets its tolerances, as runs of the graph confirm."""
+"""Choose methods so that the whole system meets its tolerances, and verify this by running it."""
 
 from __future__ import annotations
 
@@ -135,7 +135,10 @@ def _make_option(
 
 
 def _largest(points: Sequence[Point], value: Callable[[Point], float]) -> float:
-    """Return the largest absolute value over the points in the method's range; 0 without any."""
+    """Return the largest finite absolute value at the points in the method's range.
+
+    Return 0 if there are no such points.
+    """
     found = [abs(value(point)) for point in points if point.in_range]
     return max((one for one in found if math.isfinite(one)), default=0.0)
 

@@ -87,7 +87,7 @@ def make_scene(document: Document) -> Scene:
 
 
 def _find_shape_name(document: Document) -> Any:
-    """Return the name of the object's shape in a scene file, or None without one."""
+    """Return the name of the object's shape in a scene file, or None if it has no shape."""
     value: Any = document.values
     for key in (*GEOMETRY, "shape"):
         value = value.get(key) if isinstance(value, dict) else None

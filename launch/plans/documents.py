@@ -420,7 +420,7 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
         known = sorted(holder.model_fields) if _is_model(holder) else []
         key = (*at, *inside, name)
         renamed = _renamed_keys(model, document, key).get(str(name))
-        remedy = f'it is now "{renamed}"' if renamed else did_you_mean(name, known)
+        remedy = f'it was renamed to "{renamed}"' if renamed else did_you_mean(name, known)
         if name in REMOVED_KEYS:
             remedy = "remove it: only one method is left"
         return document.problem(key, f'unknown key "{name}"', remedy)
@@ -432,7 +432,7 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
     renamed = VALUES.get(str(key[-1]) if key else "", {}).get(str(error["input"]))
     if renamed is not None:
         what = f"{_shorten(error['input'])} is invalid"
-        return document.problem(key, what, f'it is now "{renamed}"')
+        return document.problem(key, what, f'it was renamed to "{renamed}"')
     raised = error.get("ctx", {}).get("error")
     message = str(raised) if isinstance(raised, Exception) else error["msg"]
     return document.problem(key, f"{_shorten(error['input'])} is invalid", message)

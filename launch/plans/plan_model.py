@@ -91,10 +91,10 @@ class Writer(StrictModel):
         return self.tcp
 
     def source_for(self, host: str) -> Source:
-        """Return the endpoint for a subscriber on `host`, with the writer's name.
+        """Return the endpoint to which a subscriber on `host` connects, and the writer's name.
 
-        The source names the writer's host only if it is another host, so that the subscriber can
-        authenticate it.
+        If the writer is reached over TCP because it runs on a different host, the source also
+        names that host, so that the subscriber can authenticate it.
         """
         far = host != self.host and self.tcp is not None
         return Source(self.endpoint_for(host), self.name, self.host if far else None)

@@ -41,10 +41,10 @@ Other nodes have their parameters below the key `parameters`.
 
 
 class NodeEntry:
-    """Node of a launch file while the file is resolved.
+    """Node of a launch file that is being resolved.
 
-    type, parameters: class and parameters of the node; None until they are resolved. ports,
-    unconnected: the connected and the unconnected ports, each with its topic.
+    type, parameters: class and parameters of the node; None until they are known. ports: connected
+    ports with their topics. unconnected: unconnected ports with the topics they would have.
     """
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
@@ -63,7 +63,7 @@ class NodeEntry:
         return found
 
     def disconnect_optional(self, written: Container[str]) -> None:
-        """Disconnect optional inputs without a writer, unless the launch file names a topic."""
+        """Disconnect optional inputs that have no writer, unless the launch file names a topic."""
         if self.type is None:
             return
         self.disconnect(

@@ -366,7 +366,10 @@ def _fingertip_frame(fingertip: Fingertip, source: Source) -> Any | None:
 
 
 def _eye_pose(eye: Eye, source: Source) -> Any | None:
-    """Return the pose of the eyes: their midpoint, with x from the left to the right eye."""
+    """Return the pose of a frame at the midpoint of the eyes; None if the eyes are not valid.
+
+    The x axis of the frame points from the left to the right eye.
+    """
     if not eye.valid:
         return None
     x_axis = eye.right_world / np.linalg.norm(eye.right_world)

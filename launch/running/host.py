@@ -353,7 +353,7 @@ def has_estop(state: ArmState) -> bool:
 
 
 def list_arms(plan: ResolvedGraph) -> list[str]:
-    """Return the network address of each arm; "host/node" for a bridge without an address."""
+    """Return the network address of each arm; "host/node" for a bridge that has none."""
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 

@@ -171,7 +171,7 @@ def find_orphans() -> list[psutil.Process]:
             if process.uids().real != os.getuid() or process.pid == os.getpid():
                 continue
             run_id = process.environ().get(RUN_VARIABLE)
-            # In another PID namespace (a container), the same pid denotes another process.
+            # In the PID namespace of a container, the same pid denotes a different process.
             same_namespace = _pid_namespace(process.pid) == _pid_namespace()
             if run_id and same_namespace and not launcher_is_alive(run_id):
                 found.append(process)
@@ -225,7 +225,10 @@ def _signal(processes: Iterable[psutil.Process], number: int) -> None:
 
 
 def _is_of_our_namespace(run: Run) -> bool:
-    """Return whether the run's launcher has our PID namespace; a container has another one."""
+    """Return whether the run's launcher is in the PID namespace of this process.
+
+    A launcher in a container has its own namespace.
+    """
     try:
         marker = json.loads((run.directory / _LAUNCHER_FILE).read_text())
     except FileNotFoundError:

@@ -457,7 +457,8 @@ class RunningGraph:
     def _publish_latched(self, topic: str, message: Message | None) -> int | None:
         """Publish a message that subscribers also receive if they connect later.
 
-        Returns its source timestamp; None if there is no message, or another writer of the topic.
+        Returns its source timestamp; None if there is no message, or if the topic has a different
+        writer.
         """
         writer = self.plan.writer(topic, LAUNCHER)
         if message is None or writer is None:

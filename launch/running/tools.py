@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
-"""Time after which all readers have connected to a new writer, as they retry every 0.5 s."""
+"""Time after which all readers have connected to a new writer; they retry every 0.5 s."""
 
 
 @dataclass(slots=True)
@@ -80,7 +80,7 @@ def make_subscriber(
 async def read_topic(
     graph: RunningGraph, topic: str, count: int | None = None
 ) -> AsyncIterator[tuple[Message, Header]]:
-    """Yield the messages of a topic of a running graph with their headers, as they arrive.
+    """Yield the messages of a topic of a running graph with their headers when they arrive.
 
     count: number of messages; None for no limit.  If the caller is slow, messages wait in a queue.
     Raises KeyError for a topic that does not exist.

@@ -104,7 +104,7 @@ STALE_REASONS = {
 }
 
 MAX_WAIT_FOR_OTHER_S = 1.0
-"""An armed arm is disarmed if the other one is not armed within this time."""
+"""An armed arm is disarmed if the other arm is not armed within this time."""
 
 MAX_ARMING_AGE_S = 1.0
 """Maximum age of an arming command.  The operator may no longer intend an older one."""
@@ -727,7 +727,7 @@ class ArmControl:
     def _slacken(
         self, reason: str, geometry: ArmGeometry, other: OtherArm | None, step_s: float
     ) -> Command:
-        """Stop; once at rest, slacken the sheet by moving this edge towards the other one."""
+        """Stop; once at rest, slacken the sheet by moving this edge towards the other edge."""
         self._settle()
         measured = self.measured_rad
         starts = self._state is State.TAUT
@@ -810,7 +810,7 @@ class ArmControl:
         return self._move(velocity, geometry, step_s)
 
     def _limit_velocity(self, goal_rad: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
-        """Return joint velocities (6,) rad/s towards a goal, assumed to keep its velocity."""
+        """Return joint velocities (6,), rad/s, towards a goal that moves at its last velocity."""
         before = self.commanded_rad if self._goal_rad is None else self._goal_rad
         return limit_velocity(
             self.commanded_rad,
@@ -869,8 +869,9 @@ class ArmControl:
     def _restart_refusal(self, measured: Floats, geometry: ArmGeometry) -> str | None:
         """Return why a motion must not restart from the measured joints, or None.
 
-        The arm must be at rest.  At its last commanded position it may restart.  At another one,
-        either the arm has not followed, or the measurement is wrong and would make the arm jump.
+        The arm must be at rest.  At its last commanded position it may restart.  At any other
+        position, either the arm has not followed, or the measurement is wrong and would make the
+        arm jump.
         """
         lowest, highest = geometry.range_rad
         beyond = max(float((lowest - measured).max()), float((measured - highest).max()))

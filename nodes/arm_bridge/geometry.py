@@ -147,7 +147,7 @@ class ArmGeometry:
         return np.asarray(joints_rad - offsets_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
-        """Return the sheet at rest between this arm's edge and the other one.
+        """Return the sheet at rest between this arm's edge and that of the other arm.
 
         own_edge, other_edge: world poses (4, 4) that the edges would have if the arms were rigid.
         """
@@ -168,7 +168,10 @@ class ArmGeometry:
     def sheet_state(
         self, joints_rad: Floats, world_from_other_flange: Floats | None
     ) -> tuple[float | None, float | None]:
-        """Return distance (m) and force (N) of the edges; None without the other flange's pose."""
+        """Return the distance between the edges (m) and the force on them (N).
+
+        Both are None if the pose of the other flange is unknown.
+        """
         if world_from_other_flange is None:
             return None, None
         other_edge = world_from_other_flange @ self.other_flange_from_edge

@@ -93,7 +93,7 @@ class MotorForceEstimator:
         *,
         forward: Callable[[Floats], Floats],
     ) -> Force | None:
-        """Return the estimated force at a time; None if the last estimate is too recent."""
+        """Return the estimated force at `at_ns`; None if the last estimate is too recent."""
         before_ns, before_rad = self._last_ns, self._last_rad
         if before_ns is not None and at_ns - before_ns < PERIOD_NS:
             return None

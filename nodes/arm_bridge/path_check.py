@@ -142,7 +142,7 @@ class Alignment:
     duration_s: float
 
     def joints_at(self, time_s: float) -> Floats:
-        """Return the joints (6,) rad at a time since the start."""
+        """Return the joints (6,), rad, at `time_s` after the start, s."""
         part = min(1.0, time_s / self.duration_s) if self.duration_s > 0.0 else 1.0
         joints: Floats = self.from_rad + smoothstep(np.array(part)) * (self.to_rad - self.from_rad)
         return joints
@@ -253,7 +253,7 @@ class PathChecker:
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
         """Return a finished request with its result, or None; must be called in every cycle.
 
-        request: check to start unless another one runs; None: no check is wanted.
+        request: check to start unless a check is already running; None: no check is wanted.
         """
         if self._running is None:
             if request is not None:

@@ -419,7 +419,7 @@ def _explain_jump(
 def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[Floats]:
     """Return the joints (6,) that an arm may have at the start of a path.
 
-    They are those near the given ones, or one solution per branch within the joint ranges.  The
+    They are those near the given joints, or one solution per branch within the joint ranges.  The
     branch with the largest distance to the range limits is first.
     """
     if given is not None:
@@ -458,7 +458,7 @@ def _solve_joints(
 def solve_step(
     left: ArmGeometry, right: ArmGeometry, sheet: SheetMotion, near: PathStep, *, fraction: float
 ) -> PathStep:
-    """Solve both arms' joints for a pose of the sheet, near those of another step.
+    """Solve both arms' joints for a pose of the sheet, near the joints of a neighbouring step.
 
     Raises PathError if one of COMMAND_LIMITS is violated.  Distances to singularities are not
     checked.  fraction: position on the path, which the error states.

@@ -1,6 +1,7 @@
 """Compute the region of each sensor in which the finger can appear.
 
-The finger's volume, the box that it can reach, is projected into both images.
+The box that the finger can reach, finger.volume_min_m to volume_max_m, is projected into both
+images.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from flexsheet.nodes.models import camera, rigid
 Floats = NDArray[np.float64]
 
 GRID = 17
-"""Number of points along each edge of the finger's volume.  They are close enough to neglect lens
+"""Number of points along each edge of the reachable box.  They are close enough to neglect lens
 distortion between them."""
 MARGIN_PX = 16.0
 """Margin of the region, for the marker's blur and for differences between calibration and scene."""
@@ -75,10 +76,10 @@ def find_visible_region(
 
 
 def find_finger_regions(scene: Scene) -> Regions:
-    """Return the sensor region of each view in which a fingertip can appear.
+    """Return, for each of the two views, the sensor region in which a fingertip can appear.
 
-    The finger's volume is extended by the finger's radius and a margin.  Raises DeviceError if a
-    view does not show the volume.
+    The fingertip can appear in the box from finger.volume_min_m to finger.volume_max_m, extended
+    by the radius of the finger and a margin.  Raises DeviceError if a view does not show the box.
     """
     finger, rig = scene.finger, scene.camera
     low = np.asarray(finger.volume_min_m) - finger.radius_m
@@ -101,8 +102,8 @@ def find_finger_regions(scene: Scene) -> Regions:
 def resolve_regions(setting: str | ExplicitRegions, scene: Scene) -> Regions | None:
     """Return the sensor regions to publish; None for both full sensors.
 
-    setting: "full", "finger" (the finger's volume), or explicit regions.  Raises DeviceError if a
-    region is not inside its sensor.
+    setting: "full", "finger" (the box that the finger can reach), or explicit regions.  Raises
+    DeviceError if a region is not inside its sensor.
     """
     if setting == "full":
         return None

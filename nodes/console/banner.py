@@ -54,7 +54,7 @@ class GraphState:
 
     @property
     def stopped(self) -> str | None:
-        """Return the reason of the engaged e-stop; None without an e-stop."""
+        """Return the reason of the engaged e-stop; None if it is not engaged."""
         if self.estop_reason is None and any(arm.mode == "estop" for arm in self.arms.values()):
             return STILL_STOPPED
         return self.estop_reason

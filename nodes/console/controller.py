@@ -282,7 +282,7 @@ class Replay:
         return list_bags(self._folder)
 
     def open(self, name: str) -> None:
-        """Open a bag of the folder and show its start.  Raises BagError."""
+        """Open the named bag in the bag folder and play it from its start.  Raises BagError."""
         self.timeline = Timeline(self._folder / name)
         self.playing = True
 
@@ -409,7 +409,10 @@ class ConsoleController:
 
 
 def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> ConsoleState:
-    """Load the state of the previous console; without one, make a state with the first scene."""
+    """Load the state of the previous console.
+
+    If there is none, make a state with the first scene.
+    """
     try:
         state = load_state(files.state)
     except scenes.SceneChoiceError as error:

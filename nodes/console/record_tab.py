@@ -75,7 +75,7 @@ class RecordTab:
     def show_replay(self, replay: Replay, *, opened: bool = False) -> None:
         """Show the current time in the replayed bag.
 
-        opened: whether another bag, or none, is shown from now on.
+        opened: whether a different bag, or none, is shown from now on.
         """
         timeline = replay.timeline
         if opened:

@@ -20,9 +20,10 @@ MAX_CHUNKS = 6
 
 
 class Timeline:
-    """Reader of a bag at a time; `seconds` is the time from the bag's start.
+    """Reader that returns the state of a recording at a selected time.
 
-    Raises BagError for a file that is not a bag, or that contains nothing that the page shows.
+    seconds: selected time since the start of the bag, s. Raises BagError if the file is not a bag
+    or contains no topic that the page shows.
     """
 
     def __init__(self, path: Path) -> None:
@@ -41,7 +42,7 @@ class Timeline:
         self.seconds = 0.0
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the latest message up to `seconds`; see `latest_messages.MessageSource`."""
+        """Return the last message at or before `seconds`; see `latest_messages.MessageSource`."""
         times, _ = self._positions.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
         if i < 0:

@@ -121,7 +121,7 @@ class SceneView:
                 handle.visible = self._shown["Arms"] and side in self._posed
 
     def set_scene(self, scene: Scene) -> None:
-        """Draw everything again for another scene."""
+        """Draw everything again after the scene has changed."""
         self._scene.reset()
         self._layers = {layer: [] for layer in LAYERS}
         self._of_scene, self._skin_shape, self._posed = scene, None, set()

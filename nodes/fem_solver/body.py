@@ -50,8 +50,8 @@ def make_soft_body_spec(
     """Return the inputs of the precomputation for the object of a scene.
 
     skin_spacing_m: distance between skin nodes. sticking: whether the finger sticks to the skin.
-    Raises ValueError as `mesh_spec`, and for a skin spacing above the radius of the fingertip. Such
-    a skin would be too stiff: the force is twice as large as it should be at a spacing of 1.7
+    Raises ValueError like `mesh_spec`, and if the skin spacing exceeds the radius of the fingertip.
+    Such a skin would be too stiff: the force is twice as large as it should be at a spacing of 1.7
     radii, and seven times at 7 radii.
     """
     if skin_spacing_m > scene.finger.radius_m:
@@ -86,7 +86,7 @@ class SceneBody:
     method: method that computes the response. front (3,): surface point nearest to the user, mesh
     frame. rest (s, 3): undeformed skin nodes, mesh frame. linear_depth_m: maximum depth of the
     linear method, at which the stiffness is evaluated. friction_ratio: friction coefficient; with
-    0 the finger slides without friction. force_error_ratio: stated relative error of the force.
+    0 the finger slides freely. force_error_ratio: stated relative error of the force.
     """
 
     method: SoftBodyMethod
@@ -128,7 +128,7 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact, with the stiffness at the front.
+        """Return the response if there is no contact; the stiffness is that at the front.
 
         The front is the surface point that faces the user.
         """

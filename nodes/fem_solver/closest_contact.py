@@ -76,7 +76,7 @@ def locate_sticking(
     """Return the contact of a fingertip at `point` (3,) that sticks to its first contact point.
 
     anchor: that point, as returned by the previous call, or None. Also returns the anchor for the
-    next call. Raises ValueError as `locate`.
+    next call. Raises ValueError like `locate`.
     """
     query, new_anchor = locate(shape, point, anchor)
     if new_anchor is None or anchor is None:

@@ -1,4 +1,4 @@
-"""Run functions on the workers of a `dask.distributed` scheduler, as an executor.
+"""Provide an executor that runs functions on the workers of a `dask.distributed` scheduler.
 
 A worker needs only the same version of this project: each job contains its input data. Import this
 module where it is used, because importing `distributed` takes half a second.

@@ -53,7 +53,7 @@ def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float
 def quadrature() -> tuple[Floats, Floats]:
     """Return quadrature points (8, 3) and positive weights (8,) on the unit tetrahedron.
 
-    The rule is exact to degree 3, as the patch test on curved elements requires. It is a conical
+    The rule is exact to degree 3, which the patch test on curved elements requires. It is a conical
     product of Gauss-Jacobi rules (Stroud, "Approximate Calculation of Multiple Integrals").
     """
     from scipy.special import roots_jacobi
@@ -112,7 +112,7 @@ def element_stiffness(
 ) -> Floats:
     """Return the element stiffness matrices (e, 30, 30), N/m.
 
-    Raises SolidMeshError as `jacobians`, ValueError as `lame_constants`.
+    Raises SolidMeshError and ValueError like `jacobians` and `lame_constants`.
     """
     lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
     points, weights = quadrature()

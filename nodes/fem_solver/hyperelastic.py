@@ -49,8 +49,8 @@ class NeoHookeanSolid:
     ) -> None:
         """Precompute the shape function gradients and the volumes of the elements.
 
-        nodes (n, 3), elements (e, 10): mesh. Raises SolidMeshError as `jacobians`, and ValueError
-        as `lame_constants`.
+        nodes (n, 3), elements (e, 10): mesh. Raises SolidMeshError and ValueError
+        like `jacobians` and `lame_constants`.
         """
         self.nodes, self.elements = nodes, elements
         self._lame, self._mu = lame_constants(young_modulus_pa, poisson_ratio)
@@ -106,7 +106,7 @@ class NeoHookeanSolid:
         This is the second derivative of the energy. For the nodes a and b of an element, let g_a
         and g_b be the gradients of their shape functions, and h = F^-T g. The block of these nodes
         is the integral of mu (g_a . g_b) I + lambda h_a h_b^T + (mu - lambda ln J) h_b h_a^T.
-        Raises InvertedElementError as `forces`.
+        Raises InvertedElementError like `forces`.
         """
         _, inverse, log = self._state(displacement)
         count = len(self.elements)

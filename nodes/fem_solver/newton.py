@@ -95,9 +95,10 @@ class SphereObstacle:
     def __init__(
         self, nodes: Floats, elements: Ints, faces: Ints, *, modulus_pa: float, radius_m: float
     ) -> None:
-        """Place the contact points on the faces.
+        """Distribute the contact points over the faces.
 
-        faces (f, 6): six-node triangles that the finger can touch.
+        faces (f, 6): six-node triangles that the finger can touch. modulus_pa: Young's modulus of
+        the body, to which the contact stiffness is proportional. radius_m: radius of the finger.
         """
         self.radius_m = radius_m
         self._count, self._faces = len(nodes), faces
@@ -167,10 +168,11 @@ class SphereObstacle:
         *,
         geometric_stiffness_weight: float,
     ) -> None:
-        """Add the second derivative of `energy` to the element matrices (e, 30, 30), in place.
+        """Add the contact stiffness to the element matrices (e, 30, 30), in place.
 
-        geometric_stiffness_weight: 1 for the exact derivative. A smaller weight reduces the part of
-        the derivative that may be indefinite; it arises because a sphere pushes points sideways.
+        The contact stiffness is the second derivative of `energy`. geometric_stiffness_weight: 1
+        for the exact derivative. A smaller weight reduces the part that results from the curvature
+        of the sphere and can make the stiffness indefinite.
         """
         inner, depth, normals, away = self.inside(positions, centre)
         slope = np.where(depth < self._rounding, depth / self._rounding, 1.0)
@@ -236,10 +238,10 @@ class NeoHookeanBody:
         """Prepare the solver.
 
         fixed (n,): whether each node is fixed. faces (f, 6): six-node triangles that the finger can
-        touch, outward. tolerance, min_step_fraction, max_step_ratio: see `TOLERANCE`,
-        `MIN_STEP_FRACTION` and `MAX_STEP_RATIO`. factor_dtype: precision of the factors of the
-        tangent stiffness; it affects only the search direction. Raises the errors of
-        `NeoHookeanSolid`.
+        touch, ordered so that their normals point outward. tolerance, min_step_fraction,
+        max_step_ratio: see `TOLERANCE`, `MIN_STEP_FRACTION` and `MAX_STEP_RATIO`. factor_dtype:
+        precision of the factors of the tangent stiffness; it affects only the search direction.
+        Raises the errors of `NeoHookeanSolid`.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio

@@ -78,9 +78,9 @@ class SoftBodySpec:
 class SoftBodyModel:
     """Precomputed elastic response of a soft body and its skin mesh.
 
-    response: response to normal forces. triangles (t, 3): skin triangles, outward. bounds (s,):
-    whether each skin node must not be touched; false also for nodes on end faces. drag: response
-    to tangential forces, or None.
+    response: response to normal forces. triangles (t, 3): skin triangles, ordered for outward
+    normals. bounds (s,): whether each skin node must not be touched; false also for nodes on end
+    faces. drag: response to tangential forces, or None.
     """
 
     response: SkinResponse
@@ -131,7 +131,7 @@ def compute_budget(
 def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
     """Estimate the resources of `compute` within a factor of two, without building the mesh.
 
-    Raises UnfitMeshError as `mesh_budget`.
+    Raises UnfitMeshError under the same conditions as `mesh_budget`.
     """
     nodes = mesh_budget(spec.mesh)
     # Empirical numbers of skin nodes, and of touchable nodes among them.

@@ -7,7 +7,7 @@ continuous function of the finger's position. One response reads 24 rows of the 
 four depths. (A proper orthogonal decomposition over depth would have to read more. It needs nine of
 thirteen modes for an error of 0.1 mm, because the contact area grows with depth.)
 
-The table is filled with solutions of Newton's method, called snapshots, at some tens of sample
+The table is filled with solutions of Newton's method, called snapshots, at several tens of sample
 points. They are interpolated to the other nodes (`snapshot_interpolator`). At small depths the
 linear method is used instead.
 """

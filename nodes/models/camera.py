@@ -41,7 +41,8 @@ def undistort(distorted: Floats, distortion: Floats) -> Floats:
     """Remove lens distortion from normalized image coordinates (..., 2) by fixed-point iteration.
 
     The iteration stops when no coordinate changes by more than 1e-13, or after `MAX_ITERATIONS`. It
-    converges where the distortion changes slowly, as it does inside the image of usual lenses.
+    converges where the distortion changes slowly, which is the case inside the image of usual
+    lenses.
     """
     k1, k2, p1, p2, k3 = distortion
     point = distorted.copy()

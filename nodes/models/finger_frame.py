@@ -15,7 +15,7 @@ def world_from_finger(
 ) -> Floats:
     """Return the rotation matrix (3, 3) from a finger's frame to the world.
 
-    direction_world: vector (3,) from the tip to the hand; without a tilt, y is horizontal.
+    direction_world: vector (3,) from the tip to the hand; if it has no tilt, y is horizontal.
     tilt_rad: rotation vector of the finger about the world's x and y axes.
     """
     x = np.asarray(direction_world, dtype=np.float64)

@@ -22,7 +22,7 @@ CLEAR_RATIO = 0.8
 class ResidualMonitor:
     """Monitor of the mean of a residual vector.
 
-    mean: weighted mean of the samples, in their unit; zeros before the first one.
+    mean: weighted mean of the samples, in their unit; zeros before the first sample.
     suspected: whether the mean has exceeded the threshold for long enough.
     """
 

@@ -94,7 +94,7 @@ class UnfitCurveError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ObjectCurve:
-    """Force of the object over depth: n ascending points from (0, 0).
+    """Force of the object against depth: n ascending points from (0, 0).
 
     Between the points the curve is a monotone cubic, beyond the last a line with the last slope.
     """
@@ -145,7 +145,7 @@ class StretchLimits:
     """Limits of the sheet, of the arms that stretch it, and of the control loop with the hand.
 
     edge_force_n: maximum force on each clamp.
-    bounds: bounds on the offset's slope; None for an analysis without a hand.
+    bounds: bounds on the offset's slope; None for an analysis that has no hand.
     """
 
     min_stretch_ratio: float
@@ -169,7 +169,8 @@ def make_stretch_limits(
 ) -> StretchLimits:
     """Return the stretch limits within the usable fraction of the scene's limits.
 
-    They apply to the sheet without a push.  A push adds edge force, which `render_force` limits.
+    They apply to the sheet if nothing pushes it.  A push adds edge force, which `render_force`
+    limits.
     bounds: bounds on the offset's slope for a stable loop with the hand.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
@@ -186,7 +187,7 @@ def make_stretch_limits(
 
 
 def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
-    """Return the force (N) on each clamp of the sheet without a push."""
+    """Return the force (N) on each clamp of the sheet if nothing pushes it."""
     push = SheetPush(stretch_ratio, finger_radius_m=0.03 * model.rubber.width_m)
     return float(model.evaluate(push, np.zeros(1)).edge_force_n[0])
 
@@ -353,14 +354,14 @@ class Compliance:
     ) -> Floats:
         """Return the sheet's distance (n,), m, behind the object's tangent plane; < 0 in front.
 
-        It is 0 without contact, smooth (C1) over the depth and continuous over the position.
+        It is 0 if there is no contact, smooth (C1) over the depth and continuous over the position.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
         result: Floats = depths - self.indentation_m(depths, position_m)
         return result
 
     def offset_per_depth(self, depth_m: float, position_m: SheetPosition = CENTRE) -> float:
-        """Return the slope of the offset over depth: -`limits.max_advance_per_depth` to 1."""
+        """Return the change of the offset per depth: -`limits.max_advance_per_depth` to 1."""
         if depth_m <= 0.0:
             return 0.0
         if depth_m >= self.max_depth_m:

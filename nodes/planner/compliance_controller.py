@@ -39,11 +39,12 @@ class ComplianceController:
 
     hysteresis_ratio: fraction of the energy of loading that the rubber loses in a cycle; None: the
         value in the scene.
-    bounds: bounds on the offset's slope for a stable loop with the hand; None without a hand.
+    bounds: bounds on the offset's slope for a stable loop with the hand; None if there is no hand.
     delay_s: time from a measured depth until the sheet has moved accordingly.
-    filter_s: time constant of the low-pass filter on the depth; None without bounds.
-    mode: "force_curve" renders the object's force over depth.  "stiffness" renders its stiffness at
-        small pushes by the stretch (Furukawa et al. 2007).  "constant_stretch" keeps the minimum.
+    filter_s: time constant of the low-pass filter on the depth; None if there are no bounds.
+    mode: "force_curve" renders the object's force as a function of depth.  "stiffness" renders its
+    stiffness at small pushes by the stretch (Furukawa et al. 2007).  "constant_stretch" keeps the
+    minimum.
     """
 
     def __init__(

@@ -19,7 +19,7 @@ from flexsheet.nodes.models.rigid import angle_between, transform
 from flexsheet.nodes.models.shapes import Nearest, Shape
 
 MIN_STEP_RATIO = 1.0 / 512.0
-"""Resolution of the search for the last point within the tilt, over the searched distance."""
+"""Resolution of the search for the last point within the tilt, relative to the search distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
 """Finer resolution for a search that passes deep inside the object, where a step changes the normal

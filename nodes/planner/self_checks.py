@@ -20,7 +20,7 @@ MAX_STIFFNESS_RATIO = 0.05
 def check_stiffness(
     sheet: SheetSpec, calibration: SheetCalibration | None
 ) -> tuple[SelfCheck, ...]:
-    """Return the check of Young's modulus times thickness, or () without a calibration.
+    """Return the check of Young's modulus times thickness, or () if there is no calibration.
 
     A difference matters because rendered forces follow from the calibration, but the limits of the
     edge force and the sag from the scene.
@@ -86,7 +86,10 @@ class MeasuredForceCheck:
             self._compare(*self._waiting.popleft())
 
     def add_force(self, force: Force, at_ns: int) -> None:
-        """Add a force measured at a time; only valid forces along the sheet's normal are used."""
+        """Add a force and the time of its measurement.
+
+        Only valid forces along the sheet's normal are used.
+        """
         if force.valid and force.axis == "sheet_normal":
             self._waiting.append((at_ns, force.force_n))
 

@@ -37,7 +37,7 @@ def make_rubber(sheet: SheetSpec) -> Rubber:
 def make_force_model(
     sheet: SheetSpec, calibration: SheetCalibration | None = None
 ) -> SheetForceModel:
-    """Return the calibrated force model; without a calibration, `ScaledSheetModel` of the sheet.
+    """Return the calibrated force model; if there is none, a `ScaledSheetModel` of the sheet.
 
     Raises CalibrationMismatchError if the calibrated sheet has another size.
     """

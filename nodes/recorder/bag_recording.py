@@ -30,7 +30,7 @@ class BagRecording:
     """Recording of messages to bags, while it is requested.
 
     A bag is ended when the free disk space falls to `keep_free_bytes`, which leaves space for its
-    index.  When twice as much is free again, another bag starts with the last messages of all
+    index.  When twice as much is free again, a new bag starts with the last messages of all
     latched topics.  Disk errors during writing are passed to `on_error`, not raised.
 
     note: state of the recording, one line.  lost: number of lost messages since the last bag.
@@ -87,9 +87,9 @@ class BagRecording:
             self._end_bag(error)
 
     def check_disk(self) -> None:
-        """End the bag if free disk space is low, and start another bag when there is enough again.
+        """End the bag if free disk space is low, and start a new bag when there is enough again.
 
-        Also start another bag when the current one reaches the maximum size or duration.
+        Also start a new bag when the current one reaches the maximum size or duration.
         """
         if not self.requested:
             return

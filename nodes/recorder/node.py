@@ -59,7 +59,7 @@ class Recorder(Node):
 
     @periodic("watch_hz")
     def watch_disk(self) -> None:
-        """End the bag before the disk is full; start another one when there is space again."""
+        """End the bag before the disk is full; start a new bag when there is space again."""
         self._recording.check_disk()
         self.note = self._recording.note
 

@@ -55,7 +55,7 @@ def place_marks(
 ) -> CheckMarks:
     """Place the marks of a projector on the sheet (4, 4) with its mesh.
 
-    deeper: mesh of the sheet with the fingertip FINGER_STEP_M deeper; None without contact.
+    deeper: mesh of the sheet with the fingertip FINGER_STEP_M deeper; None if there is no contact.
     """
     pose, lens = projector.world_from_projector, projector.lens
     world_from_projector = pose_matrix(pose)
@@ -84,7 +84,7 @@ def intersect(origin: Floats, rays: Floats, corners: Floats) -> tuple[NDArray[np
     """Intersect rays (n, 3) from a point with triangles (m, 3, 3).
 
     Return the index (n,) of the triangle that each ray hits, and barycentric weights (n, 3) of its
-    corners; NaN without a hit. Source: Moller and Trumbore 1997.
+    corners; NaN if the ray does not hit the mesh. Source: Moller and Trumbore 1997.
     """
     first, along, up = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(along, up)

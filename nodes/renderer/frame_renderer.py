@@ -83,7 +83,7 @@ class FrameRenderer:
             self.extrapolator.add(ports.soft_body.message, ports.soft_body.header)
 
     def is_unchanged(self, shown: Display) -> bool:
-        """Return whether a new frame would equal the last one: without contact and motion."""
+        """Return whether a new frame would equal the last one because nothing touches or moves."""
         ports = self._ports
         arms = (ports.arm_left.message, ports.arm_right.message)
         others = (ports.skin.message, ports.eye.message, shown)
@@ -190,8 +190,8 @@ class FrameRenderer:
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
         """Deform the object as predicted for the display time `light_ns`.
 
-        Without new responses of the solver, use the last one. Returns the exposure time of the data
-        and the time for which the deformation was predicted, ns.
+        If the solver has sent no new response, use the last one. Returns the exposure time of the
+        data and the time for which the deformation was predicted, ns.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age.seconds

@@ -391,7 +391,7 @@ class _MeshBuffers:
         self._arrays: dict[tuple[int, bool], moderngl.VertexArray] = {}
 
     def move(self, moved: NDArray[np.float32]) -> None:
-        """Set positions and normals (vertices, 6); raises ValueError for another shape."""
+        """Set positions and normals (vertices, 6); raises ValueError if the shape differs."""
         if moved.shape != (self.count, 6):
             raise ValueError(
                 f"positions and normals: expected shape ({self.count}, 6), found {moved.shape}"

@@ -16,12 +16,12 @@ MIN_AGE_S, MAX_AGE_S = 0.1, 0.5
 class MaxAge:
     """Maximum age at which poses, fingertips, eyes and soft bodies are used.
 
-    seconds: current value. It is the given one, or `PERIODS` measured periods of the camera, at
-    least `MIN_AGE_S` and at most `MAX_AGE_S`.
+    seconds: current value, s. It is either the fixed value passed to the constructor, or
+    `PERIODS` measured periods of the camera, limited to the range `MIN_AGE_S` to `MAX_AGE_S`.
     """
 
     def __init__(self, given_s: float | None = None) -> None:
-        """Set a fixed maximum age; None: derive it from the camera's period."""
+        """Set a fixed maximum age; if it is None, derive it from the camera's period."""
         self.seconds = MIN_AGE_S if given_s is None else given_s
         self._is_given = given_s is not None
         self._last: Header | None = None

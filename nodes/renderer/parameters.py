@@ -1,4 +1,4 @@
-"""Define the renderer's parameters, as a launch file gives them."""
+"""Define the parameters of the renderer that a launch file can set."""
 
 from __future__ import annotations
 

@@ -303,7 +303,7 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image as `draw` does, by two_pass with a given mesh of the sheet."""
+        """Draw the projector's image like `draw`, by two_pass with a given mesh of the sheet."""
 
         whole = self.canvas.width_px, self.canvas.height_px
 

@@ -45,7 +45,7 @@ class SheetPose:
 
     @property
     def contact_point(self) -> Floats:
-        """Return the pushed point (3,), world; without a push, the sheet's centre."""
+        """Return the pushed point (3,), world; if there is no push, the centre of the sheet."""
         return self.plane.point if self.pushed_point is None else self.pushed_point
 
 

@@ -39,13 +39,13 @@ class SheetMesh:
 
 
 def flat_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the mesh of a sheet without a push: four triangles between corners and centre."""
+    """Return the mesh of a sheet that nothing pushes: four triangles between corners and centre."""
     vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
     return SheetMesh(vertices, PYRAMID)
 
 
 def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return four triangles between corners and pushed point, as in Furukawa et al. 2007."""
+    """Return the four triangles between corners and pushed point that Furukawa et al. 2007 use."""
     if sheet.pushed_point is None:
         return flat_mesh(sheet)
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)

@@ -1,7 +1,7 @@
 """Extrapolate the responses of the soft-body solver to the display time of a frame.
 
 A response is the displacement of the object's surface at the time of the camera's exposure plus
-`prediction_horizon_s`. The frame is displayed some tens of milliseconds later. Each vertex is
+`prediction_horizon_s`. The frame is displayed tens of milliseconds later. Each vertex is
 extrapolated linearly from an older and the newest response.
 """
 

@@ -31,7 +31,7 @@ MAX_NOISE_PX = 0.1
 
 
 def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
-    """Yield a trial for each pixel noise, baseline and slab of the finger's volume.
+    """Yield a trial for each pixel noise, baseline and slab of the box that the finger can reach.
 
     The points of a trial are random in one of three slabs, at increasing height.  The scene's
     baseline replaces the nearest of BASELINES_M.  Trials in the methods' range have at least this

@@ -92,7 +92,7 @@ SOLE_CANDIDATE_TIME_S = 1.0
 """Time after which an ambiguous marker is assigned to the finger if it is the only one in view."""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""Time without the finger after which moving clutter is ambiguous: it may be the finger."""
+"""Time since the finger was last seen after which moving clutter may be the finger."""
 
 
 @dataclass(slots=True)
@@ -106,7 +106,7 @@ class Track:
     at_ns: int
 
     def predict(self, at_ns: int) -> tuple[Floats, float]:
-        """Predict the marker's position (3,) m at a time, and its error scale per axis, m."""
+        """Predict the marker's position (3,) m at `at_ns`, and its error scale per axis, m."""
         since_s = (at_ns - self.at_ns) * 1e-9
         sigma_m = POSITION_SIGMA_M + 0.5 * ACCELERATION_SIGMA_M_PER_S2 * since_s**2
         return self.point + since_s * self.velocity, min(sigma_m, MAX_POSITION_SIGMA_M)

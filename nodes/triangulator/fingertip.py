@@ -108,11 +108,11 @@ class BlobPair:
     """Pair of blobs, left and right, that may be one marker.
 
     depth_m: depth in the left camera's frame at which the rays of both blobs meet.
-    gate_fraction: ratio of the distance from the gate's centre to the gate's radius; 0 without a
-        gate.
+    gate_fraction: ratio of the distance from the gate's centre to the gate's radius; 0 if there
+        is no gate.
     cost: mismatch of rays, sizes, heights and distance from the gate's centre, in squared standard
         deviations.
-    rejection_reason: None if the pair may be a marker in the finger's volume.
+    rejection_reason: None if the pair may be a marker in the box that the finger can reach.
     """
 
     left: Blob

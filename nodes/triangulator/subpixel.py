@@ -54,7 +54,7 @@ PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
 """Inverse variances of the parameters' starting values.  They matter only where the pixels contain
-no information, as for the level of a saturated marker."""
+no information, for example about the level of a saturated marker."""
 
 MIN_SHAPE = np.array([0.5, 0.3])
 MAX_SHAPE = np.array([40.0, 8.0])
@@ -170,7 +170,7 @@ def fit_discs(
 def fit_ellipses(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> list[DiscFit]:
-    """Fit one ellipse at rest in each image, as `fit_discs` fits discs.
+    """Fit one ellipse at rest in each image; `fit_discs` does the same for discs.
 
     Starting values describe a moving disc; the ellipse starts with the same second moments.  Each
     ellipse is fitted alone, because the time grows with the third power of its size.
@@ -410,7 +410,7 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Render ellipses; return the same arrays as `_render_disc`."""
+    """Render ellipses; return arrays like those of `_render_disc`."""
     x, y = (each.ravel() for each in np.broadcast_arrays(x[0], y[0]))
     coverage, by_shape = integrate_ellipse(found[:, ELLIPSE], x, y)
     columns = found.T[:, :, None]

@@ -46,7 +46,7 @@ class TrackingSettings:
 
 @dataclass(frozen=True, slots=True)
 class PositionMeasurement:
-    """Measured marker position (3,) m at a time, with its covariance (3, 3) m^2."""
+    """Measured marker position (3,) m at `at_ns`, with its covariance (3, 3) m^2."""
 
     at_ns: int
     measured: Floats
@@ -104,11 +104,11 @@ class Tracker:
         return self._history[-1][1] if self._history else None
 
     def is_late(self, at_ns: int) -> bool:
-        """Return whether a point at `at_ns` is not newer than the newest one."""
+        """Return whether the time `at_ns` of a point is at or before the time of the estimate."""
         return self.estimate is not None and at_ns <= self.estimate.at_ns
 
     def state(self, at_ns: int) -> FingertipState:
-        """Return the state of the track at a time that is not earlier than its newest point."""
+        """Return the state of the track at `at_ns`, which must be at or after its newest point."""
         if not self._is_alive(at_ns):
             return "acquiring" if self._tentative_track else "lost"
         assert self.estimate is not None
@@ -117,7 +117,7 @@ class Tracker:
     def gate(self, at_ns: int) -> Gate | None:
         """Return the gate at a time after the newest point.
 
-        Return None if there is no track, or if the time is not after its newest point.
+        Return None if there is no track, or if the time is at or before its newest point.
         """
         if not self._is_alive(at_ns) or self.is_late(at_ns):
             return None
@@ -138,7 +138,7 @@ class Tracker:
         )
 
     def predict_at(self, at_ns: int, horizons_s: Floats) -> TrackPrediction:
-        """Predict position, velocity and path at a time that is not before the newest point.
+        """Predict position, velocity and path at a time at or after the newest point.
 
         horizons_s: (n,) times of the path's points after `at_ns`.  The first must be 0.
         If the track is lost, the predicted finger stays at its last position.

@@ -95,7 +95,7 @@ def _matrix(lens: Lens) -> Floats:
 
 
 class ImageMismatchError(FlexsheetError, ValueError):
-    """Error for images of another device, or larger than the sensor of the scene's camera."""
+    """Error for images of a wrong device, or larger than the sensor of the scene's camera."""
 
     code = "image-mismatch"
     remedy = "Set the camera in the scene to the one that took the images."

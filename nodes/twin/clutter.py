@@ -1,9 +1,9 @@
 """Describe the clutter: objects in the camera images that make it hard to track the fingertip.
 
-All objects are plain values in world coordinates (m); `pixels.py` renders them. The path of an
-object is relative to the world, or to the fingertip if the object is `carried`. `views` names the
-cameras that see it. Levels are grey levels (0..255) at normal exposure, where the marker on the
-fingertip has about 215.
+Positions are in m; `pixels.py` renders the objects. The path of an object is in the world frame,
+or relative to the fingertip if the object is `carried`. `views` names the cameras that see the
+object. Levels are grey levels (0 to 255) at normal exposure, at which the marker on the fingertip
+has a level of about 215.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Trajectory(Protocol):
     """Interface of a position as a function of simulation time."""
 
     def at(self, time_s: float) -> Floats:
-        """Return the position (3,) in the world frame, or from the fingertip if carried."""
+        """Return the position (3,) in the world frame, or relative to the fingertip, m."""
         ...
 
 
@@ -44,7 +44,7 @@ class FixedPoint:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """Trajectory with constant velocity, at `start` at time 0."""
+    """Trajectory that leaves `start` at time 0 and has a constant velocity."""
 
     start: Point
     velocity_m_per_s: Point
@@ -55,7 +55,7 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Oscillation:
-    """Trajectory that oscillates sinusoidally about the centre `middle` by +-`reach`."""
+    """Sinusoidal oscillation about the centre `middle` with the amplitude `reach`."""
 
     middle: Point
     reach: Point
@@ -154,7 +154,7 @@ def second_marker(offset_m: Point, *, level: float = 215.0, views: Views = "both
 def touching_highlight(
     overlap: float, *, radius_m: float = 0.0015, level: float = 300.0, views: Views = "both"
 ) -> Clutter:
-    """Make a highlight at +x of the marker that covers the fraction `overlap` of its diameter."""
+    """Make a highlight beside the marker (+x) that covers a fraction of the marker's diameter."""
     aside_m = MARKER_RADIUS_M + radius_m - overlap * 2.0 * MARKER_RADIUS_M
     spot = Highlight(FixedPoint((aside_m, 0.0, 0.0)), radius_m, level, carried=True, views=views)
     return Clutter(highlights=(spot,))

@@ -86,7 +86,7 @@ class Hits:
     """First intersection of each ray of a fan with a mesh.
 
     triangle: (height, width) index of the triangle that is hit; -1 where nothing is hit.
-    inverse_range: (height, width) reciprocal of the ray parameter at the hit; 0 without a hit.
+    inverse_range: (height, width) reciprocal of the ray parameter at the hit; 0 if there is no hit.
     weights: (triangles, 3, 3) matrices that map (1, column, row) to barycentric weights, which are
         not normalised.
     """
@@ -488,7 +488,7 @@ class EyeSituation:
     """True state of the simulated hardware and of the object while a frame is shown.
 
     world_from_flange_left, world_from_flange_right: (4, 4) poses of the arms' last links.
-    finger_tip: (3,) in the world frame, or None without a finger.
+    finger_tip: (3,) in the world frame, or None if there is no finger.
     skin_vertices, skin_triangles: surface mesh of the soft body at rest, (skin vertices, 3) and
         (skin triangles, 3).
     displacement: (skin vertices, 3). All three are None if the object is not deformed.

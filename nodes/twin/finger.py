@@ -215,7 +215,7 @@ class SmoothPath:
 def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
     """Check points (n, 3) and times (n,), and make the path through them.
 
-    Raises FingerPathError for a path without points or with times that do not increase.
+    Raises FingerPathError if the path has no points or its times do not increase.
     """
     if len(times_s) != len(points) or len(times_s) == 0:
         raise FingerPathError(

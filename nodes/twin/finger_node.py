@@ -180,7 +180,7 @@ class TwinFingerNode(Node):
         return (at_ns - self.started_ns) * 1e-9
 
     def _voluntary(self, at_s: float) -> tuple[Floats, Floats]:
-        """Return position and velocity, each (3,), that the finger would have without contact."""
+        """Return position and velocity, each (3,), of the finger if it touched nothing."""
         state = self.motion.at(at_s - self._seconds(self.motion_from_ns))
         return state.position, state.velocity
 
@@ -229,7 +229,7 @@ class TwinFingerNode(Node):
         self.path_stroke_s = path.stroke_s
 
     def truth(self, at_ns: int) -> FingerState:
-        """Return the true state of the fingertip at a time of this node's clock."""
+        """Return the true state of the fingertip at the time `at_ns` of this node's clock."""
         state = self.motion.at((at_ns - self.motion_from_ns) * 1e-9)
         if self.coupled is None or not self.edges:
             return state
@@ -244,8 +244,8 @@ class TwinFingerNode(Node):
     def expose(self, middle_ns: int) -> StereoPair:
         """Render the image pair with timestamp `middle_ns`; publish the true finger at that time.
 
-        The images are exposed at a slightly different time, as the apparatus states. A scene must
-        have arrived.
+        The actual exposure time differs from `middle_ns` by the timestamp error of the apparatus.
+        This method must not be called before a scene has been received.
         """
         assert self.camera is not None
         exposed_ns = middle_ns + self._stamp_error_ns()

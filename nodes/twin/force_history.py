@@ -73,7 +73,7 @@ class ForceHistory:
         return cls(sheet.hysteresis_ratio, sheet.creep_ratio_per_decade)
 
     def update(self, time_s: float, elastic_n: float) -> float:
-        """Add the elastic force at a time, and return the force with hysteresis and creep, N.
+        """Add the elastic force at `time_s`, and return the force with hysteresis and creep, N.
 
         The elastic force is assumed to change linearly between calls; the first value has the age
         `REFERENCE_S`. Raises ValueError if the time decreases.

@@ -138,7 +138,10 @@ class EdgeTrack:
         self._samples: list[tuple[float, Floats]] = []
 
     def add(self, time_s: float, left: Floats, right: Floats) -> None:
-        """Add the poses (4, 4) of the edges at a time; ignore a time that is not later."""
+        """Add the poses (4, 4) of the edges at `time_s`, s.
+
+        Poses that are not newer than the last poses are ignored.
+        """
         if not self._samples or time_s > self._samples[-1][0]:
             self._samples = [*self._samples[-1:], (time_s, np.stack([left, right]))]
 

@@ -34,5 +34,5 @@ class HeadSway:
         return cls(eyes.sway_m, SineSum.drawn(band_hz, np.random.default_rng(seed)))
 
     def at(self, time_s: float) -> Floats:
-        """Return the displacement (3,) of the eyes at a time, m."""
+        """Return the displacement (3,) of the eyes at `time_s`, m."""
         return np.asarray(self.sway_m * self.noise.at(time_s)[0])

@@ -80,7 +80,7 @@ class LitMarks:
             self._frames.append((frame.light_ns + self._late_ns, frame.marks_px))
 
     def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
-        """Return the lit points (n, 3) in the world at a time; empty if they are unknown."""
+        """Return the lit points (n, 3) in the world at `at_ns`; empty if they are unknown."""
         shown = [pixels for light_ns, pixels in self._frames if light_ns <= at_ns]
         if not shown:
             return np.zeros((0, 3))

@@ -455,7 +455,7 @@ def solve_path(
 ) -> list[DeformedSheet]:
     """Solve the equilibria of the sheet while a fingertip advances through the given positions.
 
-    Returns the sheet at each position; without any, the sheet that nothing touches.
+    Returns the sheet at each position; if there are no positions, the sheet that nothing touches.
 
     world_from_left_edge, world_from_right_edge: (4, 4) poses of the clamped edges; the origin is
     the centre of the edge, y points along it.

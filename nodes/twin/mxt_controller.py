@@ -72,8 +72,8 @@ class MxtController:
 
     An error ends the robot program: the arm brakes, and no packet is answered until `restart`.
     Errors are: a move before a packet that only requests the state; an unknown command or data
-    type; joints out of range; a first set-point away from the measured joint angles; a jump of the
-    set-point; and no packet for `timeout_s`.
+    type; joint angles outside the allowed range; a first set-point away from the measured joint
+    angles; a jump of the set-point; and no packet for `timeout_s`.
 
     servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joints.
     filter_s: time constant of the low-pass filter on set-points.
@@ -131,7 +131,7 @@ class MxtController:
         self.restart()
 
     def restart(self) -> None:
-        """Clear the error and restart the program, as an operator does."""
+        """Clear the error and restart the program, as an operator would."""
         self.error = ""
         self._master: Address | None = None
         self._moved = False
@@ -253,7 +253,7 @@ class MxtController:
         if not np.isfinite(data).all():
             raise MxtError("set-point not finite")
         if not self.servo.mechanics.is_in_range(data[:6]):
-            raise MxtError("set-point with joints out of range")
+            raise MxtError("the set-point contains joint angles outside the allowed range")
         return data[:6]
 
     def _fail(self, why: str) -> None:
@@ -285,7 +285,11 @@ class MxtController:
         return (0, *([0.0] * 8), 0, 0)
 
     def _currents_percent(self) -> list[int]:
-        """Return the motor currents (6,) in whole percent; static friction carries a part."""
+        """Return the motor currents (6,) in percent of the rated current, rounded to integers.
+
+        The motors carry the weight of the arm and the load, apart from the part that static
+        friction carries.
+        """
         balance = UNLOADED_PERCENT - self.load_nm / TORQUE_PER_PERCENT_NM
         return [round(float(one)) for one in balance + self._stuck_percent]
 

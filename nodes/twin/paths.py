@@ -254,9 +254,9 @@ def place_path(
     if shrunk is None:
         front = map_to_surface(scene, np.zeros((1, 3)))[0]
         raise FingerPathError(
-            f'path "{label}": the object\'s front at {np.round(front, 4).tolist()} m is not '
-            f"{margin_m:.2g} m inside finger.volume_min_m..volume_max_m: widen the volume or move "
-            "object.world_from_object"
+            f'path "{label}": the front of the object at {np.round(front, 4).tolist()} m must be '
+            f"at least {margin_m:.2g} m inside the volume from finger.volume_min_m to "
+            "finger.volume_max_m: widen the volume or move the object (object.world_from_object)"
         )
     return FingerPath(
         label=label,

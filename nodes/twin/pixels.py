@@ -221,7 +221,7 @@ class TwinCamera:
         marker_radius_m: float | None = None,
         marker_offset_m: Floats | None = None,
     ) -> TwinCamera:
-        """Return a copy of this camera, with the same background, but another marker or sensor.
+        """Return a copy of this camera, with the same background but a different marker or sensor.
 
         marker_offset_m: vector from the fingertip to the marker, in the world frame.
         """

@@ -99,7 +99,7 @@ def _rpy(rotation: Floats) -> Floats:
 def sheet_poses(count: int) -> list[Floats]:
     """Return various poses `world_from_sheet` (4, 4) at which the arms can hold the sheet.
 
-    They differ in distance and tilt, as the calibration of a projector requires.
+    They differ in distance and tilt because the calibration of a projector requires it.
     """
     poses = []
     for number in range(count):

@@ -11,7 +11,7 @@ J = TypeVar("J")
 
 
 class RenderQueue(Generic[J]):
-    """Queue of rendering jobs in order of arrival, which also decides what is rendered again.
+    """Queue of rendering jobs in order of arrival, which prevents repeated rendering.
 
     max_length: maximum number of waiting jobs.
     min_interval_s: minimum time before a job with the same key is rendered again.

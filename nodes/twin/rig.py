@@ -91,7 +91,7 @@ def pixels_of(lens: Lens, slopes: Floats) -> Floats:
 
 
 def pixel_of(lens: Lens, slope_x: float, slope_y: float) -> tuple[float, float]:
-    """Project one ray as `pixels_of` does, many times faster."""
+    """Project one ray like `pixels_of`, but many times faster."""
     return _seen(lens, slope_x, slope_y)
 
 

@@ -95,7 +95,10 @@ class SheetPull:
         return float(np.interp(distance_m, rigid_m, forces_n))
 
     def _remember(self, distance_m: float, time_s: float) -> None:
-        """Update hysteresis and creep with the tension at a distance; does nothing without them."""
+        """Update hysteresis and creep with the tension at a distance.
+
+        Does nothing if they are not modelled.
+        """
         if self.history is None:
             return
         elastic_n = self.force_n(distance_m) / self._rubber_ratio

@@ -160,7 +160,7 @@ class Tolerance:
     unit, scale: unit in tables, and the factor from SI units to it.
     modern: distribution of every component, or a tuple with one for each component.
     source, calibrated_source: source of the numbers.
-    paper: distribution for the profile `paper`; None: as `modern`.
+    paper: distribution for the profile `paper`; None: the distribution `modern`.
     calibrated: distribution after calibration; None if no calibration affects the parameter.
     pair: if given, both arms share a random sample, to which each adds a sample of `pair`.
     frame_periods: profiles in which the sample is in periods of the true camera rate, not seconds.

@@ -42,7 +42,7 @@ class SimulatorParameters(NodeParameters):
 
 
 def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
-    """Return the scene with the true devices; without an apparatus, the scene itself.
+    """Return the scene with the true devices; if there is no apparatus, return the scene itself.
 
     Everything that is not a device remains unchanged, since it is virtual or a requirement. The
     returned camera still has the lenses of its data sheet; `make_true_camera` adds the deviations

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_BOOKMARK_SHOTS = 40
-"""Maximum number of stored shots (image sets) at bookmarks; further ones are only counted."""
+"""Maximum number of stored shots (image sets) at bookmarks; further shots are only counted."""
 
 MAX_WIDTH_PX = 420
 QUALITY = 82

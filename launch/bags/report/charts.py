@@ -101,7 +101,7 @@ def mark_isolated(axes: Axes) -> None:
 
 
 def timeline(session: Session) -> Chart | None:
-    """Draw the states of sheet, arms and tracker as strips over time, with events above them."""
+    """Draw the states of sheet, arms and tracker as strips along time, with events above them."""
     strips = [
         (name, states)
         for name, states in (
@@ -196,7 +196,7 @@ def find_intervals(
 
 
 def latencies(session: Session) -> Chart | None:
-    """Draw the median and 99 % quantile of the latency from exposure to each event, over time."""
+    """Draw median and 99 % quantile of the latency from exposure to each event, against time."""
     events = [event for event in EVENTS if event in session.latencies]
     if not events:
         return None
@@ -318,7 +318,7 @@ def sheet_errors(session: Session) -> Chart | None:
 
 
 def draw_joint_speeds(session: Session) -> Chart | None:
-    """Draw the maximum speed of each joint in percent of its limit, over time."""
+    """Draw the maximum speed of each joint in percent of its limit, against time."""
     arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
     if not arms:
         return None
@@ -354,7 +354,7 @@ def draw_joint_speeds(session: Session) -> Chart | None:
 
 
 def forces(session: Session) -> Chart | None:
-    """Draw the forces at the sheet's edges, the object's force and the push depth, over time."""
+    """Draw the forces at the sheet's edges, the object's force and the push depth, against time."""
     arms = {side: arm for side, arm in session.arms.items() if arm.edge_force.overall()}
     if not arms:
         return None

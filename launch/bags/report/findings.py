@@ -53,7 +53,7 @@ CHECKED = (
 def find_problems(numbers: dict[str, Any]) -> list[SessionFinding]:
     """Return all problems in the numbers of a session.
 
-    Overload is first, as it causes most other problems; failures follow.
+    Overload is first, because it causes most other problems; failures follow.
     """
     found = [
         *_check_bag(numbers),

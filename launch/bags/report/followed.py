@@ -33,7 +33,7 @@ class Sizes:
             self._spread.add(0, value)
 
     def summary(self, scale: float) -> dict[str, float] | None:
-        """Return mean, 95 % quantile and maximum times `scale`; None without a value."""
+        """Return mean, 95 % quantile and maximum times `scale`; None if there are no values."""
         found, p95 = self._moments.summary(scale), self._spread.quantile_s(0.95)
         if found is None or p95 is None:
             return None
@@ -74,7 +74,7 @@ class FollowedFinger:
                 self.drop_outs += 1
 
     def figures(self) -> dict[str, Any]:
-        """Return the summary of the errors; None for values that require contact without any.
+        """Return the summary of the errors; values that require contact are None if there is none.
 
         contact_ratio: fraction of the exposures that are in contact. following_ratio: fraction of
         the exposures in contact at which the arms follow.

@@ -42,7 +42,7 @@ class Grid:
 
 
 class Range:
-    """Minimum and maximum of a quantity in each interval; NaN without a value."""
+    """Minimum and maximum of a quantity in each interval; NaN if the interval has no values."""
 
     def __init__(self, grid: Grid) -> None:
         self.minimum = np.full(grid.count, np.nan)
@@ -57,7 +57,7 @@ class Range:
             self.maximum[index] = value
 
     def overall(self) -> tuple[float, float] | None:
-        """Return minimum and maximum over all intervals; None without a value."""
+        """Return minimum and maximum over all intervals; None if there are no values."""
         if np.isnan(self.maximum).all():
             return None
         return float(np.nanmin(self.minimum)), float(np.nanmax(self.maximum))
@@ -81,12 +81,15 @@ class Spread:
         return int(self.counts.sum())
 
     def quantile_s(self, fraction: float) -> float | None:
-        """Return a quantile of all durations, accurate to 2.3 %; None without a value."""
+        """Return a quantile of all durations, accurate to 2.3 %; None if there are no durations."""
         found = _quantiles(self.counts.sum(axis=0, keepdims=True), fraction)[0]
         return None if np.isnan(found) else float(min(found, self.longest_s))
 
     def quantiles_s(self, fraction: float) -> Floats:
-        """Return a quantile of the durations in each interval (count,); NaN without a value."""
+        """Return a quantile of the durations in each interval (count,).
+
+        It is NaN for intervals that have no durations.
+        """
         return _quantiles(self.counts, fraction)
 
 
@@ -103,7 +106,7 @@ def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
 
 
 class PointSeries:
-    """Last position of a moving point in each interval (count, 3); NaN without a value."""
+    """Last position of a moving point in each interval (count, 3); NaN if there is none."""
 
     def __init__(self, grid: Grid) -> None:
         self.points = np.full((grid.count, 3), np.nan)
@@ -160,7 +163,10 @@ class RunningMoments:
             self.maximum = max(self.maximum, float(values.max()))
 
     def summary(self, scale: float) -> dict[str, float] | None:
-        """Return mean, standard deviation and maximum times `scale`; None without a value."""
+        """Return mean, standard deviation and maximum times `scale`.
+
+        Return None if there are no values.
+        """
         if not self.count:
             return None
         mean = self.total / self.count

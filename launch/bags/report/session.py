@@ -255,7 +255,10 @@ class Session:
         self._late_before: int | None = None
 
     def joint_speeds_rad_per_s(self, side: str) -> tuple[float, ...]:
-        """Return the maximum joint speeds (6,) of an arm; without a scene, those of an RV-1A."""
+        """Return the maximum joint speeds (6,) of an arm, rad/s.
+
+        If there is no scene, return the speeds of an RV-1A.
+        """
         model = RV_1A if self.scene is None else getattr(self.scene.arms, side).model
         return tuple(model.speed_rad_per_s)
 

@@ -213,11 +213,11 @@ def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, 
 def _focused_disc(
     radius_m: float, half_support: float, sizes: _Sizes, focus: Focus
 ) -> tuple[Floats, Ints]:
-    """Return a cross-section as `_disc`, symmetric about the diameter through the focus.
+    """Return a cross-section like that of `_disc`, symmetric about the diameter through the focus.
 
-    Only the ends of the support may break the symmetry. With an asymmetric mesh, the force on the
-    finger would have a sideways component of some percent. Without friction, this force would move
-    the whole body.
+    The mesh may be asymmetric only where the support ends. Otherwise, the force on the finger would
+    have a sideways component of a few percent of its magnitude. If there is no friction, this
+    component would move the whole body.
     """
     near = focus.near_m / radius_m
     inner = [(r, _sample_arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]

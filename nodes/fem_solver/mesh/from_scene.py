@@ -112,7 +112,7 @@ class MeshBudget:
 
 
 def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
-    """Return the specification of the mesh of a scene; raises ValueError as `world_from_mesh`."""
+    """Return the specification of the mesh of a scene; raises ValueError like `world_from_mesh`."""
     body = scene.object
     object_from_world = rigid.inverse(_world_from_object(scene))[:3, :3]
     mesh_from_world = rigid.inverse(world_from_mesh(scene))[:3, :3]
@@ -171,7 +171,10 @@ def _rounded(vector: Floats) -> Vector:
 
 
 def mesh_budget(spec: MeshSpec) -> MeshBudget:
-    """Estimate the resources that `build_mesh` needs, in at most a second; raises as `_budget`."""
+    """Estimate the resources that `build_mesh` needs, in at most a second.
+
+    Raises the errors of `_budget`.
+    """
     return _budget(spec, make_shape(dict(spec.geometry)))
 
 
@@ -231,15 +234,18 @@ def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
 
 
 def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
-    """Mesh the object of a scene in the frame of `world_from_mesh`; raises as `build_mesh`."""
+    """Mesh the object of a scene in the frame of `world_from_mesh`.
+
+    Raises the errors of `build_mesh`.
+    """
     return build_mesh(mesh_spec(scene, skin_spacing_m))
 
 
 def build_mesh(spec: MeshSpec) -> SolidMesh:
     """Build the mesh of a specification.
 
-    Raises UnfitMeshError as `_budget`, for an object too thin for its elements, and for a support
-    that fixes too few nodes or all touchable skin.
+    Raises UnfitMeshError like `_budget`, and also if the object is too thin for its elements or the
+    support fixes too few nodes or all touchable skin.
     """
     geometry = spec.geometry
     shape = make_shape(dict(geometry))

@@ -40,10 +40,11 @@ class SolidMesh:
     nodes (n, 3): positions, m, mesh frame. elements (e, 10): indices of their nodes. slab (n,):
     index of the slice along one axis that contains the node. The nodes of one element are in at
     most two successive slabs; nodes are sorted by slab. fixed (n,): whether each node is fixed.
-    skin (s,): nodes on the surface. skin_triangles (t, 3): indices into `skin`, outward.
+    skin (s,): nodes on the surface. skin_triangles (t, 3): indices into `skin`, ordered for outward
+    normals.
     contact_nodes (m,): nodes that the finger can touch, a sorted subset of `skin`. contact_normals
     (m, 3): outward normals there. contact_faces (f, 6): indices into `contact_nodes` of six-node
-    triangles, outward.
+    triangles, ordered for outward normals.
     """
 
     nodes: Floats

@@ -107,7 +107,7 @@ class SmoothMeshShape:
     """Closed mesh, smoothed over the length `smoothing_m`; see the module docstring."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
-        """Fit the jets that define the smooth surface of a closed mesh.
+        """Fit the local quadratics (jets) that define the smooth surface of a closed mesh.
 
         Raises MeshError for a mesh that does not bound a solid or is too small for the smoothing
         length, and ValueError for a length that is not positive.
@@ -333,7 +333,10 @@ class SmoothMeshShape:
         return _on_surface_only(feet)
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return the rise, as specified by `Shape.rise_m`, evaluated at the centres of the jets."""
+        """Return how far the object rises above its tangent plane at a surface point, m.
+
+        See `Shape.rise_m`. The height is evaluated only at the centres of the local quadratic fits.
+        """
         offset = self._centre[:-1] - point
         height = offset @ normal
         across = np.einsum("ji,ji->j", offset, offset) - height * height
@@ -376,7 +379,7 @@ class SmoothMeshShape:
         return table, counts
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate f, as a `LevelSet`, at points (n, 3) near the surface.
+        """Evaluate f at points (n, 3) near the surface; this implements a `LevelSet`.
 
         The last result (n,) is the sum of the weights w_i.
         """
@@ -435,9 +438,9 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """Function that evaluates f of a `SmoothMeshShape` along one projection, as a `LevelAt`.
+    """Function (`LevelAt`) that evaluates f of a `SmoothMeshShape` along one projection.
 
-    To save time, the list of nearby jets is updated only when the point has moved by
+    To save time, the list of nearby local fits (jets) is updated only when the point has moved by
     `MEMBERS_KNOWN` times `rho`.
     """
 

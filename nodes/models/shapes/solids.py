@@ -190,7 +190,7 @@ class EllipsoidShape(Convex):
     def _level_at(
         self, point: Triple
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
-        """Evaluate the function of `_level` at a single point, as a `LevelAt`."""
+        """Evaluate the function of `_level` at a single point; this implements a `LevelAt`."""
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
         value = 0.5 * (x * x * p + y * y * q + z * z * r - 1.0)

@@ -70,7 +70,10 @@ class Shape(Protocol):
         ...
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distance (m) to the solid, negative inside; raises as `closest`."""
+        """Return the signed distance (m) to the solid, negative inside.
+
+        Raises the errors of `closest`.
+        """
         ...
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:

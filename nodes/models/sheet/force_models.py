@@ -74,7 +74,7 @@ class SheetForceModel(Protocol):
 
 
 def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
-    """Return the force (N) on each clamp of the sheet without a push."""
+    """Return the force (N) on each clamp of the sheet if nothing pushes it."""
     return edge_force_n(stretch_ratio, rubber, mooney_ratio=rubber.mooney_ratio)
 
 

@@ -12,7 +12,7 @@ l1^-1/2, the energy is that of uniaxial tension. If l1 is below 1 too, the energ
 and tangent (its derivative with respect to the strain) are computed in the principal frame of C.
 
 The fingertip is a rigid sphere that is pushed along the flat sheet's normal. Nodes that it touches
-stick to it. Newton's method computes each equilibrium from the previous one, with
+stick to it. Newton's method computes each equilibrium from the previous equilibrium, with
 Levenberg-Marquardt damping where the slack sheet has no stiffness.
 """
 

@@ -1,4 +1,4 @@
-"""Compute force and sag of the sheet without a push, and its stiffness for small pushes."""
+"""Compute force and sag of a sheet that nothing pushes, and its stiffness for small pushes."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class SlackSheet(Protocol):
 
 
 def edge_force_n(stretch_ratio: float, sheet: SlackSheet, *, mooney_ratio: float = 0.0) -> float:
-    """Return the force (N) on each clamped edge without a push; 0 for a slack sheet."""
+    """Return the force (N) on each clamped edge if nothing pushes it; 0 if the sheet is slack."""
     return _area_modulus_n(sheet) * strain_measure(stretch_ratio, mooney_ratio)
 
 
@@ -106,7 +106,7 @@ def compute_sag_m(
     across: float | NDArray[np.float64],
     along: float | NDArray[np.float64] = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the sag of the sheet by its weight along its normal, without a push, m.
+    """Return the sag of the sheet by its weight along its normal if nothing pushes it, m.
 
     normal: unit normal (3,) of the sheet in the world.
     across: positions between the clamps, from 0 to 1, any shape.
