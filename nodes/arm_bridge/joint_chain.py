@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 from math import degrees, pi
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from flexsheet.messages.scene import JointChain
 from flexsheet.nodes.arm_bridge.kinematics import SeedBranch, UnreachableError
@@ -146,12 +146,17 @@ class NumericKinematics:
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
         """Return joints (n, 6) on the branch of `joints_rad` (6,), and their errors (n,)."""
         start = self.forward(joints_rad)
-        turns = Rotation.from_matrix(poses[:, :3, :3] @ start[:3, :3].T).as_rotvec()
+        turns = scipy.spatial.transform.Rotation.from_matrix(
+            poses[:, :3, :3] @ start[:3, :3].T
+        ).as_rotvec()
         joints = np.tile(joints_rad, (len(poses), 1))
         between = np.tile(np.eye(4), (len(poses), 1, 1))
         for number in range(1, WAYPOINTS + 1):
             part = number / WAYPOINTS
-            between[:, :3, :3] = Rotation.from_rotvec(part * turns).as_matrix() @ start[:3, :3]
+            between[:, :3, :3] = (
+                scipy.spatial.transform.Rotation.from_rotvec(part * turns).as_matrix()
+                @ start[:3, :3]
+            )
             between[:, :3, 3] = start[:3, 3] + part * (poses[:, :3, 3] - start[:3, 3])
             joints, _ = self._refine(between, joints, STEPS_PER_WAYPOINT)
         return self._refine(poses, joints, STEPS_PER_WAYPOINT)
