@@ -42,7 +42,7 @@ NODE_DEFAULTS = Methods(
     correction="two_pass",
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.003),
 )
-"""Methods that the nodes use if the scene contains no choice, as in docs/tune.md."""
+"""Methods that the nodes use if the scene contains no choice."""
 
 PAPER = Methods(
     marker="moments",
