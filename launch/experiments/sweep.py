@@ -205,8 +205,8 @@ def execute_trial(trial: Mapping[str, Any]) -> Row:
                 _end(process)
                 raise TrialError("interrupted") from None
     if process.returncode != 0:
-        last = errors.strip()[-MAX_ERROR_CHARACTERS:] or f"exit status {process.returncode}"
-        raise TrialError(last)
+        last_line = errors.strip().rpartition("\n")[2][-MAX_ERROR_CHARACTERS:]
+        raise TrialError(last_line or f"exit status {process.returncode}")
     try:
         row = json.loads(output.splitlines()[-1])
     except (IndexError, ValueError) as error:
