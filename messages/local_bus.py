@@ -120,7 +120,7 @@ class LocalChannel:
         self._last = None
 
     def interrupt(self) -> None:
-        """Tell the readers that this writer sends no more messages for now."""
+        """Notify the readers that this writer sends no more messages for now."""
         for reader in self._readers:
             reader.report_end()
 

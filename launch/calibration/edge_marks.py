@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.arm_poses import MAX_STILL_RAD, MIN_STILL_S
+from flexsheet.launch.calibration.csv_rows import parse_finite, read_rows
 from flexsheet.launch.calibration.edge_fit import EdgeMark, HeldPose
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.launch.plans.documents import BadInputError, Problem
@@ -64,28 +65,13 @@ def read_edge_marks(path: Path) -> list[HeldPose]:
 
     Raises BadInputError with file, line, column, value and remedy.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            rows = [(reader.line_num, row) for row in reader]
-            columns = tuple(reader.fieldnames or ())
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise BadInputError(
-            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
-        ) from error
-    problems = [
-        Problem(str(path), (name,), "missing column", "add it")
-        for name in COLUMNS
-        if name not in columns
-    ]
-    if problems:
-        raise BadInputError(problems)
+    problems: list[Problem] = []
     joints: dict[str, tuple[Floats, Floats]] = {}
     marks: dict[str, list[EdgeMark]] = defaultdict(list)
-    for number, row in rows:
-        where, values = f"{path}:{number}", {}
+    for where, row in read_rows(path, COLUMNS):
+        values = {}
         for name in COLUMNS[2:]:
-            values[name] = _parse(where, name, row[name], problems)
+            values[name] = parse_finite(where, name, row[name], problems)
         named = (row["side"] or "").strip()
         side = next((one for one in SIDES if one == named), None)
         if side is None:
@@ -98,17 +84,6 @@ def read_edge_marks(path: Path) -> list[HeldPose]:
     if problems:
         raise BadInputError(problems[:MAX_PROBLEMS])
     return [HeldPose(*joints[pose], tuple(marks[pose])) for pose in joints]
-
-
-def _parse(where: str, name: str, text: str | None, problems: list[Problem]) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        what = f'expected a finite number, found "{text}"'
-        problems.append(Problem(where, (name,), what, "measure this mark again, or remove its row"))
-    return value
 
 
 def _make_mark(side: Side, values: dict[str, float]) -> EdgeMark:

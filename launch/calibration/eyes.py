@@ -9,7 +9,6 @@ the centre of projection of the eye, and needs no calibration of projector or sh
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from flexsheet.launch.calibration.csv_rows import parse_finite, read_rows
 from flexsheet.launch.calibration.edge_marks import MarkDetector
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.launch.plans.documents import BadInputError, Problem
@@ -190,43 +190,19 @@ def read_alignments(path: Path) -> list[Alignment]:
 
     Raises BadInputError, which names file, line, column and value, and states the remedy.
     """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            rows = [(reader.line_num, row) for row in reader]
-            columns = tuple(reader.fieldnames or ())
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise BadInputError(
-            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
-        ) from error
-    missing = [name for name in COLUMNS if name not in columns]
-    if missing:
-        raise BadInputError([Problem(str(path), (x,), "missing column", "add it") for x in missing])
     problems: list[Problem] = []
     found = []
-    for number, row in rows:
-        where = f"{path}:{number}"
+    for where, row in read_rows(path, COLUMNS):
         side = next((one for one in SIDES if one == (row["eye"] or "").strip()), None)
         if side is None:
             what = f'expected left or right, found "{row["eye"]}"'
             problems.append(Problem(where, ("eye",), what, "name the open eye"))
             continue
-        values = [_parse(where, name, row[name], problems) for name in COLUMNS[1:]]
+        values = [parse_finite(where, name, row[name], problems) for name in COLUMNS[1:]]
         found.append(Alignment(side, 1e-3 * np.array(values[:3]), 1e-3 * np.array(values[3:])))
     if problems:
         raise BadInputError(problems)
     return found
-
-
-def _parse(where: str, name: str, text: str | None, problems: list[Problem]) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        what = f'expected a finite number, found "{text}"'
-        problems.append(Problem(where, (name,), what, "measure this point again, or remove it"))
-    return value
 
 
 def _rest(position: Floats, _time_s: float) -> Floats:

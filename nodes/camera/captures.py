@@ -12,6 +12,7 @@ from __future__ import annotations
 import importlib
 import time
 import warnings
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ def _monotonic_ms(real_time_ns: int) -> float:
     return (real_time_ns - time.time_ns() + time.monotonic_ns()) * 1e-6
 
 
-class CapturedDevice:
+class CapturedDevice(ABC):
     """Base class of captures: stores the requested format, and starts the device on first use.
 
     stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if there is none.
@@ -71,9 +72,9 @@ class CapturedDevice:
         }
         self.started = False
 
+    @abstractmethod
     def _start(self) -> None:
         """Start the device with the format in `wanted`; raises DeviceError."""
-        raise NotImplementedError
 
     def _ensure_started(self) -> None:
         if not self.started:
