@@ -109,7 +109,7 @@ def read_calibration(
     # The parser raises undocumented errors for invalid numbers and dates.
     except (YAMLError, ValueError, RecursionError, TypeError) as error:
         raise CalibrationFileError(
-            f"{path}: not YAML that `{command}` wrote: {str(error)[:200]}"
+            f"{path}: not a valid calibration file: {str(error)[:200]}; run `{command}` again"
         ) from error
     if not isinstance(content, dict) or "version" not in content:
         raise CalibrationFileError(

@@ -226,7 +226,7 @@ def test_a_pair_is_presented_by_the_modulus_of_the_object() -> None:
 def test_the_operator_can_interrupt(tmp_path: Path) -> None:
     presenter, _ = make_presenter(iter(["\n", "\n", "1\n", "\n", "Q\n"]))
     session = open_session(tmp_path)
-    with pytest.raises(ExperimentError, match="the same command continues"):
+    with pytest.raises(ExperimentError, match="run the same command again"):
         asyncio.run(run_session(session, presenter.present, lambda done, total: None))
     assert session.done == open_session(tmp_path).done == 1
 

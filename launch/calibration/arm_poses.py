@@ -223,7 +223,9 @@ def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
     for lens, eye_from_left in ((rig.left, np.eye(4)), (rig.right, rig.right_from_left)):
         in_eye = apply(eye_from_left @ row.left_from_board, points)
         if in_eye[:, 2].min() <= 0.0:
-            raise ArmPosesError(f"{row.name}: the board is behind a camera; check its pose")
+            raise ArmPosesError(
+                f"{row.name}: the board would be behind a camera; check the joints of this row"
+            )
         views.append(CornerView(points, project(in_eye, lens.matrix, lens.distortion)))
     return BoardDetection(row.name, row.joints_rad, views[0], views[1])
 

@@ -149,7 +149,8 @@ def _make_rows(poses: Sequence[HeldPose], side: Side, sheet: SheetSpec) -> list[
     count = len({tuple(row.joints_rad.tolist()) for row in rows})
     if count < MIN_POSES:
         raise EdgeFitError(
-            f"{side} arm: {count} poses have marks on both clamps, at least {MIN_POSES} are needed"
+            f"{side} arm: the marks of both clamps were measured in {count} poses, but at least "
+            f"{MIN_POSES} are needed; record more poses"
         )
     return rows
 

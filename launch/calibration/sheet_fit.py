@@ -273,9 +273,10 @@ def _residuals(
     *,
     fold: bool = False,
 ) -> Floats:
-    """Return the weighted residuals of the used rows: contact forces, then edge forces.
+    """Return the weighted residuals of the pushes that `used` selects: contact and edge forces.
 
-    fold: return instead the larger magnitude of both residuals for every row (n,).
+    The contact forces are first. fold: return instead, for every push (n,), the larger magnitude of
+        its two residuals.
     """
     forces, edges = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])

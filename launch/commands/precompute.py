@@ -62,7 +62,7 @@ def precompute(
 
     if scheduler is not None and skin_spacing_m is None:
         raise typer.BadParameter(
-            "applies to the nonlinear table only; add --skin-spacing",
+            "this option distributes the nonlinear table only; add --skin-spacing to select it",
             param_hint="--scheduler",
         )
     scene = load_scene(scene_file)

@@ -151,7 +151,9 @@ def _make_press(
 def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
     """Make the procedure of the experiment: push at each position, then move in and out.
 
-    method: minimum precision of the soft body's table, which is awaited before the first push.
+    method: least accurate table of the soft body that is accepted. The procedure waits for it
+        before
+        the first push.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:

@@ -103,7 +103,7 @@ def make_hold(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_let_go(scene: Scene, depth_m: float) -> FingerPath:
-    """Push, and withdraw the finger as fast as people do."""
+    """Make a finger path that pushes to `depth_m` and withdraws as fast as a person does."""
     return _make_path(scene, "let-go", _press(depth_m, 1.5, 0.15))
 
 

@@ -82,7 +82,9 @@ class PairPresenter:
         while True:
             answer = (await self._ask(question)).strip().lower()
             if answer == "q":
-                raise ExperimentError("interrupted by the operator; the same command continues")
+                raise ExperimentError(
+                    "interrupted by the operator; run the same command again to continue"
+                )
             if answer in accepted:
                 return answer
 

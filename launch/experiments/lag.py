@@ -49,7 +49,7 @@ def estimate_lag_s(
         )
     numbers = (follower_rows, leader_rows, times_s, leader_s)
     if not all(np.isfinite(values).all() for values in numbers):
-        raise ValueError("times and values must be finite; remove unknown samples")
+        raise ValueError("times and values must be finite; remove samples that are NaN or infinite")
     if not ((np.diff(times_s) > 0.0).all() and (np.diff(leader_s) > 0.0).all()):
         raise ValueError("times of follower and leader must increase; sort the samples")
     if len(times_s) < 8 or times_s[-1] - times_s[0] <= 4.0 * max_lag_s:

@@ -269,10 +269,13 @@ def read_offsets(bag: Path) -> stroke.SampledMotion:
 def split_sheet_error(
     recording: stroke.StrokeRecording, offsets: stroke.SampledMotion, times_ns: Times
 ) -> Floats:
-    """Split the sheet's error into the errors of the stages `STAGES`, (3, n, 3) m.
+    """Split the sheet's error into the contributions of the processing stages `STAGES`.
 
-    The total is the object's point nearest to the true finger, moved inward by the commanded
-    offset, minus the contact point of the true sheet. Vectors are in the object's frame.
+    Returns vectors (stage, sample, xyz) in metres in the object's frame. Their sum is the
+    difference
+    between two points. The first point is the point of the object's surface nearest to the true
+    finger, moved inward by the commanded offset. The second one is the contact point of the true
+    sheet.
     """
     world_from_object = stroke.object_pose(recording.scene)
     object_from_world = inverse(world_from_object)

@@ -124,9 +124,9 @@ class Layout:
         return bool(self.reached.all()) and not self.blocked_paths
 
     def speed_m_per_s(self, fraction: float) -> float:
-        """Return the finger speed that the arms can follow at a fraction of the reached samples.
+        """Return the finger speed that the arms can follow at a fraction of reachable positions.
 
-        fraction: 0 to 1. The result is 0 if no sample is reached.
+        fraction: 0 to 1. The result is 0 if no sampled position is reachable.
         """
         if not self.reached.any():
             return 0.0

@@ -121,7 +121,10 @@ def _bars(one: Interval, y: float) -> list[list[float]] | None:
 
 
 def _draw_errors(axes: Axes, points: Sequence[Mapping[str, Any]]) -> None:
-    """Draw the ratio of each error to its tolerance; the sheet's bar is divided into stages."""
+    """Draw a bar for each error as a ratio to its tolerance.
+
+    The bar of the sheet's error is stacked by the processing stages that contribute to it.
+    """
     width = 0.8 / max(len(points), 1)
     for number, (colour, point) in enumerate(zip(COLOURS, points, strict=False)):
         for column, key in enumerate(ERRORS):

@@ -77,8 +77,8 @@ def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
 def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
     """Return the angle (rad) by which to rotate an axis towards a vector or its opposite.
 
-    The nearer of both directions is used.  Near a singularity the vector is short and the rotation
-    is limited.
+    The nearer one of these two directions is used.  Near a singularity the vector is short and the
+    rotation is limited.
     along, across: components of the vector parallel to the axis, and at +90 degrees from it.
     fixed, near: lengths of the vector.  Up to `fixed`, the axis may deviate by 90 degrees from the
         vector.  From `near` on, the rotation is complete.  In between, the permitted deviation
@@ -326,7 +326,7 @@ class ClosedFormKinematics:
     def _unreachable(
         self, base_from_flange: Floats, solutions: list[tuple[float, ...]]
     ) -> UnreachableError:
-        """Make the error for a pose of which no solution is within the joint ranges."""
+        """Make the error for a pose for which no solution is within the joint ranges."""
         # Adding zero turns a negative zero into zero.
         x, y, z = np.round(base_from_flange[:3, 3] * 1e3) + 0.0
         where = f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base"
@@ -414,7 +414,10 @@ class ClosedFormKinematics:
         return joints
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return, by singularity, the margins (n,) of joints (n, 6) from its minimum distance."""
+        """Return by how much joints (n, 6) exceed the minimum distance from each singularity, (n,).
+
+        A margin is negative if the joints are nearer to the singularity than permitted.
+        """
         joints = np.asarray(joints_rad, dtype=np.float64)
         elbow = np.remainder(joints[..., 2] - self.elbow_rad + 0.5 * pi, pi) - 0.5 * pi
         wrist = np.remainder(joints[..., 4] + 0.5 * pi, pi) - 0.5 * pi

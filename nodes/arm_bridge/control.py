@@ -233,8 +233,9 @@ class ArmControl:
     def on_answer_missed(self, text: str) -> bool:
         """Tolerate one exchange without an answer; return False for a second one in a row.
 
-        text: reason for the operator.  The arm's own watchdog stops the arm if the gap becomes too
-        long.  The next command continues from this one.
+        text: reason, which is shown to the operator. The arm's own watchdog stops the arm if it
+            receives
+        no command for too long. The next command continues from the one that was not answered.
         """
         if self._missed or self.measured_rad is None:
             return False
@@ -651,7 +652,11 @@ class ArmControl:
     def _align(
         self, alignment: Alignment, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Continue the alignment unless this arm is late or waits; end it when it is complete."""
+        """Command the next step of this arm's alignment to the path; end the alignment at its goal.
+
+        The alignment's time stands still while an input is late or while this arm waits for the
+        other.
+        """
         if self._state is State.FOLLOW and self._together:
             self._aligned_s += step_s
         goal_rad = alignment.joints_at(self._aligned_s)

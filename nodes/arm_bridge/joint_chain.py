@@ -190,8 +190,9 @@ class NumericKinematics:
         beyond = np.maximum(self._lowest - found, found - self._highest)
         if (worst := int(beyond.argmax())) >= 0 and beyond[worst] > 0.0:
             raise UnreachableError(
-                f"{where}: J{worst + 1} would be at {degrees(found[worst]):.1f} degrees, its range "
-                f"is {degrees(self._lowest[worst]):.0f} to {degrees(self._highest[worst]):.0f}",
+                f"{where}: J{worst + 1} would be at {degrees(found[worst]):.1f} degrees, but "
+                f"its range is {degrees(self._lowest[worst]):.0f} to "
+                f"{degrees(self._highest[worst]):.0f}",
                 f"J{worst + 1}",
             )
         smallest = float(self._singular_values(joints)[0])

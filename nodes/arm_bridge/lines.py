@@ -94,12 +94,15 @@ class LineLink(ConnectedLink):
                 line = await reader.readline()
         except TimeoutError as error:
             raise ArmSilentError(
-                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
+                f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms; "
+                "check the controller and the network cable"
             ) from error
         except (OSError, ValueError) as error:
             raise ArmAnswerError(f"answer of {self.host}:{self.port}: {error}") from error
         if not line.endswith(b"\n"):
-            raise ArmSilentError(f"{self.host}:{self.port} has closed the connection")
+            raise ArmSilentError(
+                f"{self.host}:{self.port} has closed the connection; check the controller"
+            )
         return decode_line(line, self._sequence)
 
     def _disconnect(self) -> None:

@@ -368,7 +368,10 @@ def _shifted(
 def _sample_path(
     left: ArmGeometry, right: ArmGeometry, corners: Sequence[SheetMotion], begin: PathStep
 ) -> list[PathStep]:
-    """Sample a path through all corners so densely that no joint jumps; raises PathError."""
+    """Sample a path through the given sheet motions so densely that no joint jumps.
+
+    Raises PathError if an arm cannot reach a sample or a joint would jump.
+    """
     track = [begin]
     for number, (near, far) in enumerate(pairwise(corners)):
         fraction, step = 0.0, 0.25

@@ -239,7 +239,10 @@ class CameraReader:
         return self._make_pair(frames)
 
     def _by_stamp(self) -> bool:
-        """Return whether the drivers' timestamps are used; this is the same for all cameras."""
+        """Return whether images are paired by the drivers' timestamps instead of their arrival.
+
+        All cameras use the same kind of time.
+        """
         return all(stream.trusts_stamps for stream in self._streams)
 
     def _exposure_ns(self, frame: CapturedFrame) -> int:

@@ -181,7 +181,7 @@ class EyeViewRequester:
 
     @property
     def label(self) -> str:
-        """Return the label of the newest request, by which its frame and image are recognized."""
+        """Return the label of the newest view request, which the frame that answers it repeats."""
         return f"console {self._number}"
 
     @property

@@ -52,7 +52,10 @@ class SurfacePicker:
         )
 
     def offset_point(self, near: Floats, depth_m: float) -> Floats:
-        """Return the point `depth_m` below the surface near `near`; negative: above it."""
+        """Return the point `depth_m` below the surface point nearest to `near`.
+
+        A negative depth gives a point above the surface.
+        """
         found = self._shape.closest(apply(self._object_from_world, near))
         inside = found.point - depth_m * found.normal
         return self._within(apply(self._world_from_object, inside))

@@ -112,7 +112,7 @@ class FilledNodes:
 
 
 def interpolate_nodes(job: FillJob) -> FilledNodes:
-    """Interpolate the snapshots at the nodes of a job."""
+    """Interpolate the snapshots (solved pushes) at each sample point of the table in `job`."""
     interpolator = job.source.make_interpolator()
     moved, force, reached = zip(
         *(interpolator.interpolate(sample, job.rest) for sample in job.samples), strict=True

@@ -172,7 +172,10 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
 
 
 def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Floats:
-    """Return a body's pose after `duration_s` with a constant twist (velocity of its origin)."""
+    """Return a body's pose after moving for `duration_s` with a constant twist.
+
+    twist_world (6,): velocity of the body's origin (m/s), then angular velocity (rad/s).
+    """
     rotation = rotation_from_vector(twist_world[3:] * duration_s) @ world_from_body[:3, :3]
     return transform(rotation, world_from_body[:3, 3] + twist_world[:3] * duration_s)
 

@@ -284,7 +284,10 @@ def render_force(
 def _indentation_for_edge_force(
     model: SheetForceModel, edge_force_n: float, push: SheetPush, *, max_depth_m: float
 ) -> float:
-    """Return the indentation (m) with this force on each clamp; 0 if the flat sheet exceeds it."""
+    """Return the indentation (m) at which the force on each clamp is `edge_force_n`.
+
+    The result is 0 if the force is already larger without indentation.
+    """
     grid = 2.0 * max_depth_m * DEPTH_FRACTIONS[1:]
     flat = _flat_edge_force_n(model, push.stretch_ratio)
     if flat >= edge_force_n:

@@ -56,7 +56,10 @@ class DisplayLatencyEstimator:
         return drawn_ns + self._light_ns
 
     def record_shown(self, begun_ns: int, drawn_ns: int, swapped_ns: int) -> int:
-        """Record a frame that a window showed at `swapped_ns`, and return its display time."""
+        """Record a frame that a window showed at `swapped_ns`; return when its light appears (ns).
+
+        begun_ns, drawn_ns: times at which drawing began and ended.
+        """
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(swapped_ns - begun_ns)
         self._last_swap_ns = swapped_ns

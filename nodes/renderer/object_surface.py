@@ -238,7 +238,7 @@ class DeformationTransfer:
         if displacement.shape != self._skin.shape:
             raise ValueError(
                 f"soft_body.displacement_world_m: expected {len(self._skin)} vertices as in the "
-                f"skin, found {len(displacement)}"
+                f"skin, found {len(displacement)}; run renderer and solver with the same scene"
             )
         moves = self._moves
         moves[:, :3] = displacement

@@ -41,9 +41,9 @@ class ScreenRectangle:
 
     @property
     def clip_from_screen(self) -> Floats:
-        """Return the matrix (3, 3) from (x, y, 1) on the screen to OpenGL clip (x, y, w).
+        """Return the matrix (3, 3) from screen coordinates (x, y, 1) to OpenGL clip coordinates.
 
-        It maps the rectangle to the whole image.
+        It maps the visible rectangle of the screen to the whole image.
         """
         return np.array(
             [

@@ -361,7 +361,8 @@ def _read_recording(csv_path: Path) -> Floats:
             )
         if rows and row[0] <= rows[-1][0]:
             raise FingerPathError(
-                f"{csv_path}: line {number}: t_s does not increase; sort or delete the line"
+                f"{csv_path}: line {number}: t_s does not increase; sort the lines by t_s "
+                "or delete this line"
             )
         rows.append(row)
     if len(rows) < 2:

@@ -154,9 +154,10 @@ def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices
 
 
 def _strip(rows: int, around: int) -> Indices:
-    """Return the triangles between successive closed rows of `around` vertices each.
+    """Return the triangles between successive rings of `around` vertices each.
 
-    They face outward if the rows are ordered along +x, and their vertices as in `_turned`.
+    They face outward if the rings are ordered along +x and the vertices of a ring from +z towards
+    +y.
     """
     i, j = (v.ravel() for v in np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij"))
     here, beside = i * around + j, i * around + (j + 1) % around

@@ -71,7 +71,7 @@ class Spread:
         self.longest_s = 0.0
 
     def add(self, index: int, duration_s: float) -> None:
-        """Add a duration to an interval; shorter ones than `MIN_DURATION_S` count as this."""
+        """Add a duration to interval `index`; at least `MIN_DURATION_S` is counted."""
         self.longest_s = max(self.longest_s, duration_s)
         cell = CELLS_PER_DECADE * log10(max(duration_s, MIN_DURATION_S) / MIN_DURATION_S)
         self.counts[index, min(int(cell), CELLS - 1)] += 1
