@@ -183,7 +183,10 @@ class ClosedFormKinematics:
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return by how much (n,) the wrist centres of poses (n, 4, 4) are within reach, m."""
+        """Return the distances (n,) of poses (n, 4, 4) from the limit of the arm's reach, m.
+
+        A distance is positive if the wrist centre is within the reach.
+        """
         wrist = base_from_flange[:, :3, 3] - self._flange_m * base_from_flange[:, :3, 2]
         away = np.linalg.norm(wrist - [0.0, 0.0, self._shoulder_m], axis=1)
         return np.asarray(self.max_wrist_m - away)
@@ -428,7 +431,10 @@ class ClosedFormKinematics:
         }
 
     def _out(self, joints: Floats) -> Floats:
-        """Return how far (m) the wrist centre is in front of the axis of J1; negative: behind."""
+        """Return how far (m) the wrist centre is from the axis of J1 in the arm's plane.
+
+        The distance is negative if the wrist centre is behind the axis.
+        """
         q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
         return np.asarray(
             self._upper_m * np.sin(q2) - self._shift_m * np.cos(q23) + self._forearm_m * np.sin(q23)

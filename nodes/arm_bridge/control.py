@@ -233,9 +233,9 @@ class ArmControl:
     def on_answer_missed(self, text: str) -> bool:
         """Tolerate one exchange without an answer; return False for a second one in a row.
 
-        text: reason, which is shown to the operator. The arm's own watchdog stops the arm if it
-            receives
-        no command for too long. The next command continues from the one that was not answered.
+        The arm's own watchdog stops the arm if it receives no command for too long. The next
+        command continues from the one that was not answered.
+        text: reason, which is shown to the operator.
         """
         if self._missed or self.measured_rad is None:
             return False

@@ -80,11 +80,18 @@ class ArmKinematics(Protocol):
         ...
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return by how much (n,) poses (n, 4, 4) are within the reach of the arm, m."""
+        """Return the distances (n,) of poses (n, 4, 4) from the limit of the arm's reach, m.
+
+        A distance is positive within the reach.
+        """
         ...
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return, by singularity, the margins (n,) of joints (n, 6) from its minimum distance."""
+        """Return by how much joints (n, 6) exceed the minimum distance from each singularity, (n,).
+
+        The result has one array for each kind of singularity. A margin is negative if the joints
+        are nearer to the singularity than permitted.
+        """
         ...
 
 
