@@ -267,7 +267,7 @@ def _unchanged(fields: Fields) -> Fields:
 
 
 class _Comparison:
-    """The schema is damaged: it is not a JSON Schema, or it contains itself."""
+    """Comparison of a recorded JSON Schema with the current one, part by part."""
 
     def __init__(self, old_parts: Schema, new_parts: Schema) -> None:
         self._old_parts, self._new_parts = old_parts, new_parts

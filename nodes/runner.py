@@ -184,7 +184,10 @@ class NodeTransport:
         self._stop_socket.open()
 
     def _end_input(self, node: Node, port: str) -> None:
-        """Mark a watched input as ended; if the node requires it, disconnect its readers too."""
+        """Record that the writer of a watched input has ended.
+
+        If the node cannot work without it, also disconnect the readers of the node's outputs.
+        """
         node.inputs[port].has_ended = True
         if not node.ends_with_inputs or self._has_failed.is_set():
             return

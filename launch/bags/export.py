@@ -272,7 +272,7 @@ def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
 
 
 def wall_clock_offset_ns(reader: BagReader) -> int | None:
-    """Return what to add to a recorded time to count from 1970, ns; None if it is unknown."""
+    """Return the time since 1970 minus the recorded time, ns; None if it is unknown."""
     recording = reader.metadata.get("recording", {})
     try:
         started = datetime.fromisoformat(recording["started"])

@@ -194,7 +194,7 @@ class CornerFinder:
 
 
 def _measure_spacing(pixels: Floats) -> Floats:
-    """Corners in one line do not determine a pose."""
+    """Return the distance (n,) of each corner (n, 2) from the nearest other corner, px."""
     distances = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
     np.fill_diagonal(distances, np.inf)
     return np.asarray(distances.min(axis=1))

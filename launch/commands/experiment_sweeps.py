@@ -97,8 +97,7 @@ def robustness(
 
     For each seed, the true parameters of the simulated hardware are sampled within tolerances. A
     separate process runs a graph with one stroke; image and force are evaluated at rest, without a
-    graph. To continue an interrupted command, repeat it with the same
-    --output.
+    graph. To continue an interrupted command, repeat it with the same --output.
     """
     from flexsheet.launch.experiments import robustness as experiment
     from flexsheet.nodes.twin.tolerance_table import Profile
@@ -188,8 +187,7 @@ def sensitivity(
     """Measure the errors that each inaccurate hardware parameter causes alone.
 
     Each parameter deviates by 1 and 3 standard deviations in both directions. Without --graph, all
-    are evaluated at rest. To continue an interrupted command, repeat it with the same
-    --output.
+    are evaluated at rest. To continue an interrupted command, repeat it with the same --output.
     """
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments import sensitivity as experiment

@@ -409,16 +409,16 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
         if not press.holds:
             moving = list(_evaluate_moving(reference, press, begin_ns, end_ns))
     errors = np.abs([row["error_percent"] for row in resting])
-    judged = [row for row in resting if row["reference_n"] is not None]
+    compared = [row for row in resting if row["reference_n"] is not None]
     errors_moving = 100.0 * np.array([one.error_ratio for one in moving])
     return {
         "rows": resting,
         "reference": "independent finite elements (benchmarks.force_reference)"
-        if judged
+        if compared
         else "the soft body's own force, because no independent solution fits the scene",
         "median_percent": float(np.median(errors)),
         "worst_percent": float(errors.max()),
-        "against_reference": _summarize_judged(judged),
+        "against_reference": _summarize_against_reference(compared),
         "methods": sorted({row["method"] for row in resting}),
         "target_percent": 100.0 * TARGET_ERROR_RATIO,
         "noticed_percent": [100.0 * WEBER_RATIO, 100.0 * WEBER_RATIO_BARE],
@@ -459,7 +459,7 @@ def _evaluate_moving(
             yield sample
 
 
-def _summarize_judged(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def _summarize_against_reference(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return median and maximum error (%) of each position, over rows with a reference."""
     result = []
     for place in dict.fromkeys(row["at"] for row in rows):

@@ -390,8 +390,8 @@ def run_follow(
 ) -> dict[str, Any]:
     """Follow a finger path; return the results of `experiment follow --json`.
 
-    bag: file in which to record the running graph; None to follow the
-    path in simulated time, which needs no running graph.
+    bag: file in which to record the running graph; None to follow the path in simulated time, which
+        needs no running graph.
     """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
     scene, truth = require_scene(plan), plan.apparatus_message()

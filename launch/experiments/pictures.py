@@ -160,10 +160,10 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
                 markersize=3,
                 label=f"felt, moving at {result['moving']['speed_mm_per_s']:.0f} mm/s",
             )
-        judged = [row for row in rows if row["reference_n"] is not None]
+        compared = [row for row in rows if row["reference_n"] is not None]
         panel.plot(
-            [row["depth_mm"] for row in judged],
-            [row["reference_n"] for row in judged],
+            [row["depth_mm"] for row in compared],
+            [row["reference_n"] for row in compared],
             "x",
             color="0.2",
             label="independent reference",

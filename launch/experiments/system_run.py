@@ -1,9 +1,8 @@
 """Run one configuration of the graph, and measure its speed and all of its errors.
 
 The finger strokes around the object, pushes its front and stays at rest for two images of the
-simulated eye. Processor time and
-latency are measured during the stroke. All errors are computed from the bag, relative to the
-simulator's ground truth, by the code of the other experiments.
+simulated eye. Processor time and latency are measured during the stroke. All errors are computed
+from the bag, relative to the simulator's ground truth, by the code of the other experiments.
 """
 
 from __future__ import annotations

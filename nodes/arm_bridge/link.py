@@ -79,7 +79,7 @@ FAULT_TEXTS = {
 
 
 class Freshness(StrEnum):
-    """Whether measured joints are new, judged by the counters in the controller's answer."""
+    """Whether measured joints are new, according to the counters in the controller's answer."""
 
     FIRST = "first"
     """This is the first answer since the start of the link or of the controller."""

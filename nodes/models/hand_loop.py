@@ -141,7 +141,10 @@ def make_loop_matrices(
 def compute_decays_per_s(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the decay rate (k,) of the slowest mode for each slope, 1/s; negative: it grows."""
+    """Return the decay rate (k,) of the slowest mode for each slope, 1/s.
+
+    A negative rate means that the mode grows.
+    """
     matrices = make_loop_matrices(
         hand, loop, sheet_stiffness_n_per_m=sheet_stiffness_n_per_m, slopes=slopes
     )

@@ -37,7 +37,7 @@ class ResidualMonitor:
 
     @property
     def has_data(self) -> bool:
-        """Return whether the mean covers enough time to be judged."""
+        """Return whether the mean covers enough time to be compared with the threshold."""
         return self._weight_s >= 0.5 * self._memory_s
 
     @property

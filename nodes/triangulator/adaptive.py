@@ -232,7 +232,8 @@ def _stack_gains(interval: int, noises: tuple[int, int, int], index: int) -> Flo
 def find_gains(dt: float, variances: list[float], points: int) -> Floats:
     """Return the Kalman gains (models, 5, 3) for a frame interval and the noise of three axes.
 
-    dt: frame interval, s.  variances: of the measurement noise, m^2, one value for each axis.
+    dt: frame interval, s.
+    variances: variance of the measurement noise on each of the three axes, m^2.
     points: number of points in the track, at least two.
 
     The first call for an interval or a variance solves its Riccati equations, which takes some

@@ -398,7 +398,10 @@ class ArmServer:
     def __init__(
         self, controller: Controller, *, host: str, port: int, before: Callable[[], None]
     ) -> None:
-        """`before` is called before each request; it must call `controller.advance`."""
+        """Store the settings; `start` opens the port.
+
+        before: function called before each request; it must call `controller.advance`.
+        """
         self.controller = controller
         self._address = (host, port)
         self._before = before

@@ -81,7 +81,7 @@ class Path(Protocol):
 
     @property
     def begins_s(self) -> float:
-        """Time, zero or less, at which the finger leaves the first point.
+        """Return the time (s, at most 0) at which the finger leaves the first point.
 
         The reach to the path must have ended by then.
         """

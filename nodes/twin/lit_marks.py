@@ -52,7 +52,10 @@ class LitMarks:
     """
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
-        """scene: the scene with the true devices."""
+        """Store the devices.
+
+        scene: scene with the true devices. apparatus: their deviations from the nodes' scene.
+        """
         self._scene, self._apparatus = scene, apparatus
         self._late_ns = (
             0 if apparatus is None else round(1e9 * apparatus.projector.latency_offset_s)

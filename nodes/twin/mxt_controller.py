@@ -294,7 +294,10 @@ class MxtController:
         return [round(float(one)) for one in balance + self._stuck_percent]
 
     def _seen(self, what: int) -> Floats:
-        """Return joints (6,): 0: the set-point; 1: the filtered set-point; 2: the measurement."""
+        """Return the joints (6,) of one kind.
+
+        what: 0 for the set-point, 1 for the filtered set-point, 2 for the measurement.
+        """
         noise = self._noise_rad * self._random.standard_normal(6)
         return (self.wanted_rad, self._filtered_rad, self.servo.joints_rad + noise)[what]
 
@@ -305,7 +308,10 @@ class MxtServer:
     def __init__(
         self, controller: MxtController, *, host: str, port: int, before: Callable[[], None]
     ) -> None:
-        """`before` is called before each packet and cycle; it must call `controller.advance`."""
+        """Store the settings; `start` opens the port.
+
+        before: function called before each packet and cycle; it must call `controller.advance`.
+        """
         self.controller = controller
         self._address = (host, port)
         self._before = before
