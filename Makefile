@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 DEV_STAMP := $(VENV)/.installed-dev
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check
 LOCK := build/pip-tools
-# Of the tests: one more than cores, because some tests wait for other processes.
+# Number of parallel test processes: one more than cores, because some tests wait for others.
 WORKERS = $$(($$(nproc) + 1))
 SKIPPED := $(CURDIR)/build/skipped.txt
 SOURCES := flexsheet messages nodes launch benchmarks website
@@ -17,13 +17,13 @@ SITE_STAMP := $(SITE_VENV)/.installed
 	pages charts \
 	docs lock release clean
 
-# What runs; what tests and checks comes with `make test` and `make lint`.
+# Install what is needed to run; `make test` and `make lint` install the development packages.
 setup: $(STAMP)
 	@$(BIN)/python -m tests.system_packages
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
-		{ echo "Python 3.11 or newer is needed; say which: make PYTHON=python3.11 ..." >&2; exit 1; }
+		{ echo "Python 3.11 or newer is needed; name it: make PYTHON=python3.11 ..." >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
 $(STAMP): requirements.lock pyproject.toml | $(BIN)/python
@@ -36,8 +36,8 @@ $(DEV_STAMP): requirements-dev.lock $(STAMP)
 	$(INSTALL) --require-hashes -r requirements-dev.lock
 	@touch $@
 
-# All locks anew, after a change of pyproject.toml or website/requirements.in; what is pinned stays
-# where it may.
+# Write all lock files again, after a change of pyproject.toml or website/requirements.in. Pinned
+# versions are kept where possible.
 lock:
 	$(PYTHON) -m venv $(LOCK)
 	$(LOCK)/bin/pip install --quiet --disable-pip-version-check pip-tools
@@ -52,7 +52,7 @@ compile = $(LOCK)/bin/pip-compile --quiet --generate-hashes --allow-unsafe $(1) 
 demo: setup
 	$(BIN)/flexsheet demo
 
-# A page in the browser, to touch the object with the mouse.
+# Open a page in the browser, and touch the object with the mouse.
 try: setup
 	$(BIN)/flexsheet try
 
@@ -62,16 +62,16 @@ lint: $(DEV_STAMP)
 	$(BIN)/python -m tests.check_words
 	$(BIN)/mypy
 
-# Results that tests would otherwise compute in each of their processes: the sheet's deflection
-# shapes, and the bytecode of the package and of the tests, whose assertions pytest rewrites.
+# Compute results that each test process would otherwise compute: the sheet's deflection shapes,
+# and the bytecode of the package and the tests, whose assertions pytest rewrites.
 cached: $(DEV_STAMP)
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m compileall -q $(SOURCES)
 	$(BIN)/flexsheet precompute launch/scenes/cylinder.yaml
 	PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --collect-only -qq > /dev/null || true  # the tests report errors
 
-# Threads of BLAS would only spin against the processes that tests start.  Tests that keep time with
-# other processes have the machine for themselves; the others share its cores.  Both parts run, even
-# if the first fails; the last lines say what was skipped in either, and why.
+# Tests marked `alone` depend on timing and run one at a time; the others run in parallel. Both parts
+# run, even if the first fails. The last lines list the skipped tests with the reasons. BLAS uses one
+# thread, because more would compete with the processes that tests start.
 test: $(DEV_STAMP)
 	@$(BIN)/python -m tests.system_packages --tests
 	@mkdir -p build && : > $(SKIPPED)
@@ -87,8 +87,7 @@ test: $(DEV_STAMP)
 	else echo "no test was skipped"; fi; \
 	exit $$status
 
-# What is too long for `make test`: studies, and property tests with more examples, drawn at
-# random.
+# Tests that are too long for `make test`: studies, and property tests with more random examples.
 test-long: $(DEV_STAMP) cached
 	@status=0; \
 	export OPENBLAS_NUM_THREADS=1; set -x; \
@@ -97,7 +96,7 @@ test-long: $(DEV_STAMP) cached
 		--numprocesses $(WORKERS) --dist worksteal $$(grep -l @given tests/test_*.py) || status=$$?; \
 	exit $$status
 
-# Longer than the tests: the figures of docs/results.md.
+# Measure the figures in docs/results.md.
 bench: setup $(DEV_STAMP)
 	$(BIN)/python -m benchmarks.messaging
 	$(BIN)/python -m benchmarks.image_correction
@@ -110,48 +109,48 @@ bench: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_regret --output docs/charts
 
-# Frame time, frames per second and lag with this machine's graphics card, as a point of docs/charts;
-# exit code 3 without one.
+# Measure frame time, frame rate and lag with the graphics card, and add them to docs/charts. Exit
+# code 3: the machine has no graphics card.
 bench-gpu: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.frame_rate --output docs/charts
 
-# Other messaging libraries in turns with ours (a network of its own: root).
+# Compare with other messaging libraries, in a separate network namespace (requires root).
 bench-peers: setup
 	$(INSTALL) --no-build-isolation -e '.[peers]'
 	$(BIN)/python -m benchmarks.messaging_peers
 
-# Kills, cuts and spoils everything between three computers (network namespaces: root).
+# Kill processes, and cut and disturb connections between three simulated computers (requires root).
 faults: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.faults
 
-# docs/deploy.md, typed on three computers that are namespaces (root).
+# Execute the commands of docs/deploy.md on three simulated computers (requires root).
 deploy-trial: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.deploy_trial
 
-# An hour of strokes and pushes: what grows, drifts or is lost (docs/soak.md).
+# Run strokes and pushes for an hour, to find leaks, drift and losses (docs/soak.md).
 soak: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soak
 
-# Five minutes for each of what reads bytes from outside; what it needs more is installed first.
+# Fuzz every decoder of external data for five minutes each; installs the fuzzer first.
 fuzz: setup
 	$(INSTALL) --no-build-isolation -e '.[fuzz]'
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fuzz
 
-# What docs/limits.md summarises: tables and pictures.
+# Measure the tables and pictures that docs/limits.md summarizes.
 limits: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_limits
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
-# The figures of pages from docs/results, and the drawings of docs/images.
+# Insert figures from docs/results into the pages, and draw docs/images.
 pages: setup
 	$(BIN)/python -m website.pages
 
-# docs/charts: every method of every family, on this machine; half an hour.
+# Measure every method of every family for docs/charts; takes half an hour.
 charts: setup
 	$(BIN)/flexsheet chart --output docs/charts
 
-# Tunes all shipped scenes, best on an idle machine; hours.  Scenes and strokes that are finished in
-# runs/tune are not repeated, so an interrupted command continues.
+# Tune all shipped scenes on an idle machine; takes hours. An interrupted command continues, because
+# finished scenes and strokes in runs/tune are not repeated.
 tune-scenes: setup
 	@mkdir -p runs/tune; status=0; \
 	for scene in launch/scenes/*.yaml; do \
@@ -162,12 +161,12 @@ tune-scenes: setup
 		case $$code in 0|3) mv $$folder.part $$folder.json ;; *) status=1 ;; esac; \
 	done; exit $$status
 
-# Errors, latency and safety against load; an interrupted command continues (network: root).
+# Measure errors, latency and safety against load (requires root). An interrupted command continues.
 load: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.load --output runs/load
 
-# The site, with the generated reference tables and charts: open site/index.html.  Its generator is no part of the program, so it has an environment
-# of its own.
+# Build the documentation site, site/index.html, with the generated reference tables and charts. The
+# generator has a separate virtual environment.
 $(SITE_STAMP): website/requirements.lock
 	$(PYTHON) -m venv $(SITE_VENV)
 	$(SITE_VENV)/bin/pip install --quiet --disable-pip-version-check --require-hashes \
@@ -179,8 +178,8 @@ docs: setup $(SITE_STAMP)
 	$(SITE_VENV)/bin/python -m zensical build --clean --strict
 	$(SITE_VENV)/bin/python -m website.finish site
 
-# dist/: source archive, wheel and checksums of the version in pyproject.toml.  The wheel is built
-# from the archive, so that both are complete.
+# Write source archive, wheel and checksums to dist/. The wheel is built from the archive, which
+# shows that the archive is complete.
 BUILD = $(CURDIR)/$(BIN)/python -c "import sys; from setuptools import build_meta; \
 	getattr(build_meta, sys.argv[1])(sys.argv[2])"
 release: setup

@@ -1,7 +1,7 @@
-// Browsers give pages that are opened as files no workers, and the search needs one: here its
-// script runs in a hidden frame instead, with a worker's messages, which are copies.
+// The search needs a web worker, which browsers refuse to pages opened from files. Run its script
+// in a hidden frame instead, and copy the messages as for a worker.
 if (location.protocol === "file:") {
-  const told = (data) => new MessageEvent("message", { data: structuredClone(data) })
+  const makeEvent = (data) => new MessageEvent("message", { data: structuredClone(data) })
 
   window.Worker = class extends EventTarget {
     constructor(url) {
@@ -12,7 +12,7 @@ if (location.protocol === "file:") {
       document.body.append(this.frame)
       const inside = this.frame.contentWindow
       inside.postMessage = (data) => {
-        const event = told(data)
+        const event = makeEvent(data)
         this.dispatchEvent(event)
         this.onmessage?.(event)
       }
@@ -23,7 +23,7 @@ if (location.protocol === "file:") {
     }
 
     postMessage(data) {
-      const event = told(data)
+      const event = makeEvent(data)
       this.ready.then(() => this.frame.contentWindow?.dispatchEvent(event))
     }
 
