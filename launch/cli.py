@@ -94,6 +94,18 @@ Python's handler raises KeyboardInterrupt, and they clean up.
 """
 
 
+ROS_COMMANDS = {
+    "interface": "`flexsheet topic info TOPIC` prints the fields of a topic's messages",
+    "action": "flexsheet has topics only; see `flexsheet topic list`",
+    "component": "the launch file assigns nodes to processes; see docs/nodes-and-processes.md",
+    "pkg": "`flexsheet node types` lists the node types",
+    "rqt": "`flexsheet view` shows a running graph in Foxglove",
+    "rviz2": "`flexsheet view` shows a running graph in Foxglove",
+    "tf": "`flexsheet view` shows the transforms in Foxglove",
+}
+"""Commands of ROS 2 that flexsheet lacks, with what to use instead."""
+
+
 class CommandTable(Mapping[str, Any]):
     """Read-only table of commands by name; imports each command on first use."""
 
@@ -117,6 +129,8 @@ class CommandGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command, and restore Python's SIGINT handler for commands that need it."""
+        if args and (instead := ROS_COMMANDS.get(args[0])):
+            raise CommandError(f'no command "{args[0]}"; {instead}', BAD_INPUT)
         found = super().resolve_command(ctx, args)
         if found[0] not in INTERRUPTED_AT_ONCE:
             signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -9,8 +9,8 @@ MAX_LOAD_RATIO = 1.5
 """Maximum load per core, used if a computer cannot measure how long its nodes wait."""
 
 BUSY_REMEDY = (
-    "end other programs, give the graph more cores, or start fewer nodes; "
-    "started as root, the simulated arms have priority (docs/launch-files.md, nice)"
+    "the arms may pause meanwhile; end other programs, give the graph more cores, start fewer "
+    "nodes, or start the graph as root, which gives the simulated arms priority"
 )
 
 

@@ -86,5 +86,6 @@ def node_class(name: str) -> type[Node]:
     if not class_name:
         near = get_close_matches(name, NODES, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; known nodes: {', '.join(NODES)}"
+        hint += '; name a node of your own as "module:Class"'
         raise UnknownNodeError(f'unknown node type "{name}"{hint}')
     return getattr(import_module(module_name), class_name)  # type: ignore[no-any-return]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from concurrent.futures import Executor, ProcessPoolExecutor
 from multiprocessing import get_context
 
@@ -21,6 +22,15 @@ def priority_in(workers: Executor) -> tuple[int, int]:
 def test_a_background_process_has_the_lowest_priority() -> None:
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=enter_background) as workers:
         assert priority_in(workers) == (MAX_NICE, os.SCHED_BATCH)
+
+
+def test_ctrl_c_does_not_interrupt_the_workers_of_a_soft_bodys_table() -> None:
+    """The terminal sends SIGINT to all of its processes; the node stops its workers itself."""
+    with local_processes(1) as workers:
+        worker = workers.submit(os.getpid).result()
+        job = workers.submit(sum, range(20_000_000))
+        os.kill(worker, signal.SIGINT)
+        assert job.result() == sum(range(20_000_000))
 
 
 def test_workers_of_a_soft_bodys_table_are_background_processes() -> None:

@@ -646,3 +646,8 @@ def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
     }  # fmt: skip
     again = flexsheet("chart", "--redraw", "--output", tmp_path, "--json").json()
     assert [one["family"] for one in again] == ["triangulation"]
+
+
+def test_a_command_of_ros_2_names_its_replacement(flexsheet: Command) -> None:
+    said = flexsheet("interface", "show", "Fingertip")
+    assert (said.code, "topic info TOPIC" in said.err) == (2, True)

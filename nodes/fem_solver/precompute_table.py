@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import (
@@ -118,6 +119,8 @@ stop_requested: ContextVar[Callable[[], bool]] = ContextVar("stop_requested", de
 
 
 def _init_worker(stop: Event) -> None:
+    # Ctrl-C reaches all processes of a terminal, but the parent process stops its workers itself.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     enter_background()
     threading.Thread(target=_exit_on, args=(stop,), name="stop", daemon=True).start()
 
