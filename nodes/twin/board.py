@@ -54,13 +54,13 @@ class Light:
     """Uneven illumination of an image, and the background behind the board.
 
     gain: factor at the image centre. slope_x, slope_y: relative change from there to the right and
-    the lower edge. room: background levels (height, width).
+    the lower edge. background: its levels (height, width).
     """
 
     gain: float
     slope_x: float
     slope_y: float
-    room: Singles
+    background: Singles
 
 
 class TwinBoard:
@@ -84,13 +84,13 @@ class TwinBoard:
         """
         height, width = self.camera.height_px, self.camera.width_px
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-        middle = slopes_of(lens, pixels.astype(np.float64))
-        down, right = np.gradient(middle, axis=(0, 1))
+        centre_rays = slopes_of(lens, pixels.astype(np.float64))
+        down, right = np.gradient(centre_rays, axis=(0, 1))
         offsets = (np.arange(RAYS) + 0.5) / RAYS - 0.5
         rays = np.empty((RAYS * height, RAYS * width, 2), np.float32)
         for row, y in enumerate(offsets):
             for column, x in enumerate(offsets):
-                rays[row::RAYS, column::RAYS] = middle + x * right + y * down
+                rays[row::RAYS, column::RAYS] = centre_rays + x * right + y * down
         return rays
 
     def corners(self, left_from_board: Floats) -> tuple[Floats, Floats]:
@@ -145,8 +145,8 @@ class TwinBoard:
         gain, slope_x, slope_y = self._random.uniform([0.85, -0.2, -0.2], [1.1, 0.2, 0.2])
         coarse = self._random.standard_normal((12, 16), dtype=np.float32)
         size = (self.camera.width_px, self.camera.height_px)
-        room = ROOM_LEVEL + 12.0 * cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC)
-        return Light(gain, slope_x, slope_y, np.clip(room, 5.0, 90.0).astype(np.float32))
+        background = ROOM_LEVEL + 12.0 * cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC)
+        return Light(gain, slope_x, slope_y, np.clip(background, 5.0, 90.0).astype(np.float32))
 
     def _outline(self) -> Floats:
         """Return points (n, 3) along the edge of the board with its border, in its frame."""
@@ -168,7 +168,7 @@ class TwinBoard:
 
     def _drawn(self, rays: Singles, eye_from_board: Floats, light: Light) -> Singles:
         height, width = self.camera.height_px, self.camera.width_px
-        levels = light.room.copy()
+        levels = light.background.copy()
         in_eye = apply(eye_from_board, self._outline())
         lens = self.camera.left if rays is self._rays[0] else self.camera.right
         outline = pixels_of(lens, in_eye[:, :2] / in_eye[:, 2:])
@@ -230,9 +230,9 @@ class TwinBoard:
         (most of a ChArUco board).
         """
         board = self.board
-        middle = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
+        board_centre = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
         height_m = (board.rows + 1 + 2 * BORDER_SQUARES) * board.square_m
-        ways = [(0, 0), (-1, -1), (1, -1), (1, 1), (-1, 1), (-1, 0), (1, 0), (0, -1), (0, 1)]
+        directions = [(0, 0), (-1, -1), (1, -1), (1, 1), (-1, 1), (-1, 0), (1, 0), (0, -1), (0, 1)]
         nearer = 1.0 if board.kind == "chessboard" else CHARUCO_NEARER
         poses: list[Floats] = []
         for number in range(count):
@@ -244,12 +244,14 @@ class TwinBoard:
                 tilt_rad * np.array([np.cos(towards), np.sin(towards), 0.0])
             ) @ rotation_from_vector([0.0, 0.0, self._random.uniform(-0.15, 0.15)])
             depth_m = self.camera.left.fy_px * height_m / (share * self.camera.height_px)
-            way = np.array(ways[number % len(ways)], dtype=np.float64)
-            poses.append(self._placed(turn, depth_m, way, middle))
+            direction = np.array(directions[number % len(directions)], dtype=np.float64)
+            poses.append(self._place_board(turn, depth_m, direction, board_centre))
         return poses
 
-    def _placed(self, turn: Floats, depth_m: float, way: Floats, middle: Floats) -> Floats:
-        """Place a rotated board as far from the image centre in direction `way` as it is visible.
+    def _place_board(
+        self, turn: Floats, depth_m: float, direction: Floats, board_centre: Floats
+    ) -> Floats:
+        """Place a rotated board as far from the image centre in `direction` as it is visible.
 
         If it is not visible at the centre, move it farther away. Returns left_from_board (4, 4).
         """
@@ -259,8 +261,8 @@ class TwinBoard:
 
         def posed(shares: Floats) -> Floats:
             centre = np.array([between_m, 0.0, depth_m])
-            centre[:2] += 1.2 * shares * depth_m * reach * way
-            return transform(turn, centre - turn @ np.array([*middle, 0.0]))
+            centre[:2] += 1.2 * shares * depth_m * reach * direction
+            return transform(turn, centre - turn @ np.array([*board_centre, 0.0]))
 
         out = np.zeros(2)
         while not self._shown(posed(out)):

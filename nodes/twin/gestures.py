@@ -233,8 +233,8 @@ def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
     for leg, rest_s in enumerate(lag_s):
         signed = speed if leg % 4 < 2 else -speed
         phases += [(start_s, signed), (even_s, signed), (BRAKE_S, 0.0), (float(rest_s), 0.0)]
-    times, way = integrate_speed_profile(phases)
-    return _on_surface(scene, "stop", (times, _pressing(way - half, TOUCH_M)))
+    times, travel_m = integrate_speed_profile(phases)
+    return _on_surface(scene, "stop", (times, _pressing(travel_m - half, TOUCH_M)))
 
 
 def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
@@ -246,13 +246,13 @@ def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
     here, signed = -0.5 * half + 0.5 * speed * turn_s, speed
     for _ in range(14):
         end = np.sign(signed) * generator.uniform(0.2, 0.9) * half
-        way = max(np.sign(signed) * (end - here), 0.0)
-        phases += [(way / speed + 1e-3, signed), (turn_s, -signed)]
-        here += signed * (way / speed + 1e-3)
+        travel_m = max(np.sign(signed) * (end - here), 0.0)
+        phases += [(travel_m / speed + 1e-3, signed), (turn_s, -signed)]
+        here += signed * (travel_m / speed + 1e-3)
         signed = -signed
     phases += [(turn_s, 0.0)]
-    times, way = integrate_speed_profile(phases)
-    return _on_surface(scene, "reverse", (times, _pressing(way - 0.5 * half, TOUCH_M)))
+    times, travel_m = integrate_speed_profile(phases)
+    return _on_surface(scene, "reverse", (times, _pressing(travel_m - 0.5 * half, TOUCH_M)))
 
 
 def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:

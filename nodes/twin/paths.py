@@ -36,8 +36,8 @@ OF_HEIGHT = 0.9
 """Fractions that the finger can stroke: of the length of an object with ends, of the width of the
 sheet, and of its usable half-height."""
 
-MAX_CACHED_GROUNDS = 4
-_GROUNDS: dict[bytes, Ground] = {}
+MAX_CACHED_SURFACE_MAPS = 4
+_SURFACE_MAPS: dict[bytes, SurfaceMap] = {}
 
 SPEED_FRACTION = 0.8
 """Maximum speed of a path, as a fraction of the scene's finger speed. The rest is a reserve, since
@@ -49,7 +49,7 @@ PRESS_FRACTION = 1.0 / 6.0
 
 def map_to_surface(scene: Scene, places: Floats) -> Floats:
     """Convert surface positions (n, 3) on the scene's object to world points (n, 3)."""
-    return _ground_of(scene).points(places)
+    return _surface_map_of(scene).points(places)
 
 
 def touchable(scene: Scene) -> tuple[float, float]:
@@ -58,10 +58,10 @@ def touchable(scene: Scene) -> tuple[float, float]:
     They extend equally to both sides of the front. They are limited by 0.8 of the length of an
     object with ends, the maximum tilt of the working range, and the usable part of the sheet.
     """
-    return _ground_of(scene).touchable_m
+    return _surface_map_of(scene).touchable_m
 
 
-class Ground:
+class SurfaceMap:
     """Map from surface positions on a scene's object to world points.
 
     The distances `along` and `arc` are measured on geodesics, which are computed on a grid. Points
@@ -97,7 +97,7 @@ class Ground:
                 OF_HEIGHT * scene.sheet.usable_half_height_m,
             ),
         )
-        self._lay_out(front, np.cross(across, front.normal))
+        self._fit_splines(front, np.cross(across, front.normal))
 
     def points(self, places: Floats) -> Floats:
         """Convert surface positions (n, 3) to world points (n, 3).
@@ -132,7 +132,7 @@ class Ground:
             here = there
         return way_m, False
 
-    def _lay_out(self, front: Nearest, heading: Floats) -> None:
+    def _fit_splines(self, front: Nearest, heading: Floats) -> None:
         """Fit splines of the surface over (along, arc), to 1.25 times the range to be stroked."""
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
@@ -159,10 +159,10 @@ def _front(shape: Shape, towards_user: Floats) -> Nearest:
         return far
     place = FAR_M * towards_user
     for _ in range(200):
-        way = float(shape.signed_distance(place))
-        if way < 1e-9:
+        distance_m = float(shape.signed_distance(place))
+        if distance_m < 1e-9:
             break
-        place = place - way * towards_user
+        place = place - distance_m * towards_user
     return shape.closest(place)
 
 
@@ -176,15 +176,15 @@ def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tupl
     ticks: ascending distances (k,) in m at which points are computed. 0 is in the centre, with
     equally many distances on both sides.
     """
-    middle = len(ticks) // 2
+    centre = len(ticks) // 2
     begun = shape.closest(starts)
     points, normals = (np.empty((len(ticks), *starts.shape)) for _ in range(2))
-    points[middle], normals[middle] = begun.point, begun.normal
+    points[centre], normals[centre] = begun.point, begun.normal
     for sign in (1, -1):
         found, heading = begun, sign * headings
         here, normal = found.point, found.normal
-        for step in range(1, middle + 1):
-            to = middle + sign * step
+        for step in range(1, centre + 1):
+            to = centre + sign * step
             way_m = abs(ticks[to] - ticks[to - sign])
             parts = max(1, int(np.ceil(way_m / STRIDE_M)))
             for _ in range(parts):
@@ -200,14 +200,14 @@ def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tupl
     return points, normals
 
 
-def _ground_of(scene: Scene) -> Ground:
+def _surface_map_of(scene: Scene) -> SurfaceMap:
     """Return the surface map of a scene; the latest few are cached, as they are costly."""
     key = pickle.dumps((scene.object, scene.working_range, scene.sheet, scene.name))
-    if key not in _GROUNDS:
-        while len(_GROUNDS) >= MAX_CACHED_GROUNDS:
-            _GROUNDS.pop(next(iter(_GROUNDS)))
-        _GROUNDS[key] = Ground(scene)
-    return _GROUNDS[key]
+    if key not in _SURFACE_MAPS:
+        while len(_SURFACE_MAPS) >= MAX_CACHED_SURFACE_MAPS:
+            _SURFACE_MAPS.pop(next(iter(_SURFACE_MAPS)))
+        _SURFACE_MAPS[key] = SurfaceMap(scene)
+    return _SURFACE_MAPS[key]
 
 
 def inside(scene: Scene, points: Floats, margin_m: float) -> bool:

@@ -323,7 +323,7 @@ class TwinCamera:
         """
         clutter, sensor = self.clutter, self.sensor
         time_s, tip = float(times_s.mean()), tips.mean(axis=0)
-        way = tips[-1] - tips[0]
+        motion = tips[-1] - tips[0]
         windows = [
             self._disc(eye, point[None], LIT_RADIUS_M, LIT_LEVEL, adds=True) for point in lit
         ]
@@ -332,11 +332,11 @@ class TwinCamera:
             if limb.carried:
                 ends += tip + self.nail.knuckle_shift_m
             radii_m = (limb.start_radius_m, limb.end_radius_m)
-            moved = way if limb.carried else np.zeros(3)
+            moved = motion if limb.carried else np.zeros(3)
             windows.append(self._limb(eye, ends, radii_m, limb.level, moved, lit=True))
         ends = np.stack([tip, tip + FINGER_LENGTH_M * self.nail.direction])
         radii_m = (self.finger_radius_m, 1.2 * self.finger_radius_m)
-        windows.append(self._limb(eye, ends, radii_m, sensor.finger_level, way, lit=True))
+        windows.append(self._limb(eye, ends, radii_m, sensor.finger_level, motion, lit=True))
         if marker:
             at = tips + self.marker_offset_m
             if self.nail.marker_normal is None:
@@ -353,7 +353,7 @@ class TwinCamera:
                 if occluder.carried:
                     ends += tip
                 radii_m = (occluder.radius_m, occluder.radius_m)
-                moved = way if occluder.carried else np.zeros(3)
+                moved = motion if occluder.carried else np.zeros(3)
                 windows.append(self._limb(eye, ends, radii_m, occluder.level, moved, lit=False))
         return [window for window in windows if window is not None]
 
@@ -369,7 +369,7 @@ class TwinCamera:
         ends: Floats,
         radii_m: tuple[float, float],
         level: float,
-        way: Floats,
+        motion: Floats,
         *,
         lit: bool,
     ) -> Window | None:
@@ -378,7 +378,7 @@ class TwinCamera:
         Return None if the capsule is not visible.
 
         lit: whether the lamp shades it from the side; otherwise its level is constant.
-        way: motion (3,) in m during the exposure, which widens the blurred edges.
+        motion: (3,) m, of the limb during the exposure, which widens the blurred edges.
 
         The profile of the edges is a cubic, within 2 % of the normal distribution function. It is
         not valid for a limb that is thinner than its blurred edges.
@@ -389,7 +389,7 @@ class TwinCamera:
         u0, v0, u1, v1 = x0 / z0, y0 / z0, x1 / z1, y1 / z1
         width0, width1 = radii_m[0] / z0, radii_m[1] / z1
         scale = pixels_per_slope(eye.lens, u0, v0)
-        travel_px = scale / z0 * math.hypot(*way.tolist())
+        travel_px = scale / z0 * math.hypot(*motion.tolist())
         spread_px = math.hypot(self.sensor.spread_px(z0, eye.lens.fx_px), travel_px / math.sqrt(12))
         # Lens distortion bends straight lines, so the bounding box of the ends does not suffice.
         pixels = [
@@ -455,9 +455,9 @@ class TwinCamera:
         of that of a uniform disc.
         """
         in_camera = apply(eye.camera_from_world, places)
-        middle = in_camera.mean(axis=0)
-        towards = float(-(eye.camera_from_world[:3, :3] @ normal) @ middle)
-        x, y, z = middle.tolist()
+        centre = in_camera.mean(axis=0)
+        towards = float(-(eye.camera_from_world[:3, :3] @ normal) @ centre)
+        x, y, z = centre.tolist()
         if in_camera[:, 2].min() <= MIN_DEPTH_M or towards <= 0.0:
             return None
         per_slope = pixels_per_slope(eye.lens, x / z, y / z)
@@ -486,9 +486,9 @@ class TwinCamera:
     ) -> CameraView:
         height, width = self.camera.height_px, self.camera.width_px
         slopes = _slopes(lens, width, height)
-        canvas = self._room(height, width)
+        canvas = self._make_background(height, width)
         if self.clutter.sheet is not None and sheet is not None:
-            self._lay(self.clutter.sheet, sheet, canvas, slopes, camera_from_world)
+            self._draw_sheet(self.clutter.sheet, sheet, canvas, slopes, camera_from_world)
         canvas *= np.float32(self.sensor.exposure)
         eye = CameraView(
             side=side,
@@ -508,7 +508,7 @@ class TwinCamera:
             eye.noisy.append(self._read_out(canvas))
         return eye
 
-    def _room(self, height: int, width: int) -> Singles:
+    def _make_background(self, height: int, width: int) -> Singles:
         """Return the image of a dim room: smooth noise of two scales, darker than the marker."""
         texture = np.zeros((height, width), dtype=np.float32)
         for cells, share in ((24, 0.7), (96, 0.3)):
@@ -533,7 +533,7 @@ class TwinCamera:
         lit = np.linspace(1.08, 0.92, size[1], dtype=np.float32)
         return np.asarray((sheet.level + sheet.contrast * grain) * lit, dtype=np.float32)
 
-    def _lay(
+    def _draw_sheet(
         self, sheet: Sheet, grain: Singles, canvas: Singles, slopes: Floats, pose: Floats
     ) -> None:
         """Draw the sheet, which lies in the world plane z = 0, on the canvas.
