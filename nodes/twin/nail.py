@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -12,6 +13,10 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.twin.clutter import FINGER_DIRECTION, FINGER_LENGTH_M
 
+THICKNESS_RATIO = 0.6
+"""Thickness of a finger from pad to nail, 10 mm when the pad yields, divided by its breadth of 16
+to 18 mm (sources: `tolerance_table.py`)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Nail:
@@ -21,6 +26,10 @@ class Nail:
         marker.
     marker_normal: (3,) normal of a flat marker; None if the marker is a ball.
     direction: (3,) from the fingertip to the knuckle.
+
+    A finger with a flat marker on its nail has an elliptic cross-section, on whose flat side the
+    marker lies. Otherwise it is round, and its axis begins at the fingertip: with a ball, or with a
+    marker at the pad, whose offset is only the error of a calibration.
     """
 
     marker_offset_m: Floats = field(default_factory=lambda: np.zeros(3))
@@ -49,7 +58,48 @@ class Nail:
             direction=direction,
         )
 
+    def find_normal(self, radius_m: float) -> Floats | None:
+        """Return the direction (3,) from the finger's axis to the nail; None for a round finger.
+
+        radius_m: half of the finger's breadth.
+        """
+        height_m = float(np.linalg.norm(_reject(self.marker_offset_m, self.direction)))
+        if self.marker_normal is None or height_m < THICKNESS_RATIO * radius_m:
+            return None
+        across = _reject(self.marker_normal, self.direction)
+        length = float(np.linalg.norm(across))
+        return None if length < 1e-6 else across / length
+
+    def find_axis_shift_m(self, radius_m: float) -> Floats:
+        """Return the vector (3,) from the fingertip to the start of the finger's axis.
+
+        radius_m: half of the finger's breadth.
+        """
+        normal = self.find_normal(radius_m)
+        if normal is None:
+            return np.zeros(3)
+        on_nail = _reject(self.marker_offset_m, self.direction)
+        return np.asarray(on_nail - THICKNESS_RATIO * radius_m * normal)
+
+    def find_half_width_m(self, view: Floats, radius_m: float) -> float:
+        """Return half the width of the finger's outline, seen along the vector (3,) `view`.
+
+        radius_m: half of the finger's breadth.
+        """
+        normal, aside = self.find_normal(radius_m), np.cross(self.direction, view)
+        length = float(np.linalg.norm(aside))
+        if normal is None or length < 1e-9:
+            return radius_m
+        cosine = float(normal @ aside) / length
+        return radius_m * math.sqrt(1.0 - (1.0 - THICKNESS_RATIO**2) * cosine**2)
+
     @property
     def knuckle_shift_m(self) -> Floats:
         """Return the vector (3,) by which the finger's tilt displaces the knuckle and the hand."""
         return np.asarray(FINGER_LENGTH_M * (self.direction - np.array(FINGER_DIRECTION)))
+
+
+def _reject(vector: Floats, direction: Floats) -> Floats:
+    """Return the component (3,) of a vector that is perpendicular to a direction (3,)."""
+    along = direction / np.linalg.norm(direction)
+    return np.asarray(vector - (vector @ along) * along)

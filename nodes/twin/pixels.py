@@ -153,6 +153,11 @@ class CameraView:
     canvas: Singles
     noisy: list[Image]
 
+    @property
+    def position_m(self) -> Floats:
+        """Return the position (3,) of the camera's centre in the world."""
+        return np.asarray(-self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3])
+
     def see(self, point_world: Floats) -> tuple[Floats, float]:
         """Return the pixel (2,) and depth (m) of a world point; for depths <= 0 the pixel is 0."""
         x, y, z = (
@@ -334,8 +339,10 @@ class TwinCamera:
             radii_m = (limb.start_radius_m, limb.end_radius_m)
             moved = motion if limb.carried else np.zeros(3)
             windows.append(self._limb(eye, ends, radii_m, limb.level, moved, lit=True))
-        ends = np.stack([tip, tip + FINGER_LENGTH_M * self.nail.direction])
-        radii_m = (self.finger_radius_m, 1.2 * self.finger_radius_m)
+        start = tip + self.nail.find_axis_shift_m(self.finger_radius_m)
+        ends = np.stack([start, start + FINGER_LENGTH_M * self.nail.direction])
+        width_m = self.nail.find_half_width_m(start - eye.position_m, self.finger_radius_m)
+        radii_m = (width_m, 1.2 * width_m)
         windows.append(self._limb(eye, ends, radii_m, sensor.finger_level, motion, lit=True))
         if marker:
             at = tips + self.marker_offset_m
