@@ -5,9 +5,11 @@ import sys
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 from scipy.optimize import linear_sum_assignment
 
 from flexsheet.nodes.triangulator.data_association import assign_columns
+from flexsheet.nodes.twin.finger import SmoothPath
 
 SLOW = {"scipy.interpolate", "scipy.optimize", "scipy.stats", "matplotlib", "distributed", "typer"}
 
@@ -17,7 +19,7 @@ def test_nodes_that_the_arms_wait_for_import_no_slow_package() -> None:
         "import sys\n"
         "from types import SimpleNamespace\n"
         "from flexsheet.nodes.runner import node_class\n"
-        "for name in ('triangulator', 'planner', 'camera', 'arm_bridge', 'twin_arms'):\n"
+        "for name in ('triangulator', 'planner', 'twin_finger', 'camera', 'arm_bridge', 'twin_arms'):\n"
         "    node_class(name)\n"
         "parameters = SimpleNamespace(calibration=None, marker_calibration=None)\n"
         "setup = node_class('triangulator').setup(SimpleNamespace(parameters=parameters))\n"
@@ -43,3 +45,18 @@ def test_assignments_are_as_cheap_as_scipys(seed: int) -> None:
     assert len(set(columns)) == rows
     expected = linear_sum_assignment(costs)
     assert costs[range(rows), columns].sum() == pytest.approx(costs[expected].sum())
+
+
+@pytest.mark.parametrize("count", [2, 3, 50])
+def test_a_finger_path_is_the_clamped_spline_of_scipy(count: int) -> None:
+    random = np.random.default_rng(count)
+    times, points = np.cumsum(random.uniform(0.001, 0.1, count)), random.normal(size=(count, 3))
+    path, expected = (
+        SmoothPath.through(times, points),
+        CubicSpline(times, points, bc_type="clamped"),
+    )
+    for share in (0.01, 0.3, 0.99):
+        at_s = share * path.duration_s
+        position, velocity = path.at(at_s)
+        assert position == pytest.approx(expected(times[0] + at_s), abs=1e-9)
+        assert velocity == pytest.approx(expected(times[0] + at_s, 1), abs=1e-6)
