@@ -89,8 +89,8 @@ class Triangulator(Node):
         return frozenset() if shows_check_marks(scene) else frozenset({"frame"})
 
     async def setup(self) -> None:
-        # SciPy imports submodules on first use, which must not delay an image.
-        _ = scipy.optimize, scipy.special
+        # SciPy imports a submodule on first use, which must not delay an image.
+        _ = scipy.special
         if path := self.parameters.calibration:
             self.calibration = load_calibration(path)
         if path := self.parameters.marker_calibration:

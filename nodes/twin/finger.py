@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 import numpy as np
-import scipy
 
 from flexsheet.messages.apparatus import FingerTruth
 from flexsheet.messages.errors import FlexsheetError
@@ -166,15 +165,19 @@ class SmoothPath:
 
     times_s: Floats
     points: Floats
-    spline: scipy.interpolate.CubicSpline = field(repr=False)
-    rate: scipy.interpolate.CubicSpline = field(repr=False)
+    cubics: Floats = field(repr=False)
+    rates: Floats = field(repr=False)
 
     @staticmethod
     def through(times_s: Floats, points: Floats) -> SmoothPath:
         """Make the path through points (n >= 2, 3) at increasing times (n,) from time 0."""
         times = times_s - times_s[0]
-        spline = scipy.interpolate.CubicSpline(times, points, bc_type="clamped")
-        return SmoothPath(times, points, spline, spline.derivative())
+        rates = find_clamped_rates(times, points)
+        steps = np.diff(times)[:, None]
+        mean = np.diff(points, axis=0) / steps
+        excess = (rates[:-1] + rates[1:] - 2.0 * mean) / steps
+        cubics = [excess / steps, (mean - rates[:-1]) / steps - excess, rates[:-1], points[:-1]]
+        return SmoothPath(times, points, np.stack(cubics), rates)
 
     @property
     def duration_s(self) -> float:
@@ -190,7 +193,7 @@ class SmoothPath:
         Between two samples the velocity is a quadratic Bezier curve. It stays within the triangle
         of its control points: both end velocities, and 3 times the mean velocity minus these two.
         """
-        ends = self.rate(self.times_s)
+        ends = self.rates
         mean = np.diff(self.points, axis=0) / np.diff(self.times_s)[:, None]
         middle = 3.0 * mean - ends[1:] - ends[:-1]
         corners = np.linalg.norm(np.stack([ends[1:], ends[:-1], middle]), axis=2)
@@ -205,11 +208,30 @@ class SmoothPath:
         # The library's function would take six times as long for a single time.
         i = int(np.searchsorted(self.times_s, time_s, side="right")) - 1
         since = time_s - self.times_s[i]
-        cubic, square, linear, constant = self.spline.c[:, i]
+        cubic, square, linear, constant = self.cubics[:, i]
         return (
             ((cubic * since + square) * since + linear) * since + constant,
             (3.0 * cubic * since + 2.0 * square) * since + linear,
         )
+
+
+def find_clamped_rates(times_s: Floats, points: Floats) -> Floats:
+    """Return the rates (n, 3) at the points (n, 3) of the cubic spline that rests at both ends.
+
+    The second derivative is continuous; the tridiagonal equations are solved by elimination. SciPy
+    would take a third of a second to import, which delays the restart of the node.
+    """
+    steps = np.diff(times_s)
+    mean = np.diff(points, axis=0) / steps[:, None]
+    right = 3.0 * (steps[1:, None] * mean[:-1] + steps[:-1, None] * mean[1:])
+    rates, ratios = np.zeros_like(points), [0.0]
+    for i, (before, after) in enumerate(zip(steps[:-1].tolist(), steps[1:].tolist(), strict=True)):
+        pivot = 2.0 * (before + after) - after * ratios[i]
+        ratios.append(before / pivot)
+        rates[i + 1] = (right[i] - after * rates[i]) / pivot
+    for i in range(len(points) - 2, 0, -1):
+        rates[i] -= ratios[i] * rates[i + 1]
+    return rates
 
 
 def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:

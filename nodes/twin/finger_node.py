@@ -113,8 +113,10 @@ class TwinFingerNode(Node):
         return "it takes images by its own clock; the bag has the finger's motion as twin/finger"
 
     async def setup(self) -> None:
-        # SciPy imports submodules on first use, which must not delay an image.
-        _ = scipy.interpolate, scipy.special
+        # SciPy imports a submodule on first use, which must not delay an image.
+        _ = scipy.special
+        if self.parameters.hand == "coupled":
+            _ = scipy.interpolate
         self._jitter = np.random.default_rng((self.parameters.seed, JITTER_STREAM))
         self.filming = asyncio.create_task(self._film())
 
