@@ -68,6 +68,15 @@ def commission(
             help="Measured radius of the fingertip, mm.",
         ),
     ] = None,
+    sheet_kg_per_m2: Annotated[
+        float | None,
+        typer.Option(
+            "--sheet-kg-per-m2",
+            metavar="KG/M2",
+            min=0.0,
+            help="Measured mass per area of the sheet, which determines its sag.",
+        ),
+    ] = None,
     board: Annotated[
         str,
         typer.Option(
@@ -152,6 +161,7 @@ def commission(
         apparatus,
         data=given,
         finger_radius_m=None if finger_radius_mm is None else 1e-3 * finger_radius_mm,
+        sheet_kg_per_m2=sheet_kg_per_m2,
         board=_parse_board(board, square_mm, None, FOUR_BITS),
         flange_board=_parse_board(flange_board, flange_square_mm, None, FOUR_BITS),
         seconds=duration,
