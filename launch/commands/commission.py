@@ -144,9 +144,11 @@ def commission(
     given = {name: Path(path) for name, path in _parse_pairs("--data", data).items()}
     skips = _parse_pairs("--skip", skipped)
     repeats = [_parse_step("--step", name) for name in repeated or ()]
-    if apparatus is not None and (given or finger_radius_mm is not None):
+    measured = (finger_radius_mm, sheet_kg_per_m2)
+    if apparatus is not None and (given or any(one is not None for one in measured)):
         raise CommandError(
-            "--data and --finger-radius-mm are for real devices; remove them or --apparatus",
+            "--data, --finger-radius-mm and --sheet-kg-per-m2 are for real devices; remove them or "
+            "--apparatus",
             BAD_INPUT,
         )
     if check and (repeats or skips or any(name is not StepName.VERIFICATION for name in given)):

@@ -126,7 +126,8 @@ class Laboratory:
 
     apparatus: true parameters of simulated devices, in the world frame of the camera; None for real
     devices. data: file or folder with the captured data of each step. finger_radius_m: measured
-    radius for real devices. sheet_kg_per_m2: measured mass per area of the real sheet. seconds: duration of the verification. simulated_time: verify simulated
+    radius for real devices. sheet_kg_per_m2: measured mass per area of a real sheet. seconds:
+    duration of the verification. simulated_time: verify simulated
     devices without a running graph. pairs, arm_poses, sheet_poses: numbers of simulated
     observations.
     """
@@ -650,8 +651,8 @@ def describe_sheet(
 
     modulus_thickness_n_per_m: product of Young's modulus and thickness. width_m: width without
     tension. mass_kg_per_m2: mass per area, which determines the density at the scene's thickness;
-    None keeps the scene's density. The step `edges` measured how far the tension displaces the flanges. The measured sheet
-    has another tension, so the compliances are scaled to keep this displacement at mean stretch.
+    None keeps the scene's density. The step `edges` measured how far the tension displaces the
+    flanges. The measured sheet has another tension, so the compliances are scaled to keep this displacement at mean stretch.
     """
     sheet = scene.sheet
     modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m
