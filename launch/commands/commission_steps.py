@@ -652,7 +652,8 @@ def describe_sheet(
     modulus_thickness_n_per_m: product of Young's modulus and thickness. width_m: width without
     tension. mass_kg_per_m2: mass per area, which determines the density at the scene's thickness;
     None keeps the scene's density. The step `edges` measured how far the tension displaces the
-    flanges. The measured sheet has another tension, so the compliances are scaled to keep this displacement at mean stretch.
+    flanges. The measured sheet has another tension, so the compliances are scaled to keep
+    this displacement at mean stretch.
     """
     sheet = scene.sheet
     modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m
