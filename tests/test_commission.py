@@ -701,3 +701,12 @@ def test_lags_are_read_from_the_bag_of_a_stroke(tmp_path: Path) -> None:
     assert found == {"left": MeasuredLag(0.041, 0.001), "right": MeasuredLag(0.052, 0.001)}
     with pytest.raises(DelaysError, match="the right arm's bridge measured no servo lag"):
         read_measured_lags(write(tmp_path / "short.mcap", *states[:3]))
+
+
+def test_the_mass_per_area_of_the_sheet_determines_its_density() -> None:
+    scene = SCENE
+    before = scene.sheet.young_modulus_pa * scene.sheet.thickness_m
+    values = describe_sheet(scene, before, scene.sheet.width_m, 1.417)
+    assert values["sheet.density_kg_per_m3"] * scene.sheet.thickness_m == pytest.approx(1.417)
+    kept = describe_sheet(scene, before, scene.sheet.width_m)
+    assert "sheet.density_kg_per_m3" not in kept

@@ -64,8 +64,9 @@ STAMP_STD_S = 3e-3
 The value assumes a uniform distribution within an exposure of 10 ms.
 """
 
-THICKNESS_GRADIENT_STD, DENSITY_STD_RATIO = 0.03, 0.04
-"""Standard deviations of the relative thickness gradient of the sheet and of its relative density.
+THICKNESS_GRADIENT_STD, SHEET_MASS_STD_RATIO = 0.03, 0.07
+"""Standard deviations of the thickness gradient of the sheet, and of its relative mass per area if
+no step has measured it: 4 % of density and 6 % of thickness.
 
 Sources: ISO 3302-1 class M1 for rubber sheets; densities of natural rubber compounds.
 """
@@ -101,6 +102,7 @@ class Knowledge:
     unknowns of `fit_edges`; a side that was not calibrated is absent. projector_px2: covariance
     (2, 2) of the displacement of the projected image. eyes_m2: covariance (3, 3) of the midpoint
     between the eyes. stamp_std_s: standard deviation of exposure time minus timestamp.
+    sheet_mass_std_ratio: relative standard deviation of the sheet's mass per area.
     """
 
     scene: Scene
@@ -109,6 +111,7 @@ class Knowledge:
     projector_px2: Floats
     eyes_m2: Floats
     stamp_std_s: float
+    sheet_mass_std_ratio: float = SHEET_MASS_STD_RATIO
 
 
 def predict_errors(
@@ -170,7 +173,7 @@ def draw_apparatus(known: Knowledge, random: Random) -> Apparatus:
         update={
             "thickness_gradient_ratio": _tuple(THICKNESS_GRADIENT_STD * random.standard_normal(2)),
             "density_kg_per_m3": scene.sheet.density_kg_per_m3
-            * (1.0 + DENSITY_STD_RATIO * float(random.standard_normal())),
+            * (1.0 + known.sheet_mass_std_ratio * float(random.standard_normal())),
             "friction_coefficient": FRICTION
             * float(np.exp(FRICTION_STD_LN * random.standard_normal())),
             "creep_ratio_per_decade": max(

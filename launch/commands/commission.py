@@ -68,6 +68,15 @@ def commission(
             help="Measured radius of the fingertip, mm.",
         ),
     ] = None,
+    sheet_kg_per_m2: Annotated[
+        float | None,
+        typer.Option(
+            "--sheet-kg-per-m2",
+            metavar="KG/M2",
+            min=0.0,
+            help="Measured mass per area of the sheet, which determines its sag.",
+        ),
+    ] = None,
     board: Annotated[
         str,
         typer.Option(
@@ -135,9 +144,11 @@ def commission(
     given = {name: Path(path) for name, path in _parse_pairs("--data", data).items()}
     skips = _parse_pairs("--skip", skipped)
     repeats = [_parse_step("--step", name) for name in repeated or ()]
-    if apparatus is not None and (given or finger_radius_mm is not None):
+    measured = (finger_radius_mm, sheet_kg_per_m2)
+    if apparatus is not None and (given or any(one is not None for one in measured)):
         raise CommandError(
-            "--data and --finger-radius-mm are for real devices; remove them or --apparatus",
+            "--data, --finger-radius-mm and --sheet-kg-per-m2 are for real devices; remove them or "
+            "--apparatus",
             BAD_INPUT,
         )
     if check and (repeats or skips or any(name is not StepName.VERIFICATION for name in given)):
@@ -152,6 +163,7 @@ def commission(
         apparatus,
         data=given,
         finger_radius_m=None if finger_radius_mm is None else 1e-3 * finger_radius_mm,
+        sheet_kg_per_m2=sheet_kg_per_m2,
         board=_parse_board(board, square_mm, None, FOUR_BITS),
         flange_board=_parse_board(flange_board, flange_square_mm, None, FOUR_BITS),
         seconds=duration,

@@ -62,13 +62,17 @@ CALLIPER_M = 3e-4
 GAUGE_N = 0.005
 """Standard deviation of the noise of the simulated force gauge."""
 
+WEIGHING_RATIO = 0.004
+"""Relative standard deviation of the mass per area of a simulated sheet, from a scale of 0.2 g and
+a ruler of 0.5 mm."""
+
 INSTRUCTIONS: dict[StepName, str] = {
     StepName.CAMERA: "capture board images with `flexsheet calibrate stereo --device-source ... "
     "--pictures FOLDER`, and give --data camera=FOLDER",
     StepName.ARMS: "record poses with `flexsheet calibrate arms-capture` to FOLDER/left and "
     "FOLDER/right, and give --data arms=FOLDER",
     StepName.SHEET: "measure pushes as for `flexsheet calibrate sheet --rows`, and give --data "
-    "sheet=CSV",
+    "sheet=CSV; weigh the sheet, and give its mass per area with --sheet-kg-per-m2",
     StepName.PROJECTOR: "write the patterns with `flexsheet calibrate projector --write-patterns`, "
     "capture them on the sheet in six poses, and give --data projector=FOLDER",
     StepName.EDGES: "fix three marks on each clamp, record them with `flexsheet calibrate "
@@ -122,7 +126,8 @@ class Laboratory:
 
     apparatus: true parameters of simulated devices, in the world frame of the camera; None for real
     devices. data: file or folder with the captured data of each step. finger_radius_m: measured
-    radius for real devices. seconds: duration of the verification. simulated_time: verify simulated
+    radius for real devices. sheet_kg_per_m2: measured mass per area of a real sheet. seconds:
+    duration of the verification. simulated_time: verify simulated
     devices without a running graph. pairs, arm_poses, sheet_poses: numbers of simulated
     observations.
     """
@@ -132,6 +137,7 @@ class Laboratory:
     board: Board = BOARD
     flange_board: Board = FLANGE_BOARD
     finger_radius_m: float | None = None
+    sheet_kg_per_m2: float | None = None
     seconds: float = 10.0
     seed: int = 1
     simulated_time: bool = False
@@ -261,12 +267,15 @@ class Laboratory:
         if self.apparatus is None:
             file = self._find_data(StepName.SHEET)
             pushes, lines = read_rows(file, scene.sheet, scene.finger.radius_m)
-            source = str(file)
+            source, mass_kg_per_m2 = str(file), self.sheet_kg_per_m2
         else:
             pushes = calibrate_sheet.simulate_pushes(
                 scene, self.apparatus, places=False, noise_n=GAUGE_N, seed=self.seed
             )
             lines, source = list(range(1, len(pushes) + 1)), f"twin of {scene.name}"
+            true = apply_apparatus(scene, self.apparatus).sheet
+            weighing = np.random.default_rng([self.seed, 3]).normal(1.0, WEIGHING_RATIO)
+            mass_kg_per_m2 = float(true.density_kg_per_m3 * true.thickness_m * weighing)
         try:
             found = calibrate_sheet.make_calibration(
                 scene, pushes, lines, source=source, with_mooney=False, with_table=False
@@ -295,7 +304,10 @@ class Laboratory:
                 "modulus_percent": 100.0 * modulus.standard_deviation / modulus.value,
                 "slack_width_mm": 1e3 * found.slack_width_m.standard_deviation,
             },
-            scene_values=describe_sheet(scene, modulus.value, width_m),
+            scene_values=describe_sheet(scene, modulus.value, width_m, mass_kg_per_m2),
+            covariances=(
+                {} if mass_kg_per_m2 is None else {"sheet_mass_ratio2": [[WEIGHING_RATIO**2]]}
+            ),
             parameters={"planner.sheet_calibration": SHEET},
         )
 
@@ -516,7 +528,12 @@ class Laboratory:
 
 def collect_knowledge(lab: Commissioning) -> Knowledge:
     """Collect calibrations and covariances of the finished steps, to predict errors from them."""
-    from flexsheet.launch.calibration.prediction import EYE_STD_M, STAMP_STD_S, Knowledge
+    from flexsheet.launch.calibration.prediction import (
+        EYE_STD_M,
+        SHEET_MASS_STD_RATIO,
+        STAMP_STD_S,
+        Knowledge,
+    )
     from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 
     covariances: dict[StepName, dict[str, Any]] = {
@@ -532,6 +549,9 @@ def collect_knowledge(lab: Commissioning) -> Knowledge:
         edges=covariances.get(StepName.EDGES, {}),
         projector_px2=named.get("shift_px2", np.zeros((2, 2))),
         eyes_m2=named.get("eyes_m2", EYE_STD_M**2 * np.eye(3)),
+        sheet_mass_std_ratio=float(
+            np.sqrt(named.get("sheet_mass_ratio2", np.array(SHEET_MASS_STD_RATIO**2)).item())
+        ),
         stamp_std_s=float(np.sqrt(named.get("stamp_s2", np.array(STAMP_STD_S**2)).item())),
     )
 
@@ -622,13 +642,18 @@ def _read_stroke(path: Path) -> dict[str, Any]:
 
 
 def describe_sheet(
-    scene: Scene, modulus_thickness_n_per_m: float, width_m: float
+    scene: Scene,
+    modulus_thickness_n_per_m: float,
+    width_m: float,
+    mass_kg_per_m2: float | None = None,
 ) -> dict[str, float]:
     """Return the values to store in the scene for a measured sheet, by dotted path.
 
     modulus_thickness_n_per_m: product of Young's modulus and thickness. width_m: width without
-    tension. The step `edges` measured how far the tension displaces the flanges. The measured sheet
-    has another tension, so the compliances are scaled to keep this displacement at mean stretch.
+    tension. mass_kg_per_m2: mass per area, which determines the density at the scene's thickness;
+    None keeps the scene's density. The step `edges` measured how far the tension displaces the
+    flanges. The measured sheet has another tension, so the compliances are scaled to keep
+    this displacement at mean stretch.
     """
     sheet = scene.sheet
     modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m
@@ -636,6 +661,8 @@ def describe_sheet(
     distance_m = 0.5 * (sheet.min_stretch_ratio + sheet.max_stretch_ratio) * sheet.width_m
     before_n, after_n = (edge_force_n(distance_m / one.width_m, one) for one in (sheet, measured))
     values = {"sheet.young_modulus_pa": modulus_pa, "sheet.width_m": width_m}
+    if mass_kg_per_m2 is not None:
+        values["sheet.density_kg_per_m3"] = mass_kg_per_m2 / sheet.thickness_m
     for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
         compliance = arm.flange_compliance_m_per_n * before_n / after_n
         values[f"arms.{side}.flange_compliance_m_per_n"] = compliance
