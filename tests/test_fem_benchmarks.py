@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks import external_solvers
 from flexsheet.launch.health.compliance import SKIN_SPACING_M, compute_front_curve
+from flexsheet.messages.methods import SoftBodyChoice
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import load_cached, save_cached
 from flexsheet.nodes.fem_solver import precompute, reference, snapshots
@@ -21,8 +22,14 @@ from flexsheet.nodes.fem_solver.benchmarks import (
     SOFT_BODY,
     SoftBodyBenchmark,
 )
-from flexsheet.nodes.fem_solver.body import make_soft_body_spec, make_table_spec
+from flexsheet.nodes.fem_solver.body import (
+    SceneBody,
+    attach_table,
+    make_soft_body_spec,
+    make_table_spec,
+)
 from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
+from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from flexsheet.nodes.fem_solver.table import Table
 from flexsheet.nodes.methods import measure
 from tests.scenes import load_cylinder, load_values
@@ -99,9 +106,15 @@ def test_a_solver_that_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPa
     assert external_solvers.import_optional("skfem") is None
 
 
-def test_the_objects_curve_is_the_tables_where_one_is_kept(tmp_path: Path) -> None:
+def test_the_objects_curve_does_not_depend_on_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     scene = small_scene()
-    by_linear = compute_front_curve(scene, tmp_path)
+    chosen = SoftBodyChoice(method="linear", skin_spacing_m=SKIN_SPACING_M)
+    chooses_linear = scene.model_copy(
+        update={"methods": scene.methods.model_copy(update={"soft_body": chosen})}
+    )
+    by_linear = compute_front_curve(chooses_linear, tmp_path)
     spec = make_soft_body_spec(scene, SKIN_SPACING_M)
     model = load_cached(precompute.response_cache(spec), tmp_path)
     assert model is not None
@@ -114,8 +127,17 @@ def test_the_objects_curve_is_the_tables_where_one_is_kept(tmp_path: Path) -> No
         force_n=100.0 * pascals * depths[:, None] * response.normals[:, None],
         reach_m=np.full(count, 0.02),
     )
+
+    def build(_: SoftBodyFactory, scene: Scene, linear: SceneBody, progress: object) -> SceneBody:
+        return attach_table(linear, scene, model, table)
+
+    monkeypatch.setattr(SoftBodyFactory, "build_table", build)
+    when_missing = compute_front_curve(scene, tmp_path)
     save_cached(make_table_cache(make_table_spec(scene, spec)), tmp_path, table)
+    monkeypatch.delattr(SoftBodyFactory, "build_table")
     by_table = compute_front_curve(scene, tmp_path)
+    assert np.array_equal(when_missing, by_table)
+    assert np.array_equal(compute_front_curve(chooses_linear, tmp_path), by_linear)
     assert by_table[:, 1] == pytest.approx(100.0 * by_table[:, 0], rel=1e-3, abs=1e-9)
     assert by_linear[-1, 1] != pytest.approx(by_table[-1, 1], rel=0.05)
 

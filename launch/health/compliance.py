@@ -52,8 +52,9 @@ SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
     """Return the object's force against depth (n, 2), m and N, on the side that faces the user.
 
-    The cached nonlinear table of the object is used if it exists. Otherwise the linear method is
-    used, and computed if necessary. cache_dir: None for the user's cache folder.
+    The complete nonlinear table of the object is computed and cached if it is missing, which takes
+    minutes. The linear method is used if the scene chooses it. So the result does not depend on the
+    cache. cache_dir: None for the user's cache folder.
     """
     factory = SoftBodyFactory(
         skin_spacing_m=SKIN_SPACING_M,
@@ -63,7 +64,10 @@ def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
         cache_dir=cache_dir or cache.default_cache_dir(),
         workers=0,
     )
-    best, *_ = factory.bodies(scene, "auto", lambda done, total, need: None)
+    method, _ = choose_method(scene, "auto", SKIN_SPACING_M, compute_table=True)
+    best, *_ = factory.bodies(scene, method, lambda done, total, need: None)
+    if method != "linear" and best.method.name == "linear":
+        best = factory.build_table(scene, best, lambda done, total, need: None)
     return best.at_rest().force_curve
 
 
