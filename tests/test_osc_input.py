@@ -28,7 +28,7 @@ SCENE = load_cylinder()
 CENTRE = SCENE.eyes.centre_world_m
 TIP = np.array([0.0, 0.01, 0.1])
 STEP_NS = 10_000_000
-BOTH = {"fingertip": OscStream(address="/tip")}
+BOTH: dict[str, Any] = {"fingertip": OscStream(address="/tip")}
 
 
 def pad(text: bytes) -> bytes:
@@ -71,7 +71,7 @@ class Sender:
                 self.clock.move_to(self.clock.now_ns() + STEP_NS)
                 before = self.count()
                 sender.sendto(packet, address)
-                await until(lambda before=before: self.count() > before, "the packet")
+                await until(lambda: self.count() > before, "the packet")  # noqa: B023
 
     def count(self) -> int:
         node = self.node
