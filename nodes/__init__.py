@@ -48,6 +48,7 @@ class OmissionReason(StrEnum):
 NODES: dict[str, str] = {
     "camera": "flexsheet.nodes.camera.node:Camera",
     "triangulator": "flexsheet.nodes.triangulator.node:Triangulator",
+    "osc_input": "flexsheet.nodes.triangulator.osc_node:OscInput",
     "planner": "flexsheet.nodes.planner.node:Planner",
     "arm_bridge": "flexsheet.nodes.arm_bridge.node:ArmBridge",
     "fem_solver": "flexsheet.nodes.fem_solver.node:FemSolver",

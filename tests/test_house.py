@@ -17,6 +17,7 @@ SHARED_ROOMS = {
     "flexsheet.nodes.arrays",
     "flexsheet.nodes.background",
     "flexsheet.nodes.cache",
+    "flexsheet.nodes.external_input",
     "flexsheet.nodes.methods",
     "flexsheet.nodes.models",
     "flexsheet.nodes.node",
