@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from flexsheet.launch.cli import app
 from flexsheet.launch.experiments import ExperimentError, stroke, sweep, system_errors, system_run
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
+from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.experiments.sweep import TrialError
 from flexsheet.launch.experiments.true_geometry import place_edges
 from flexsheet.launch.methods import system_chart
@@ -36,7 +37,8 @@ from flexsheet.launch.methods.configurations import (
 )
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import nominal_apparatus
-from flexsheet.messages.scene import Methods, Scene
+from flexsheet.messages.methods import Methods
+from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Interval
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
@@ -339,8 +341,9 @@ def test_a_graph_without_image_or_force_has_no_error_of_them() -> None:
 
 def test_methods_change_the_errors_of_the_stages_that_they_belong_to() -> None:
     scene = load_scene(SCENES / "rigid-plane.yaml")
+    calibrations = NodeCalibrations.of(load_graph(DEMO_FILE))
     errors = system_errors.ErrorEvaluator(
-        scene, nominal_apparatus(scene), NodeCalibrations(), seconds=2.0, seed=3
+        scene, nominal_apparatus(scene), calibrations, seconds=2.0, seed=3
     )
     exact, paper = (errors.evaluate(one, {}) for one in (FINEST, PAPER))
     assert exact["image_mm"] is exact["force_percent"] is None
