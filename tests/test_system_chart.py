@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
-from flexsheet.launch.experiments import ExperimentError, stroke, sweep, system_run
+from flexsheet.launch.experiments import ExperimentError, stroke, sweep, system_errors, system_run
+from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
+from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.experiments.sweep import TrialError
 from flexsheet.launch.experiments.true_geometry import place_edges
 from flexsheet.launch.methods import system_chart
@@ -28,12 +30,15 @@ from flexsheet.launch.methods.configurations import (
     CONTROL,
     CONTROL_AGAIN,
     FINEST,
+    PAPER,
     choose_cheapest,
     list_configurations,
     select_configurations,
 )
 from flexsheet.launch.plans.plan import load_graph, load_scene
-from flexsheet.messages.scene import Methods, Scene
+from flexsheet.messages.apparatus import nominal_apparatus
+from flexsheet.messages.methods import Methods
+from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Interval
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
@@ -152,21 +157,21 @@ def test_the_sheets_error_is_split_into_its_stages() -> None:
     scene = scene.model_copy(update={"object": turned})
     recording, times = make_recording(scene, 0.002, 0.001, 0.0004)
     level = stroke.SampledMotion(times, np.zeros((len(times), 1)))
-    parts = system_run.split_sheet_error(recording, level, times)
+    parts = system_errors.split_sheet_error(recording, level.values, times)
     expected = [[-0.002, 0.0, 0.0], [0.0, 0.0, 0.001], [0.002, 0.0, -0.0004]]
     assert parts.mean(axis=1) == pytest.approx(np.array(expected), abs=1e-9)
     assert parts.sum(axis=0)[0] == pytest.approx([0.0, 0.0, 0.0006], abs=1e-9)
     lowered = stroke.SampledMotion(times, np.full((len(times), 1), 0.001))
-    whole = system_run.split_sheet_error(recording, lowered, times).sum(axis=0)
+    whole = system_errors.split_sheet_error(recording, lowered.values, times).sum(axis=0)
     assert whole[0] == pytest.approx([0.0, 0.0, -0.0004], abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["light-touch", "plane"])
 def test_the_stroke_stays_on_the_object_within_the_scenes_speed(name: str) -> None:
     scene = load_scene(SCENES / f"{name}.yaml")
-    path = system_run.make_stroke(scene, 6.0)
+    path = system_errors.make_stroke(scene, 6.0)
     touching = path.positions_world_m[1:-1]
-    speeds = np.linalg.norm(np.diff(touching, axis=0), axis=1) / system_run.SAMPLE_S
+    speeds = np.linalg.norm(np.diff(touching, axis=0), axis=1) / system_errors.SAMPLE_S
     assert speeds.max() <= 1.05 * scene.working_range.speed_m_per_s
     half_m = 0.5 * touchable(scene)[1]
     front = map_to_surface(scene, np.array([[0.0, 0.0, 0.0]]))[0]
@@ -215,8 +220,10 @@ def test_a_configuration_sets_the_methods_of_all_nodes(planned: system_chart.Sce
     assert len(names) == 12 * 6  # five configurations and the control again
     assert names.count(CONTROL) == names.count(CONTROL_AGAIN) == 12
     trial = planned.trials["block-001-most-exact"]
-    assert trial["apparatus"] == "seed:100,modern,calibrated"
-    assert planned.trials["block-000-paper"]["apparatus"] is None
+    errors = planned.trials["errors-100"]
+    assert errors["apparatus"] == "seed:100,modern,calibrated"
+    assert planned.trials[system_chart.NOMINAL]["apparatus"] is None
+    assert errors["configurations"]["paper"]["planner"] == {"prediction_horizon_s": 0.0}
     graph = load_graph(Path(trial["launch_file"]), settings=trial["settings"])
     assert graph.scene is not None
     assert graph.scene["name"] == "light-touch"
@@ -273,7 +280,8 @@ def simulate_trials(planned: system_chart.SceneTrials) -> dict[str, dict[str, An
         rows[trial] = make_row(
             arm_ms * drift[block] * noise[0], sheet_mm * noise[1], cores=cores * noise[2]
         )
-    return rows
+    errors = {name: make_row(1.0, sheet_mm) for name, (_, sheet_mm, _) in FIGURES.items()}
+    return rows | {name: errors for name in planned.trials if name.startswith("errors-")}
 
 
 def test_points_have_the_figures_their_spread_and_a_verdict(
@@ -305,29 +313,42 @@ def test_points_have_the_figures_their_spread_and_a_verdict(
     assert ratio["low"] < 13.0 / 11.0 < ratio["high"]
     noise = points[CONTROL_AGAIN]["ratio_to_control"]["exposure_to_arm_ms.p50"]
     assert noise["low"] < 1.0 < noise["high"]
-    assert points[CONTROL]["random_apparatuses"]["runs"] == 6
-    assert points[CONTROL]["random_apparatuses"]["within_tolerances"] == 6
+    assert points[CONTROL]["random_apparatuses"]["runs"] == 3
+    assert points[CONTROL]["random_apparatuses"]["within_tolerances"] == 3
     front = system_chart.find_system_front(list(points.values()))
     assert "paper" not in front  # as fast as the cheapest, and less exact
     assert "most exact" in front
 
 
-def test_an_error_that_is_within_its_tolerance_by_less_than_its_spread_fails() -> None:
+def test_a_latency_that_is_within_its_tolerance_by_less_than_its_spread_fails() -> None:
     scene = load_scene(LIGHT)
-    errors = np.linspace(0.8, 1.15, 9)
-    rows = {CONTROL: {block: make_row(9.0, error) for block, error in enumerate(errors)}}
-    point = system_chart.summarize_configuration(scene, CONTROL, rows, set(range(9)))
-    assert point["sheet_mm"] < 1.0
-    assert point["failing"] == ["sheet_mm.p95"]
+    latencies = np.linspace(11.0, 15.5, 9)
+    rows = {CONTROL: {block: make_row(value, 0.5) for block, value in enumerate(latencies)}}
+    point = system_chart.summarize_configuration(scene, CONTROL, rows, make_row(1.0, 0.5), [])
+    assert point["exposure_to_arm_ms"]["p95"] < 15.0
+    assert point["failing"] == ["exposure_to_arm_ms.p95"]
 
 
 def test_a_graph_without_image_or_force_has_no_error_of_them() -> None:
     scene = load_scene(LIGHT)
     absent = {"image_mm": None, "force_percent": None, "exposure_to_light_ms": None}
-    rows = {CONTROL: {block: make_row(9.0, 0.5) | absent for block in range(3)}}
-    point = system_chart.summarize_configuration(scene, CONTROL, rows, {0, 1, 2})
+    row = make_row(9.0, 0.5) | absent
+    rows = {CONTROL: dict.fromkeys(range(3), row)}
+    point = system_chart.summarize_configuration(scene, CONTROL, rows, row, [])
     assert point["meets_tolerances"]
     assert point["image_mm"] is point["force_percent"] is point["exposure_to_light_ms"] is None
+
+
+def test_methods_change_the_errors_of_the_stages_that_they_belong_to() -> None:
+    scene = load_scene(SCENES / "rigid-plane.yaml")
+    calibrations = NodeCalibrations.of(load_graph(DEMO_FILE))
+    errors = system_errors.ErrorEvaluator(
+        scene, nominal_apparatus(scene), calibrations, seconds=2.0, seed=3
+    )
+    exact, paper = (errors.evaluate(one, {}) for one in (FINEST, PAPER))
+    assert exact["image_mm"] is exact["force_percent"] is None
+    assert exact["fingertip_mm"]["p95"] < 0.5 * paper["fingertip_mm"]["p95"]
+    assert errors.evaluate(FINEST, {}) == exact
 
 
 @pytest.fixture
@@ -339,7 +360,8 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> list[Mapping[str, Any]]:
         ran.append(trial)
         if len(ran) == 3:
             raise TrialError("the node planner has ended")
-        return make_row(10.0, 0.5)
+        row = make_row(10.0, 0.5)
+        return row if trial["kind"] == "system" else dict.fromkeys(("paper", CONTROL), row)
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
     monkeypatch.setattr(
@@ -360,7 +382,7 @@ def test_the_command_draws_the_chart_and_continues(
     tmp_path: Path, trials: list[Mapping[str, Any]]
 ) -> None:
     first = run_chart(tmp_path)
-    assert len(trials) == 6
+    assert len(trials) == 8  # errors with two apparatuses, two blocks of three runs
     assert [one["configuration"] for one in first["points"]] == ["paper", CONTROL, CONTROL_AGAIN]
     (failure,) = first["failed"]
     assert failure["error"] == "the node planner has ended"
@@ -372,7 +394,7 @@ def test_the_command_draws_the_chart_and_continues(
     assert "<svg" in (tmp_path / "system.svg").read_text()
     assert json.loads((tmp_path / "system.json").read_text()) == first
     again = run_chart(tmp_path)
-    assert len(trials) == 7  # only the failed trial ran again
+    assert len(trials) == 9  # only the failed trial ran again
     assert again["failed"] == []
 
 

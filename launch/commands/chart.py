@@ -94,8 +94,8 @@ def chart(
             metavar="N",
             min=0,
             max=100,
-            help="For system: number of random samples of inaccurate hardware (apparatuses); every "
-            "other repetition uses one.",
+            help="For system: number of random samples of inaccurate hardware (apparatuses) for "
+            "which the errors are computed.",
         ),
     ] = 5,
     configurations: Annotated[

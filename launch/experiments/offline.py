@@ -23,6 +23,7 @@ from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.stroke import project_presented_point
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.methods import Correction, SheetShapeMethod
 from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
@@ -197,7 +198,7 @@ class OfflineEvaluator:
     """Evaluator of the errors of apparatuses (true hardware parameters) of one scene.
 
     metres_per_px: resolution of the images. cells: number of node intervals per side of the mesh of
-    the true sheet.
+    the true sheet. correction, sheet_shape: methods of the renderer.
 
     Its methods raise ExperimentError if the equations of the sheet or the arms have no solution.
     """
@@ -209,8 +210,11 @@ class OfflineEvaluator:
         *,
         metres_per_px: float = METRES_PER_PX,
         cells: int = CELLS,
+        correction: Correction = "two_pass",
+        sheet_shape: SheetShapeMethod = "reduced_order",
     ) -> None:
         self._metres_per_px, self._cells = metres_per_px, cells
+        self._correction, self._sheet_shape = correction, sheet_shape
         given = calibrations or NodeCalibrations()
         self._scene = scene
         self._geometry = StereoGeometry.of(scene.camera, given.stereo)
@@ -225,9 +229,12 @@ class OfflineEvaluator:
 
     @cached_property
     def _renderer(self) -> SceneRenderer:
-        basis = deflection_cache.load_or_compute(self._scene, None)
         return SceneRenderer(
-            self._scene, headless_context(), spacing_m=RENDERER_SPACING_M, basis=basis
+            self._scene,
+            headless_context(),
+            spacing_m=RENDERER_SPACING_M,
+            basis=deflection_cache.load_or_compute(self._scene, None),
+            sheet_shape=self._sheet_shape,
         )
 
     def evaluate(
@@ -436,7 +443,7 @@ class OfflineEvaluator:
             finger_tip=None if tip is None else tip + tip_error,
         )
         assert believed is not None
-        ramps = draw_coordinate_ramps(self._renderer, "two_pass", believed)
+        ramps = draw_coordinate_ramps(self._renderer, self._correction, believed)
         true_edges = arms.hold(edges)
         sheet = solve(
             true_rubber(scene.sheet, apparatus),

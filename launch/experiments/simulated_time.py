@@ -2,9 +2,9 @@
 
 The nodes' methods are called at the simulated times at which the nodes would call them: at the
 exposure, when its image arrives, when its target takes effect, and in each arm cycle. Results do
-not depend on the load of the computer and are reproducible. Images, the path check before the first
-motion, the synchronization of the arms, and stops are not simulated. The soft body applies no
-force, so that the sheet keeps its stretch.
+not depend on the load of the computer and are reproducible. The path check before the first motion,
+the synchronization of the arms, and stops are not simulated; images only on request. The soft body
+applies no force, so that the sheet keeps its stretch.
 
 The ground truth comes from the simulator: camera, servos, flange compliance and sheet surface.
 """
@@ -23,6 +23,7 @@ from flexsheet.launch.bags.report.followed import FollowedFinger
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.stroke import (
     SampledMotion,
+    StrokeRecording,
     make_edge_row,
     make_motion,
     object_pose,
@@ -33,8 +34,11 @@ from flexsheet.launch.experiments.stroke import (
 )
 from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges
 from flexsheet.messages.apparatus import Apparatus, ArmTruth, CameraTruth, nominal_apparatus
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import FingerPath, Phase, Side, SoftBody
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import FingerPath, Fingertip, Phase, Side, SoftBody, StereoPair
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import FOLLOW_BOUNDS, extrapolate_goal
 from flexsheet.nodes.arm_bridge.limiter import limit_velocity
@@ -51,13 +55,17 @@ from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.timing import update_horizon_s
 from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlanner
 from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
+from flexsheet.nodes.triangulator.node import Triangulator
+from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.arms import ArmMechanics, Servo
+from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.finger import FingerMotion, find_tremor_m, validate_path
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, VoluntaryPath
 from flexsheet.nodes.twin.nail import Nail
+from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
@@ -89,7 +97,8 @@ class LoopSettings:
     bridges know the true servo lag of the arms, for comparison with runs in which they measure it.
     computing_s: time from the end of the read-out to the published target. calibrations: those of
     the nodes, with which they see the finger through the true camera; None: they know camera,
-    marker and exposure times exactly.
+    marker and exposure times exactly. with_images: whether the triangulator node finds the marker
+    in simulated images by the scene's methods, instead of in positions with noise.
     """
 
     tracking: str = "adaptive"
@@ -98,6 +107,7 @@ class LoopSettings:
     lag_known: bool = False
     computing_s: float = COMPUTING_S
     calibrations: NodeCalibrations | None = None
+    with_images: bool = False
 
 
 class MeasuredFinger:
@@ -147,6 +157,62 @@ class MeasuredFinger:
             pad = found.point_world - self._believed_marker_m
             self._tracker.update(at_ns, pad, found.covariance)
         return self._tracker.predict_at(at_ns, self._horizons_s).path
+
+
+class FilmedFinger:
+    """Simulated camera that takes images, and the triangulator node that finds the finger there."""
+
+    def __init__(self, scene: Scene, apparatus: Apparatus, settings: LoopSettings) -> None:
+        true_scene, self._truth = apply_apparatus(scene, apparatus), apparatus.camera
+        self._exposure_s = scene.camera.exposure_s
+        self._random = np.random.default_rng(settings.seed)
+        self._camera = TwinCamera(
+            rig.make_true_camera(true_scene.camera),
+            finger_radius_m=true_scene.finger.radius_m,
+            seed=settings.seed,
+            clutter=CLUTTER["lab"],
+            nail=Nail.of(apparatus.finger),
+            skew_s=apparatus.camera.skew_s,
+        )
+        self._found: Fingertip | None = None
+        self._node = Triangulator(
+            TriangulatorParameters(), name="triangulator", clock=VirtualClock(), send=self._keep
+        )
+        given = settings.calibrations or NodeCalibrations()
+        self._node.calibration, self._node.marker_calibration = given.stereo, given.marker
+        self._node.on_scene(scene, self._stamp(0))
+
+    def _keep(self, _: Topic, message: Message, __: Header) -> None:
+        if isinstance(message, Fingertip):
+            self._found = message
+
+    @staticmethod
+    def _stamp(at_ns: int) -> Header:
+        return Header(1, at_ns, at_ns, "virtual", "camera", 1)
+
+    def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
+        """Take images of the finger at a timestamp; return its predicted path (n, 3), m.
+
+        position_world, velocity: true position and velocity (3,) of the finger at the timestamp.
+        """
+        late_s = self._truth.stamp_offset_s
+        if self._truth.exposure_jitter_s:
+            late_s += self._truth.exposure_jitter_s * float(self._random.standard_normal())
+        left, right = self._camera.picture(
+            lambda offset_s: position_world + (late_s + offset_s) * velocity,
+            exposure_s=self._exposure_s,
+            time_s=1e-9 * at_ns,
+        )
+        pair = StereoPair(
+            device=self._camera.camera.device,
+            exposure_s=self._exposure_s,
+            dropped_frames=0,
+            left=left,
+            right=right,
+        )
+        self._node.on_stereo(pair, self._stamp(at_ns))
+        assert self._found is not None
+        return self._found.predicted_path_world_m
 
 
 class SimulatedArm:
@@ -289,13 +355,17 @@ class SimulatedLoop:
         self.sheet = SimulatedSheet(
             scene, apparatus, self.planner.motion, lag_known=settings.lag_known
         )
-        self._tracked = MeasuredFinger(scene, apparatus, settings)
+        track = FilmedFinger if settings.with_images else MeasuredFinger
+        self._tracked = track(scene, apparatus, settings)
+        self._fixed_horizon_s = parameters.prediction_horizon_s
         self.fingertip = np.zeros(3)
         self.period_s = 1.0 / (apparatus.camera.rate_hz or scene.camera.rate_hz)
         read_out_s = apparatus.camera.read_out_s
         read_out_s = READ_OUT_S if read_out_s is None else read_out_s
         self._age_s = 0.5 * scene.camera.exposure_s + read_out_s + settings.computing_s
         self._horizon_s = self._age_s + SENDING_S + SERVO_LAG_S
+        if self._fixed_horizon_s is not None:
+            self._horizon_s = self._fixed_horizon_s
         self._target, self._valid_at_s, self._commanded_s = self.planner.motion, 0.0, 0.0
 
     @property
@@ -324,7 +394,8 @@ class SimulatedLoop:
         arms = self.sheet.arms
         needed_s = self._age_s + SENDING_S + 0.5 * (arms[0].lag_s + arms[1].lag_s)
         before_s = self._horizon_s
-        self._horizon_s = update_horizon_s(before_s, needed_s, PREDICTION_S)
+        if self._fixed_horizon_s is None:
+            self._horizon_s = update_horizon_s(before_s, needed_s, PREDICTION_S)
         arrives_s = exposed_s + self._age_s + SENDING_S
         self.run_cycles(arrives_s)
         planner = self.planner
@@ -395,14 +466,19 @@ def follow_in_simulated_time(
     }
 
 
-def stroke_in_simulated_time(
-    scene: Scene, apparatus: Apparatus, settings: LoopSettings, seconds: float
-) -> dict[str, dict[str, float]]:
-    """Simulate the experiment `stroke`; return its errors in mm and degrees as `stroke_result`.
+def record_in_simulated_time(
+    scene: Scene,
+    apparatus: Apparatus,
+    settings: LoopSettings,
+    path: FingerPath,
+    span_s: tuple[float, float],
+) -> StrokeRecording:
+    """Simulate the sheet for a finger path with tremor; return what a bag would contain.
 
-    The settings must have calibrations. The errors delta_d_mm are those that the devices report.
+    span_s: interval of the path in which fingertips are recorded. The settings must have
+    calibrations.
     """
-    given, path = settings.calibrations, stroke_path(scene, seconds)
+    given = settings.calibrations
     force_model = make_force_model(scene.sheet, None if given is None else given.sheet)
     compliance = ComplianceController(scene, force_model, "force_curve")
     loop = SimulatedLoop(scene, apparatus, settings, compliance)
@@ -415,7 +491,7 @@ def stroke_in_simulated_time(
         tremor_m=find_tremor_m(apparatus.finger, path.tremor_m),
         max_speed_m_per_s=scene.finger.max_speed_m_per_s,
     )
-    begin_s, end_s = stroke_window_s(seconds)
+    begin_s, end_s = span_s
     rows: list[tuple[int, Floats]] = []
     number, done = 0, False
     while not done:
@@ -431,14 +507,42 @@ def stroke_in_simulated_time(
         SampledMotion(samples.times_ns, samples.values[:, columns])
         for columns in (slice(0, 3), slice(3, 6))
     )
+    reported, edges = (
+        (make_motion(left, "edge"), make_motion(right, "edge"))
+        for left, right in (loop.sheet.reported_rows, loop.sheet.rows)
+    )
+    return StrokeRecording(
+        scene=scene,
+        fingertip=measured,
+        measured=measured,
+        finger=true,
+        windows_ns={path.label: (int(samples.times_ns[0]), int(samples.times_ns[-1]))},
+        measured_edges=reported,
+        true_edges=edges,
+        delays_s={},
+        drops=0,
+        surface=SheetSurface.of(scene, None),
+        true_surface=SheetSurface.of(scene, apparatus),
+    )
+
+
+def stroke_in_simulated_time(
+    scene: Scene, apparatus: Apparatus, settings: LoopSettings, seconds: float
+) -> dict[str, dict[str, float]]:
+    """Simulate the experiment `stroke`; return its errors in mm and degrees as `stroke_result`.
+
+    The settings must have calibrations. The errors delta_d_mm are those that the devices report.
+    """
+    recorded = record_in_simulated_time(
+        scene, apparatus, settings, stroke_path(scene, seconds), stroke_window_s(seconds)
+    )
+    true, measured = recorded.finger, recorded.fingertip
     results = {}
-    for prefix, tip, edge_rows, given_truth in (
-        ("true_", true, loop.sheet.rows, apparatus),
-        ("", measured, loop.sheet.reported_rows, None),
+    for prefix, tip, edges, surface in (
+        ("true_", true, recorded.true_edges, recorded.true_surface),
+        ("", measured, recorded.measured_edges, recorded.surface),
     ):
-        left, right = (make_motion(list(one), "edge") for one in edge_rows)
-        surface = SheetSurface.of(scene, given_truth)
-        errors = sheet_errors(scene, tip, (left, right), samples.times_ns, surface=surface)
+        errors = sheet_errors(scene, tip, edges, true.times_ns, surface=surface)
         results[f"{prefix}delta_d_mm"] = summary(errors[0], 1e3)
         results[f"{prefix}delta_theta_deg"] = summary(errors[1], math.degrees(1.0))
     off = np.linalg.norm(measured.values - true.values, axis=1)
@@ -514,15 +618,15 @@ def touch_in_simulated_time(
     )
 
 
-def make_soft_body(curve: Floats) -> SoftBody:
-    """Return a soft body at rest with this force curve (m, 2)."""
+def make_soft_body(curve: Floats, stiffness_n_per_m: float = 0.0) -> SoftBody:
+    """Return a soft body at rest with this force curve (m, 2) and stiffness."""
     return SoftBody(
         mesh_id="",
         method="curve",
         in_range=True,
         push_depth_m=0.0,
         force_world_n=np.zeros(3),
-        stiffness_n_per_m=0.0,
+        stiffness_n_per_m=stiffness_n_per_m,
         force_curve=curve,
         displacement_world_m=np.zeros((0, 3), dtype=np.float32),
     )

@@ -20,17 +20,18 @@ from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.offline import Metric, OfflineEvaluator, exceeded_tolerances
 from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import (
-    make_settings,
     make_stroke_procedure,
     require_scene,
     run_experiment,
 )
-from flexsheet.launch.experiments.system_run import METRES_PER_PX, run_system
+from flexsheet.launch.experiments.system_errors import ErrorEvaluator
+from flexsheet.launch.experiments.system_run import run_system
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import nominal_apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.methods import Methods
 from flexsheet.messages.types import Status, SuspectedCause
 from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
 
@@ -190,19 +191,25 @@ def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_system_trial(trial: Mapping[str, Any]) -> Row:
-    """Run one configuration of the graph; return its speed and its errors."""
+    """Run one configuration of the graph; return its processor use and latencies."""
     launch_file = Path(trial["launch_file"])
-    coarse = make_settings(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
-    settings = [*choose_ports(launch_file), *coarse, *trial["settings"]]
+    settings = [*choose_ports(launch_file), *trial["settings"]]
     with _bag_of(trial) as bag:
-        return run_system(
-            launch_file,
-            settings,
-            bag,
-            float(trial["seconds"]),
-            _tell,
-            apparatus=trial["apparatus"],
-        )
+        return run_system(launch_file, settings, bag, float(trial["seconds"]), _tell)
+
+
+def run_system_errors_trial(trial: Mapping[str, Any]) -> Row:
+    """Return the errors of several configurations with one apparatus, in simulated time."""
+    plan = load_graph(Path(trial["launch_file"]), apparatus=trial["apparatus"])
+    scene = require_scene(plan)
+    apparatus = plan.apparatus_message() or nominal_apparatus(scene)
+    evaluator = ErrorEvaluator(
+        scene, apparatus, NodeCalibrations.of(plan), float(trial["seconds"]), int(trial["seed"])
+    )
+    return {
+        name: evaluator.evaluate(Methods.model_validate(one["methods"]), one["planner"])
+        for name, one in trial["configurations"].items()
+    }
 
 
 KINDS: dict[str, Callable[[Mapping[str, Any]], Row]] = {
@@ -210,6 +217,7 @@ KINDS: dict[str, Callable[[Mapping[str, Any]], Row]] = {
     "robustness": run_robustness_trial,
     "sensitivity": run_sensitivity_trial,
     "system": run_system_trial,
+    "system errors": run_system_errors_trial,
 }
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.precompute import (
     precompute_deflection_shapes,
     precompute_force_table,
-    precompute_soft_body,
 )
 from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
@@ -30,6 +30,7 @@ NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
     "sheet_force": ("planner", "sheet_force"),
     "sheet_shape": ("renderer", "sheet_shape"),
     "correction": ("renderer", "correction"),
+    "compliance": ("planner", "compliance_mode"),
 }
 """Node type, and its parameter that selects the method, for each key of `Methods`."""
 
@@ -52,15 +53,14 @@ PAPER = Methods(
     sheet_shape="four_triangles",
     correction="four_triangles",
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.0045),
+    compliance="stiffness",
 )
-"""Methods of Furukawa et al. 2007, sections III and IV: no filter, linear FEM, four triangles."""
+"""Methods of Furukawa et al. 2007, sections III and IV: no filter, linear FEM, four triangles, and
+stiffness rendered by the sheet's stretch only."""
 
-PAPER_PARAMETERS = (
-    ("planner", "prediction_horizon_s=0"),
-    ("planner", "compliance_mode=stiffness"),
-)
-"""Parameters for the same paper, which does not compensate the delay (section V-C), and renders
-stiffness by the sheet's stretch only (section III-B)."""
+PAPER_PLANNER = {"prediction_horizon_s": 0.0}
+"""Parameters of the planner for the same paper, which does not compensate the delay (section V-C).
+"""
 
 FINEST = NODE_DEFAULTS.model_copy(
     update={
@@ -72,15 +72,17 @@ FINEST = NODE_DEFAULTS.model_copy(
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """Methods of all nodes, with further parameters given as (node type, "parameter=value")."""
+    """Methods of all nodes, with further parameters of the planner by name."""
 
     name: str
     methods: Methods
-    parameters: tuple[tuple[str, str], ...] = ()
+    planner: Mapping[str, float] = field(default_factory=dict)
 
     def settings(self, graph: ResolvedGraph) -> list[str]:
         """Return the settings "node.parameter=value" that apply this configuration to a graph."""
-        chosen = list(self.parameters)
+        # Tables are not computed in the background, which would disturb the measurement.
+        chosen = [("fem_solver", "compute_table=false")]
+        chosen += [("planner", f"{key}={value}") for key, value in self.planner.items()]
         for key, (node_type, parameter) in NODE_PARAMETERS.items():
             method = getattr(self.methods, key)
             if method is not None:
@@ -96,14 +98,18 @@ class Configuration:
         ]
 
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
-        """Compute and cache the tables that the methods need, so that no run has to."""
-        if self.methods.sheet_shape == "reduced_order":
+        """Compute and cache the tables of the sheet that the methods need, so that no run has to.
+
+        A missing table of the soft body is not computed; the linear method then replaces it.
+        """
+        if self.methods.sheet_shape == "reduced_order" and scene.projector is not None:
             precompute_deflection_shapes(scene, None, progress)
         if self.methods.sheet_force == "table":
             precompute_force_table(scene, None, progress)
-        body = self.methods.soft_body
-        if body is not None and body.method == "nonlinear_table":
-            precompute_soft_body(scene, body.skin_spacing_m, None, None, progress)
+
+    def describe(self) -> dict[str, Any]:
+        """Return methods and parameters of the planner, for a trial in simulated time."""
+        return {"methods": self.methods.model_dump(mode="json"), "planner": dict(self.planner)}
 
 
 def choose_cheapest(scene: Scene) -> Methods:
@@ -158,7 +164,7 @@ def list_configurations(scene: Scene) -> list[Configuration]:
     """
     tuned = choose_tuned(scene)
     found = [
-        Configuration("paper", PAPER, PAPER_PARAMETERS),
+        Configuration("paper", PAPER, PAPER_PLANNER),
         Configuration("cheapest in range", choose_cheapest(scene)),
         Configuration("default", NODE_DEFAULTS),
         Configuration(TUNED, tuned),

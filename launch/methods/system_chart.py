@@ -1,9 +1,10 @@
 """Measure speed and accuracy of the whole system for several configurations of its methods.
 
-Each trial is a separate process that starts the graph, see `experiments/system_run.py`. A block
-contains all configurations. Blocks alternate between the nominal apparatus (true parameters of the
-simulated hardware) and random ones. Errors are 95 % values of a run. Results are medians over
-blocks with their confidence intervals.
+Processor use and latency are measured in the running graph (`experiments/system_run.py`). A block
+contains all configurations; results are medians over blocks with their confidence intervals. Errors
+are 95 % values, computed in simulated time (`experiments/system_errors.py`) for the nominal
+apparatus (true parameters of the simulated hardware) and for random ones. Each trial is a separate
+process.
 """
 
 from __future__ import annotations
@@ -44,6 +45,9 @@ from flexsheet.nodes.twin.tolerance_table import Profile
 
 Progress = Callable[[str], None]
 
+NOMINAL = "errors-nominal"
+"""Name of the trial that computes the errors with the nominal apparatus."""
+
 FIRST_SEED = 100
 """Seed of the first random apparatus; smaller seeds are for development."""
 
@@ -74,12 +78,18 @@ class SceneTrials:
     common: Mapping[str, Any]
 
 
-def choose_apparatus(block: int, apparatuses: int) -> str | None:
-    """Return the apparatus of a block: None (nominal) in every other block, else a random one."""
-    if apparatuses == 0 or block % 2 == 0:
-        return None
-    seed = FIRST_SEED + (block // 2) % apparatuses
-    return apparatus_text(seed, Profile.MODERN, calibrated=True)
+def describe_errors(
+    launch: Path, configurations: Sequence[Configuration], apparatus: str | None, seconds: float
+) -> dict[str, Any]:
+    """Describe a trial that computes the errors of configurations with one apparatus."""
+    return {
+        "kind": "system errors",
+        "launch_file": str(launch),
+        "configurations": {one.name: one.describe() for one in configurations},
+        "apparatus": apparatus,
+        "seconds": seconds,
+        "seed": FINGER_SEED,
+    }
 
 
 def plan_trials(
@@ -91,15 +101,39 @@ def plan_trials(
     apparatuses: int,
     configurations: Sequence[str] = (),
 ) -> SceneTrials:
-    """Describe the trials of one scene in the order in which they run."""
+    """Describe the trials of one scene: errors first, then the blocks in random order."""
     scene = load_scene(scene_file)
-    chosen = select_configurations(scene, configurations)
+    return plan_configurations(
+        scene_file,
+        select_configurations(scene, configurations),
+        folder,
+        blocks=blocks,
+        seconds=seconds,
+        apparatuses=apparatuses,
+    )
+
+
+def plan_configurations(
+    scene_file: Path,
+    chosen: Sequence[Configuration],
+    folder: Path,
+    *,
+    blocks: int,
+    seconds: float,
+    apparatuses: int = 0,
+) -> SceneTrials:
+    """Describe the trials of some configurations; the control, if among them, runs twice."""
     folder.mkdir(parents=True, exist_ok=True)
     launch = write_launch_file(DEMO_FILE, scene_file, folder / "launch.yaml").resolve()
     graph = load_graph(launch)
     settings = {one.name: one.settings(graph) for one in chosen}
-    settings[CONTROL_AGAIN] = settings[CONTROL]
-    trials, places = {}, {}
+    if CONTROL in settings:
+        settings[CONTROL_AGAIN] = settings[CONTROL]
+    trials: dict[str, Mapping[str, Any]] = {NOMINAL: describe_errors(launch, chosen, None, seconds)}
+    for seed in range(FIRST_SEED, FIRST_SEED + apparatuses):
+        text = apparatus_text(seed, Profile.MODERN, calibrated=True)
+        trials[f"errors-{seed}"] = describe_errors(launch, chosen, text, seconds)
+    places = {}
     for block, order in enumerate(order_blocks(list(settings), blocks, seed=ORDER_SEED)):
         for name in order:
             trial = f"block-{block:03d}-{name.replace(', ', '-').replace(' ', '-')}"
@@ -108,17 +142,15 @@ def plan_trials(
                 "kind": "system",
                 "launch_file": str(launch),
                 "settings": [*settings[name], *_set_seed(graph, block)],
-                "apparatus": choose_apparatus(block, apparatuses),
                 "seconds": seconds,
             }
     common = {
         "experiment": "system",
         **describe_graph(graph, launch, ()),
         "seconds": seconds,
-        "apparatuses": apparatuses,
-        "configurations": settings,
+        "configurations": {one.name: one.describe() for one in chosen},
     }
-    return SceneTrials(scene_file, scene, trials, places, tuple(chosen), common)
+    return SceneTrials(scene_file, load_scene(scene_file), trials, places, tuple(chosen), common)
 
 
 def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
@@ -127,45 +159,10 @@ def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
     return [f"{node.name}.seed={seed}" for node in graph.nodes_of_type("twin_finger")]
 
 
-def plan_configuration(
-    scene_file: Path,
-    configuration: Configuration,
-    folder: Path,
-    *,
-    runs: int,
-    seconds: float,
-) -> SceneTrials:
-    """Describe the trials of one configuration with the nominal apparatus."""
-    folder.mkdir(parents=True, exist_ok=True)
-    launch = write_launch_file(DEMO_FILE, scene_file, folder / "launch.yaml").resolve()
-    graph = load_graph(launch)
-    trial = {
-        "kind": "system",
-        "launch_file": str(launch),
-        "apparatus": None,
-        "seconds": seconds,
-    }
-    trials = {
-        f"run-{number:03d}": {
-            **trial,
-            "settings": [*configuration.settings(graph), *_set_seed(graph, number)],
-        }
-        for number in range(runs)
-    }
-    places = {name: (number, configuration.name) for number, name in enumerate(trials)}
-    common = {
-        "experiment": "proposal",
-        **describe_graph(graph, launch, ()),
-        "seconds": seconds,
-        "configuration": configuration.settings(graph),
-    }
-    return SceneTrials(scene_file, load_scene(scene_file), trials, places, (configuration,), common)
-
-
 def run_scene(planned: SceneTrials, folder: Path, progress: Progress) -> dict[str, Row]:
     """Run the trials that have no result yet; return all results by trial name.
 
-    Tables that the methods need are computed before, so that they do not affect the measurement.
+    Tables of the sheet that the methods need are computed before.
     """
     for one in planned.configurations:
         one.prepare(planned.scene, progress)
@@ -254,36 +251,52 @@ def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[
 
     Omit those that have no successful run.
     """
-    found: dict[str, dict[int, Row]] = {}
-    for name, row in rows.items():
-        block, configuration = planned.places[name]
-        if "error" not in row:
-            found.setdefault(configuration, {})[block] = row
-    nominal = {
-        block
-        for name, (block, _) in planned.places.items()
-        if planned.trials[name]["apparatus"] is None
-    }
+    nominal: Mapping[str, Any] = _good(rows, NOMINAL)
+    speeds: dict[str, list[Row]] = {}
+    for name, (_, configuration) in planned.places.items():
+        speeds.setdefault(configuration, []).append(_good(rows, name))
+    seeds = [name for name in planned.trials if name.startswith("errors-") and name != NOMINAL]
+    random = [_good(rows, name) for name in seeds]
     return [
-        summarize_configuration(planned.scene, one.name, found, nominal)
+        summarize_configuration(
+            planned.scene,
+            one.name,
+            {name: {i: row for i, row in enumerate(own) if row} for name, own in speeds.items()},
+            nominal[source],
+            [row[source] for row in random if source in row],
+        )
         for one in (*planned.configurations, Configuration(CONTROL_AGAIN, planned.scene.methods))
-        if found.get(one.name)
+        if (source := CONTROL if one.name == CONTROL_AGAIN else one.name) in nominal
+        and any(speeds.get(one.name, ()))
     ]
 
 
-def summarize_configuration(
-    scene: Scene, name: str, rows: Mapping[str, Mapping[int, Row]], nominal: set[int]
-) -> dict[str, Any]:
-    """Summarize one configuration in a point of the chart. rows: by configuration and block.
+def _good(rows: Mapping[str, Row], name: str) -> Row:
+    """Return the row of a trial; an empty one if the trial failed."""
+    row = rows.get(name, {})
+    return {} if "error" in row else row
 
-    Absolute values are medians over the blocks with the nominal apparatus; if all of these failed,
-    over all blocks. Ratios to the control use all blocks in which both have a row.
+
+def summarize_configuration(
+    scene: Scene,
+    name: str,
+    rows: Mapping[str, Mapping[int, Row]],
+    errors: Row,
+    random: Sequence[Row],
+) -> dict[str, Any]:
+    """Summarize one configuration in a point of the chart.
+
+    rows: processor use and latencies by configuration and block. errors, random: errors with the
+    nominal apparatus and with each random one. Ratios to the control use all blocks in which both
+    have a row.
     """
     own, control = rows[name], rows.get(CONTROL, {})
-    blocks = sorted(set(own) & nominal) or sorted(own)
-    random = [own[block] for block in sorted(set(own) - nominal)]
+    blocks = sorted(own)
 
     def estimate(key: str) -> Interval | None:
+        if key.partition(".")[0] in ERRORS:
+            value = read_value(errors, key)
+            return Interval(value, value, value) if np.isfinite(value) else None
         return bootstrap_median(np.array([read_value(own[block], key) for block in blocks]))
 
     def summarize_latency(key: str) -> dict[str, float] | None:
@@ -325,7 +338,7 @@ def summarize_configuration(
             )
             is not None
         },
-        "budget": _median_by_key([own[block]["budget"] for block in blocks]),
+        "budget": errors["budget"],
         "random_apparatuses": {
             "runs": len(random),
             "within_tolerances": sum(

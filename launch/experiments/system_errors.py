@@ -1,0 +1,318 @@
+"""Compute the errors of a configuration of the system in simulated time, without running nodes.
+
+The finger strokes around the object while the triangulator finds it in simulated images, and
+planner and arms follow. Images and forces are evaluated with the sheet at rest. The results do not
+depend on the load of the computer. All errors are relative to the simulator's ground truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from flexsheet.launch.experiments import compliance, stroke
+from flexsheet.launch.experiments.force_reference import find_reference_curve
+from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
+from flexsheet.launch.experiments.offline import Metric, OfflineEvaluator
+from flexsheet.launch.experiments.simulated_time import (
+    LoopSettings,
+    make_soft_body,
+    record_in_simulated_time,
+)
+from flexsheet.launch.experiments.stroke import (
+    SampledMotion,
+    StrokeRecording,
+    compute_sheet_planes,
+    object_pose,
+    project_presented_point,
+)
+from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
+from flexsheet.launch.methods.blocks import attribute_error
+from flexsheet.messages.apparatus import Apparatus
+from flexsheet.messages.methods import Methods, SoftBodyChoice
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import FingerPath, SoftBody
+from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.cache import default_cache_dir
+from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
+from flexsheet.nodes.models.rigid import apply, inverse
+from flexsheet.nodes.models.shapes import Nearest, make_shape
+from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
+from flexsheet.nodes.planner.compliance_controller import ComplianceController
+from flexsheet.nodes.planner.force_table import load_force_model
+from flexsheet.nodes.planner.hand_bounds import load_or_compute_bounds
+from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.planner.sheet_force import make_force_model
+from flexsheet.nodes.planner.trajectory import SheetTrajectoryPlanner
+from flexsheet.nodes.twin.force_history import compute_history_ratios
+from flexsheet.nodes.twin.membrane import solve
+from flexsheet.nodes.twin.paths import map_to_surface, touchable
+from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_surface import SheetSurface
+from flexsheet.nodes.twin.truth import apply_apparatus
+
+STROKE = "system stroke"
+TOUCH_M = 0.001
+"""Push depth during the stroke. It keeps the finger in contact despite drift and tremor."""
+
+STROKED_RATIO = 0.9
+"""Fraction of the touchable arc length of the object that is stroked."""
+
+SAMPLE_S = 0.05
+MAX_STEP_RAD = 0.1
+"""Maximum phase of the stroke between two points of its path."""
+
+APPROACH_S = 1.0
+WARM_UP_S = 0.5
+"""Time after the approach in which errors are not evaluated, until the sheet has settled."""
+
+HOVER_M = 0.03
+METRES_PER_PX = 0.0014
+"""Resolution of the images; the error map interpolates between the drawn coordinates."""
+
+FORCE_STEP_S, FORCE_REST_S = 1.0 / 60.0, 1.5
+"""Time step of the planner during a push, and duration of the rest before a force is evaluated."""
+
+STAGES = ("fingertip", "planner and arms", "geometry of the arms")
+"""Stages whose errors add up to the sheet's error: measured minus true finger; sheet computed from
+the arms' measured joints minus measured finger; true sheet minus that computed sheet."""
+
+
+def make_stroke(scene: Scene, seconds: float, label: str = STROKE) -> FingerPath:
+    """Make a finger path that strokes back and forth around the object, up to the scene's speed."""
+    half_m = 0.5 * STROKED_RATIO * touchable(scene)[1]
+    frequency_rad_per_s = scene.working_range.speed_m_per_s / half_m
+    times = np.arange(0.0, seconds, min(SAMPLE_S, MAX_STEP_RAD / frequency_rad_per_s))
+    arcs = half_m * np.sin(frequency_rad_per_s * times)
+    places = np.column_stack([np.zeros_like(arcs), arcs, np.full_like(arcs, -TOUCH_M)])
+    first, last = ([*place[:2], HOVER_M] for place in (places[0], places[-1]))
+    lift_s = HOVER_M / max(scene.working_range.speed_m_per_s, compliance.PUSH_M_PER_S)
+    return FingerPath(
+        label=label,
+        times_s=np.concatenate([[0.0], APPROACH_S + times, [APPROACH_S + seconds + lift_s]]),
+        positions_world_m=map_to_surface(scene, np.vstack([first, places, last])),
+        wander_m=stroke.WANDER_M,
+        tremor_m=stroke.TREMOR_M,
+    )
+
+
+@dataclass(slots=True)
+class ErrorEvaluator:
+    """Evaluator of configurations of one scene with one apparatus (true hardware parameters).
+
+    seconds: duration of the stroke. seed: random seed of the finger. Results of methods that
+    several configurations have in common are computed once.
+    """
+
+    scene: Scene
+    apparatus: Apparatus
+    calibrations: NodeCalibrations
+    seconds: float
+    seed: int
+    _known: dict[tuple[Any, ...], Any] = field(default_factory=dict)
+
+    def evaluate(self, methods: Methods, planner: Mapping[str, Any]) -> dict[str, Any]:
+        """Return mean, p95 and maximum of each error, or None for one that the scene lacks.
+
+        methods: all methods of the configuration. planner: further parameters of the planner.
+        budget: share of each stage of `STAGES` in the sheet's mean square error.
+        """
+        has_image, has_force = self.scene.projector is not None, self.scene.object.material
+        moving = (methods.marker, methods.tracking, *planner.items())
+        drawn = (methods.correction, methods.sheet_shape)
+        pressed = (methods.sheet_force, methods.soft_body, methods.compliance)
+        return {
+            **self._once(moving, lambda: self._stroke(methods, planner)),
+            "image_mm": self._once(drawn, lambda: self._image(methods)) if has_image else None,
+            "force_percent": self._once(pressed, lambda: self._force(methods))
+            if has_force
+            else None,
+        }
+
+    def _once(self, key: tuple[Any, ...], compute: Any) -> Any:
+        if key not in self._known:
+            self._known[key] = compute()
+        return self._known[key]
+
+    def _stroke(self, methods: Methods, planner: Mapping[str, Any]) -> dict[str, Any]:
+        path = make_stroke(self.scene, self.seconds)
+        scene = self.scene.model_copy(update={"methods": methods})
+        settings = LoopSettings(
+            seed=self.seed, planner=planner, calibrations=self.calibrations, with_images=True
+        )
+        begin_s = APPROACH_S + WARM_UP_S
+        span_s = begin_s, APPROACH_S + self.seconds
+        recorded = record_in_simulated_time(scene, self.apparatus, settings, path, span_s)
+        times = recorded.finger.times_ns
+        errors = split_sheet_error(recorded, np.zeros((len(times), 1)), times)
+        off_m = np.linalg.norm(recorded.fingertip.values - recorded.finger.values, axis=1)
+        return {
+            "sheet_mm": summarize_errors(1e3 * np.linalg.norm(errors.sum(axis=0), axis=1)),
+            "fingertip_mm": summarize_errors(1e3 * off_m),
+            "budget": dict(zip(STAGES, attribute_error(errors).tolist(), strict=True)),
+        }
+
+    def _image(self, methods: Methods) -> dict[str, float] | None:
+        evaluator = OfflineEvaluator(
+            self.scene,
+            self.calibrations,
+            metres_per_px=METRES_PER_PX,
+            correction=methods.correction or "two_pass",
+            sheet_shape=methods.sheet_shape or "reduced_order",
+        )
+        maps = evaluator.evaluate(self.apparatus, frozenset({Metric.IMAGE})).image_m or ()
+        sizes_mm = [1e3 * np.linalg.norm(one, axis=2).ravel() for one in maps]
+        found = np.concatenate(sizes_mm)
+        return summarize_errors(found[np.isfinite(found)])
+
+    def _force(self, methods: Methods) -> dict[str, float] | None:
+        """Return the errors (%) of the force that the finger feels while it rests at depths.
+
+        The reference is the stored solution of an independent solver. Where the file contains none
+        for the scene, it is the force of the configuration's own soft body.
+        """
+        scene, truth = self.scene, apply_apparatus(self.scene, self.apparatus)
+        press = compliance.make_presses(scene)[0]
+        body = load_body(scene, methods.soft_body)
+        expected = find_reference_curve(scene, *press.place_m)
+        rubber, friction = true_rubber(truth.sheet, self.apparatus), true_friction(self.apparatus)
+        arms, push = ArmPair(scene, self.apparatus), self._make_push(methods, body)
+        ratios, errors = compute_history_ratios(self.apparatus), list[float]()
+        for hold in press.holds:
+            tip = press.surface - hold.depth_m * press.normal
+            motion = push.rest_at(tip, press.surface)
+            edges = place_edges(motion.world_from_sheet, scene.sheet.width_m * motion.stretch_ratio)
+            sheet = solve(
+                rubber,
+                *arms.hold(edges),
+                finger_tip=tip,
+                finger_radius_m=truth.finger.radius_m,
+                friction_coefficient=friction,
+            )
+            reference = None if expected is None else expected.force(hold.depth_m)
+            curve = body.force_curve
+            wanted_n = float(np.interp(hold.depth_m, curve[:, 0], curve[:, 1]))
+            if reference is not None:
+                wanted_n = reference.force_n
+            felt_n = ratios * float(sheet.finger_force_n @ press.normal)
+            errors += (
+                100.0 * np.abs(felt_n - wanted_n) / max(wanted_n, FORCE_JND_FLOOR_N)
+            ).tolist()
+        return summarize_errors(np.array(errors))
+
+    def _make_push(self, methods: Methods, body: SoftBody) -> RestingPush:
+        scene, given = self.scene.model_copy(update={"methods": methods}), self.calibrations
+        mode = PlannerParameters().choose_compliance(scene)
+        model = (
+            load_force_model(scene, methods.sheet_force or "scaled", None)[0]
+            if given.sheet is None
+            else make_force_model(scene.sheet, given.sheet)
+        )
+        bounds = load_or_compute_bounds(scene.camera.rate_hz, None)
+        controller = ComplianceController(
+            scene, model, mode, bounds=bounds if mode == "force_curve" else None
+        )
+        controller.update(body, in_contact=False)
+        offset = OfflineEvaluator(scene, given).evaluate(
+            self.apparatus, frozenset({Metric.FINGERTIP})
+        )
+        assert offset.fingertip_m is not None
+        planner = SheetTrajectoryPlanner(scene, PlannerParameters().trajectory_settings())
+        return RestingPush(planner, controller, offset.fingertip_m[0])
+
+
+@dataclass(slots=True)
+class RestingPush:
+    """Planned sheet for a finger that moves in and rests.
+
+    measured_m: measured minus true fingertip (3,).
+    """
+
+    planner: SheetTrajectoryPlanner
+    controller: ComplianceController
+    measured_m: Floats
+
+    def rest_at(self, tip: Floats, surface: Floats) -> Any:
+        """Return the sheet's motion after the finger has moved to a point (3,) and rested there."""
+        finger = tip + self.measured_m
+        if not self.planner.in_contact:
+            for _ in range(round(FORCE_REST_S / FORCE_STEP_S)):
+                self._step(surface + self.measured_m)
+        for _ in range(round(FORCE_REST_S / FORCE_STEP_S)):
+            motion = self._step(finger)
+        return motion
+
+    def _step(self, finger: Floats) -> Any:
+        return self.planner.follow_finger(
+            finger, np.zeros(3), self.controller, FORCE_STEP_S, finger
+        ).motion
+
+
+@cache
+def _load_curve(scene_json: str, method: str, spacing_m: float) -> SoftBody:
+    scene = Scene.model_validate_json(scene_json)
+    factory = SoftBodyFactory(skin_spacing_m=spacing_m, cache_dir=default_cache_dir())
+    bodies = factory.bodies(scene, method, lambda *_: None)  # type: ignore[arg-type]
+    rest = bodies[0].at_rest()
+    return make_soft_body(rest.force_curve, rest.stiffness_n_per_m)
+
+
+def load_body(scene: Scene, choice: SoftBodyChoice | None) -> SoftBody:
+    """Return the soft body at rest of a scene, by a method and skin spacing.
+
+    As in the solver node, the linear method replaces a table that is not computed.
+    """
+    method, spacing_m = (
+        ("linear", 0.003)
+        if choice is None
+        else (
+            choice.method,
+            choice.skin_spacing_m,
+        )
+    )
+    return _load_curve(scene.model_dump_json(), method, spacing_m)
+
+
+def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: Any) -> Floats:
+    """Split the sheet's error into the errors of the stages `STAGES`, (3, n, 3) m.
+
+    The total is the object's point nearest to the true finger, moved inward by the commanded
+    offset (n, 1), minus the contact point of the true sheet. Vectors are in the object's frame.
+    """
+    world_from_object = object_pose(recording.scene)
+    object_from_world = inverse(world_from_object)
+    shape = make_shape(dict(recording.scene.object.geometry))
+
+    def find_contact(finger: SampledMotion) -> tuple[Nearest, Floats]:
+        foot = shape.closest(apply(object_from_world, finger.interpolate(times_ns)))
+        return foot, foot.point - offsets_m * foot.normal
+
+    def present(
+        edges: tuple[SampledMotion, SampledMotion], foot: Nearest, surface: SheetSurface | None
+    ) -> Floats:
+        planes = compute_sheet_planes(edges, world_from_object, times_ns)
+        if surface is not None:
+            planes = surface.find_tangent_planes(planes, foot.point, world_from_object[1, :3])
+        return project_presented_point(foot, planes.points, planes.normals)
+
+    true_foot, wanted = find_contact(recording.finger)
+    measured_foot, aimed = find_contact(recording.fingertip)
+    whole = wanted - present(recording.true_edges, true_foot, recording.true_surface)
+    fingertip = wanted - aimed
+    control = aimed - present(recording.measured_edges, measured_foot, recording.surface)
+    return np.stack([fingertip, control, whole - fingertip - control])
+
+
+def summarize_errors(values: Floats) -> dict[str, float] | None:
+    """Return mean, 95 % quantile and maximum of values (n,); None if there are no values."""
+    if len(values) == 0:
+        return None
+    return {
+        "mean": float(values.mean()),
+        "p95": float(np.quantile(values, 0.95)),
+        "max": float(values.max()),
+    }
