@@ -24,6 +24,7 @@ class NodeRole(StrEnum):
     """
 
     ARM_BRIDGE = "arm_bridge"
+    ARM_SIMULATOR = "arm_simulator"
     CAMERA = "camera"
     CLOCK = "clock"
     CONSOLE = "console"

@@ -258,7 +258,7 @@ def without(key: str) -> Callable[[str], str]:
         (without("device"), "device: Field required"),
         (lambda text: text + "\nflavour: salt\n", "flavour: Extra inputs"),
         (lambda text: text.replace("width_px: 480", "width_px: wide"), "width_px: .*valid integer"),
-        (lambda text: text[: len(text) // 3] + "\n{", "not YAML"),
+        (lambda text: text[: len(text) // 3] + "\n{", "not a valid calibration file"),
         (lambda text: "", 'does not contain the key "version"'),
     ],
     ids=["version", "no version", "missing", "foreign", "type", "cut", "empty"],

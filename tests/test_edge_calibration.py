@@ -126,7 +126,7 @@ def test_the_bridge_measures_the_sheet_that_it_commands(stretch: float) -> None:
 
 def test_too_few_poses_and_confused_arms_are_refused() -> None:
     _, poses = held_poses(3)
-    with pytest.raises(EdgeFitError, match=r"left arm: 5 poses .* at least 8"):
+    with pytest.raises(EdgeFitError, match=r"left arm: .* in 5 poses, but at least 8 are needed"):
         fit_edges(poses[:5], SCENE)
     confused = [
         replace(pose, left_rad=other.left_rad)

@@ -352,7 +352,7 @@ def test_a_board_behind_the_camera_is_rejected(tmp_path: Path) -> None:
     (tmp_path / TABLE).write_text(
         f"{header},board_rx_rad,board_ry_rad,board_rz_rad\n0,25,119,0,-54,0,0,0,-0.5,0,0,0\n"
     )
-    with pytest.raises(ArmPosesError, match="row 2: the board is behind a camera"):
+    with pytest.raises(ArmPosesError, match="row 2: the board would be behind a camera"):
         read_detections(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
 
 
@@ -506,7 +506,7 @@ def test_images_of_another_size_or_without_a_board(tmp_path: Path) -> None:
         ("[1]", 'does not contain the key "version"'),
         ("version: 99", "version: expected 1, found 99"),
         ("version: 1", "date"),
-        ("a: [", "not YAML"),
+        ("a: [", "not a valid calibration file"),
     ],
 )
 def test_a_bad_calibration_file_is_named(tmp_path: Path, text: str | None, words: str) -> None:

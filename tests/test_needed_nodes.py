@@ -134,3 +134,9 @@ def test_missing_parts_are_named() -> None:
     values["object"]["support"] = None
     with pytest.raises(ValueError, match="support is missing"):
         Scene.model_validate(values)
+
+
+def test_a_solver_whose_fingertip_a_bag_provides_is_started() -> None:
+    plan = load_graph(LAUNCH / "replay.yaml")
+    assert "fem_solver" in plan.nodes
+    assert plan.omitted == ()

@@ -87,7 +87,7 @@ def test_the_table_is_computed_once_in_the_nodes_cache(
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (("--scheduler", "tcp://127.0.0.1:9"), "applies to the nonlinear table only"),
+        (("--scheduler", "tcp://127.0.0.1:9"), "add --skin-spacing"),
         (("--skin-spacing", "0.009"), "skin_spacing_m: 0.009 is more than finger.radius_m"),
         (
             ("--skin-spacing", str(SPACING_M), "--scheduler", "tcp://127.0.0.1:9"),

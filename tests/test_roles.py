@@ -86,5 +86,6 @@ def test_the_shipped_nodes_have_their_roles() -> None:
         "console": NodeRole.CONSOLE,
         "recorder": NodeRole.RECORDER,
         "renderer": NodeRole.RENDERER,
+        "twin_arms": NodeRole.ARM_SIMULATOR,
         "twin_finger": NodeRole.FINGER_SIMULATOR,
     }

@@ -72,7 +72,7 @@ def commission(
         float | None,
         typer.Option(
             "--sheet-kg-per-m2",
-            metavar="KG/M2",
+            metavar="DENSITY",
             min=0.0,
             help="Measured mass per area of the sheet, which determines its sag.",
         ),

@@ -36,7 +36,10 @@ def remove_features(scene: Scene, features: Collection[Feature]) -> Scene:
 
 
 def omit_unneeded(
-    entries: list[NodeEntry], scene: Scene | None, needed: Collection[str]
+    entries: list[NodeEntry],
+    scene: Scene | None,
+    needed: Collection[str],
+    external: Collection[str] = (),
 ) -> tuple[list[NodeEntry], list[OmittedNode]]:
     """Return the nodes that are started, and the omitted nodes with the reasons.
 
@@ -44,7 +47,7 @@ def omit_unneeded(
     of the graph publishes scenes, it may later publish one that needs more nodes, so the scene is
     ignored.
 
-    needed: topics that command-line tools read.
+    needed: topics that command-line tools read. external: topics that they write.
     """
     fixed = scene
     if any(topic.name == "scene" for entry in entries for _, topic in entry.topics("output")):
@@ -57,7 +60,7 @@ def omit_unneeded(
         if fixed is not None:
             entry.disconnect(entry.type.unused_inputs(entry.parameters, fixed))
     while True:
-        found = next(_find_unneeded(kept, fixed, needed), None)
+        found = next(_find_unneeded(kept, fixed, needed, external), None)
         if found is None:
             return kept, omitted
         entry, reason = found
@@ -68,9 +71,13 @@ def omit_unneeded(
 
 
 def _find_unneeded(
-    entries: list[NodeEntry], scene: Scene | None, needed: Collection[str]
+    entries: list[NodeEntry],
+    scene: Scene | None,
+    needed: Collection[str],
+    external: Collection[str],
 ) -> Iterator[tuple[NodeEntry, OmissionReason]]:
     writers = {topic.name for entry in entries for _, topic in entry.topics("output")}
+    writers |= EXTERNAL_TOPICS.union(external)
     for entry in entries:
         if entry.type is None or entry.parameters is None or entry.spec.always:
             continue
@@ -82,7 +89,7 @@ def _find_unneeded(
             readers = (_list_read_topics(other) for other in entries if other is not entry)
             if not outputs & set(needed).union(*readers):
                 yield entry, OmissionReason.NO_READER
-            elif not _required_inputs(entry) <= writers | EXTERNAL_TOPICS:
+            elif not _required_inputs(entry) <= writers:
                 yield entry, OmissionReason.NO_WRITER
 
 

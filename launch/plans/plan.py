@@ -107,7 +107,7 @@ def load_graph(
     scene_file = None if scene_document is None else scene_document.path
     truth = _load_apparatus(apparatus, scene, scene_file, document)
     give_apparatus(entries, truth, document)
-    entries, omitted = omit_unneeded(entries, scene, needed)
+    entries, omitted = omit_unneeded(entries, scene, needed, spec.external_topics)
     writers = list_writers(
         spec,
         entries,

@@ -65,6 +65,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import find_topic
 from flexsheet.messages.types import NodeProcess
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.runner import NodeConfig, PortConfig, ProcessConfig
 
 SOFTWARE = Path(__file__).resolve().parents[2]
@@ -409,14 +410,23 @@ class RunningGraph:
                 self._run.end()
 
     async def _end_children(self) -> None:
-        """End all processes. Nodes that only read topics end last, to receive final messages."""
+        """End all processes.
+
+        Simulated arms end after their bridges, which command them to stop. Nodes that only read
+        topics end last, to receive final messages.
+        """
         readers = {
             name
             for name, process in self._processes.items()
             if all(_only_reads(node) for node in process.nodes)
         }
-        writers = self._children.keys() - readers
-        for names in (writers, readers):
+        arms = {
+            name
+            for name, process in self._processes.items()
+            if {node.role for node in process.nodes} == {NodeRole.ARM_SIMULATOR}
+        }
+        others = self._children.keys() - readers - arms
+        for names in (others, arms, readers):
             await _terminate([self._children[name] for name in names if name in self._children])
 
     def _start(self) -> None:

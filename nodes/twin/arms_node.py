@@ -17,6 +17,7 @@ from flexsheet.messages.apparatus import ArmTruth, nominal_apparatus
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
 from flexsheet.nodes.node import Input, Node, Output, periodic
@@ -107,6 +108,7 @@ def joint_torques_nm(
 class TwinArmsNode(Node):
     """Simulate both arms with the sheet between them; they start when the first scene arrives."""
 
+    role: ClassVar[NodeRole | None] = NodeRole.ARM_SIMULATOR
     opens_devices: ClassVar[bool] = True
 
     parameters: TwinArmsParameters
