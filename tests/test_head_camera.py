@@ -124,6 +124,7 @@ class Harness:
     def __init__(self, capture: FakeCapture) -> None:
         self.capture, self.clock = capture, VirtualClock()
         self.pixels: Floats | None = project(eyes_at(CENTRE))
+        self.search_ns = 0
         self.sent: list[Eye] = []
         self.thread_names: set[str] = set()
         pose = {"position_m": CAMERA_M.tolist(), "rpy_rad": [-TILT_RAD, 0.0, np.pi]}
@@ -136,6 +137,7 @@ class Harness:
 
     def detect(self, image: Any) -> Floats | None:
         self.thread_names.add(threading.current_thread().name)
+        self.clock.move_to(self.clock.now_ns() + self.search_ns)
         return self.pixels
 
     async def next_eye(self, step_ns: int = 100_000_000) -> Eye:
@@ -201,6 +203,20 @@ async def test_without_a_face_the_eyes_are_invalid_and_keep_their_position(
         np.testing.assert_allclose(found.centre_world_m, moved, atol=1e-4)
 
 
+async def test_silence_makes_the_eyes_invalid_until_the_next_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with running(monkeypatch) as harness:
+        await harness.next_eye()
+        harness.clock.move_to(harness.clock.now_ns() + 200_000_000)
+        await harness.node.watch()
+        assert harness.sent[-1].valid, "the last image is new"
+        harness.clock.move_to(harness.clock.now_ns() + 10**9)
+        await harness.node.watch()
+        assert not harness.sent[-1].valid
+        assert (await harness.next_eye(step_ns=0)).valid
+
+
 async def test_implausible_eyes_are_invalid(monkeypatch: pytest.MonkeyPatch) -> None:
     async with running(monkeypatch) as harness:
         harness.pixels = project(eyes_at(CENTRE + np.array([0.0, 0.0, 2.0])))
@@ -214,6 +230,17 @@ async def test_images_above_the_rate_limit_are_not_searched(
     async with running(monkeypatch) as harness:
         first = await harness.next_eye()
         harness.capture.deliver()  # no time has passed
+        second = await harness.next_eye()
+        assert harness.sent == [first, second]
+
+
+async def test_an_image_that_waited_during_a_slow_search_is_not_searched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with running(monkeypatch) as harness:
+        harness.search_ns = 10**9
+        first = await harness.next_eye()
+        harness.capture.deliver()  # it arrived during the search
         second = await harness.next_eye()
         assert harness.sent == [first, second]
 

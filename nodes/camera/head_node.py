@@ -28,6 +28,8 @@ from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
 JOIN_S = 1.0
+DRAIN_NS = 10_000_000
+"""Time after a search in which images are discarded, because they waited in the driver's queue."""
 PixelCount = Annotated[int, Field(gt=0)]
 
 
@@ -67,7 +69,9 @@ class HeadCameraParameters(NodeParameters):
         description="increase of the cutoff frequency per speed of the head, Hz per m/s",
     )
     silence_s: Positive = Field(
-        default=0.3, description="time without detected eyes until the filter is reset, s"
+        default=0.3,
+        description="time without eyes until the filter is reset, and without an image until the "
+        "eyes are invalid, s",
     )
     retry_s: Positive = Field(
         default=2.0, description="time until a camera that failed is opened again, s"
@@ -166,10 +170,14 @@ class HeadCamera(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Publish invalid eyes while no images arrive."""
-        at_ns = self.clock.now_ns() - round(1e9 * self.parameters.delay_s)
-        last_ns = self._published_ns
-        if last_ns is None or at_ns - last_ns > 1e9 * self.parameters.silence_s:
+        """Publish invalid eyes while no images arrive.
+
+        Their time is that since which they are missing, so that an image that is being searched is
+        newer.
+        """
+        p = self.parameters
+        at_ns = self.clock.now_ns() - round(1e9 * (p.delay_s + p.silence_s))
+        if self._published_ns is None or at_ns > self._published_ns:
             self._publish_invalid(at_ns)
 
 
@@ -229,8 +237,8 @@ class FaceReader(threading.Thread):
                         f"{p.device!r}: delivers images of {width}x{height} px instead of "
                         f"{p.width_px}x{p.height_px} px; set width_px, height_px and the lens"
                     )
-                due_ns = now_ns + round(1e9 / p.max_rate_hz)
                 pixels = detect(convert_to_gray(image))
+                due_ns = max(now_ns + round(1e9 / p.max_rate_hz), self._now() + DRAIN_NS)
                 if not self.stopping.is_set():
                     self._deliver(now_ns - round(1e9 * p.delay_s), pixels)
         finally:
