@@ -50,6 +50,7 @@ NODES: dict[str, str] = {
     "camera": "flexsheet.nodes.camera.node:Camera",
     "triangulator": "flexsheet.nodes.triangulator.node:Triangulator",
     "osc_input": "flexsheet.nodes.triangulator.osc_node:OscInput",
+    "head_camera": "flexsheet.nodes.camera.head_node:HeadCamera",
     "planner": "flexsheet.nodes.planner.node:Planner",
     "arm_bridge": "flexsheet.nodes.arm_bridge.node:ArmBridge",
     "fem_solver": "flexsheet.nodes.fem_solver.node:FemSolver",

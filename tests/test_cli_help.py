@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from importlib.metadata import version
@@ -193,6 +194,36 @@ def test_the_shell_completes(
     with pytest.raises(SystemExit):
         cli.main()
     assert offered in capsys.readouterr().out.split()
+
+
+BASH_COMPLETION = """
+source <(flexsheet --show-completion bash)
+read -r -a COMP_WORDS <<< "$1"
+COMP_CWORD=$((${#COMP_WORDS[@]} - 1))
+$(complete -p flexsheet | sed -E 's/.* -F ([^ ]+) .*/\\1/') flexsheet
+printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="bash is not installed")
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [("flexsheet to", ["topic"]), ("flexsheet topic echo fing", ["fingertip"])],
+)
+def test_bash_runs_the_generated_completion_script(
+    words: str, offered: list[str], tmp_path: Path
+) -> None:
+    """Bash reads the script and calls its function, as it does when the user presses Tab."""
+    command = tmp_path / "flexsheet"
+    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m flexsheet "$@"\n')
+    command.chmod(0o755)
+    path = f"{tmp_path}:{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "--norc", "-c", BASH_COMPLETION, "bash", words], cwd=ROOT,
+        env={**os.environ, "PATH": path}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.split() == offered
+    assert done.stderr == ""
 
 
 def test_files_are_offered_by_their_suffix(tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ PYTHONS = [
     for line in PROJECT["classifiers"]
     if (found := re.fullmatch(r"Programming Language :: Python :: (3\.\d+)", line))
 ]
+MANUAL_PAGE = "share/man/man1/flexsheet.1"
 CATEGORIES = {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
 
 READ_ALL = """
@@ -79,7 +80,11 @@ print(json.dumps({
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the wheel from the source archive, as `make release` does."""
     folder = tmp_path_factory.mktemp("release")
-    archive = build(link_sources(folder / "sources"), "build_sdist")
+    sources = link_sources(folder / "sources")
+    page = sources / MANUAL_PAGE
+    page.parent.mkdir(parents=True)
+    page.write_text(render())
+    archive = build(sources, "build_sdist")
     with tarfile.open(archive) as packed:
         packed.extractall(folder, filter="data")
     return build(folder / archive.name.removesuffix(".tar.gz"), "build_wheel")
@@ -99,6 +104,7 @@ def test_the_wheel_contains_every_file_of_the_package(wheel: Path) -> None:
         pytest.skip("the tree is no git repository")
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {name.split("/")[0].split("-")[0] for name in names} == {"flexsheet"}
+    assert f"flexsheet-{VERSION}.data/data/{MANUAL_PAGE}" in names
     tracked = (f"flexsheet/{line}" for line in listed.stdout.split() if (ROOT / line).exists())
     assert sorted(set(tracked) - names) == []
 

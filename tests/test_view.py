@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+import signal
 import socket
 import struct
+import sys
 from collections import Counter
 from collections.abc import AsyncIterator, Mapping
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +44,7 @@ from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 from tests.scenes import CYLINDER_FILE, load_cylinder
-from tests.waiting import until
+from tests.waiting import DEADLINE_S, until
 
 SCENE = load_cylinder()
 SUBPROTOCOL = "foxglove.sdk.v1"
@@ -181,19 +183,28 @@ def load_plan(folder: Path) -> ResolvedGraph:
 
 
 @asynccontextmanager
-async def connect(server: LiveServer) -> AsyncIterator[Viewer]:
+async def connect_to(server: LiveServer) -> AsyncIterator[Viewer]:
+    async with connect(f"ws://127.0.0.1:{server.port}") as viewer:
+        await until(lambda: len(viewer.channels) == len(server.channels), "the channels")
+        yield viewer
+        assert viewer.socket.close_code is None
+
+
+@asynccontextmanager
+async def connect(address: str) -> AsyncIterator[Viewer]:
     async with websockets.connect(
-        f"ws://127.0.0.1:{server.port}",
+        address,
         subprotocols=[SUBPROTOCOL],  # type: ignore[list-item]
         max_size=None,
         close_timeout=0.1,  # the server of the SDK answers no close
     ) as socket:
         viewer = Viewer(socket)
         listening = asyncio.create_task(viewer.listen())
-        await until(lambda: len(viewer.channels) == len(server.channels), "the channels")
-        yield viewer
-        assert not listening.done()
-        listening.cancel()
+        try:
+            yield viewer
+        finally:
+            listening.cancel()
+            await asyncio.gather(listening, return_exceptions=True)
 
 
 @asynccontextmanager
@@ -221,7 +232,7 @@ def short_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 async def test_a_viewer_gets_numbers_poses_images_and_the_scene(short_folder: Path) -> None:
     names = ("fingertip", "tf", "tf_static", "apparatus", "sheet", "object", "finger",
              "joint_states", "stereo/left", "stereo/left/calibration")  # fmt: skip
-    async with live(short_folder) as (server, graph), connect(server) as viewer:
+    async with live(short_folder) as (server, graph), connect_to(server) as viewer:
         await viewer.subscribe(*names)
         await graph.publish_until(lambda: set(names) <= viewer.received.keys(), "scene", *EXTERNAL)
 
@@ -296,7 +307,7 @@ def world_poses(found: dict[str, Any]) -> dict[str, Any]:
 
 
 async def test_topics_are_read_only_for_subscribers(short_folder: Path) -> None:
-    async with live(short_folder) as (server, graph), connect(server) as viewer:
+    async with live(short_folder) as (server, graph), connect_to(server) as viewer:
         await until(lambda: server.topics_read == ALWAYS_READ, "only small topics")
         await viewer.subscribe("stereo/right")
         await until(lambda: server.topics_read == {*ALWAYS_READ, "stereo"}, "the images")
@@ -306,7 +317,7 @@ async def test_topics_are_read_only_for_subscribers(short_folder: Path) -> None:
 
 
 async def test_parameters_are_shown_and_cannot_be_changed(short_folder: Path) -> None:
-    async with live(short_folder) as (server, graph), connect(server) as viewer:
+    async with live(short_folder) as (server, graph), connect_to(server) as viewer:
         status = make_status()
         await viewer.send("subscribeParameterUpdates", parameterNames=["planner.max_spin_rad"])
 
@@ -347,7 +358,7 @@ def make_status() -> Status:
 
 
 async def test_viewers_can_neither_publish_nor_call(short_folder: Path) -> None:
-    async with live(short_folder) as (server, graph), connect(server) as viewer:
+    async with live(short_folder) as (server, graph), connect_to(server) as viewer:
         info = viewer.last("serverInfo")
         assert info is not None
         assert set(info["capabilities"]) == {"parameters", "parametersSubscribe", "time"}
@@ -391,6 +402,29 @@ def test_the_command_prints_address_and_layout(
         refused = run(occupied.getsockname()[1])
     assert refused.exit_code != 0
     assert "choose another port" in str(refused.exception)
+
+
+@pytest.mark.parametrize("connected", [False, True])
+async def test_ctrl_c_ends_the_command_at_once(short_folder: Path, connected: bool) -> None:
+    (short_folder / "plan.json").write_text(load_plan(short_folder).model_dump_json())
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "flexsheet", "view", "--run", short_folder, "--port", "0", "--json",
+        stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+    )  # fmt: skip
+    assert process.stdout is not None
+    async with AsyncExitStack() as stack:
+        stack.callback(lambda: process.returncode is None and process.kill())
+        printed = json.loads(await process.stdout.readline())
+        if connected:
+            viewer = await stack.enter_async_context(connect(printed["address"]))
+            await until(lambda: "tf_static" in viewer.channels, "the channels")
+            await viewer.subscribe("tf_static")
+            await until(lambda: "tf_static" in viewer.received, "a message")
+        process.send_signal(signal.SIGINT)
+        async with asyncio.timeout(DEADLINE_S):
+            _, errors = await process.communicate()
+    assert process.returncode == 0, errors.decode()
+    assert "Traceback" not in errors.decode()
 
 
 @pytest.mark.parametrize("topic", TOPICS)

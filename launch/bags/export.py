@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from flexsheet.launch.ros2.mapping import CONTEXT_TOPICS, SHEET_COLOUR, find_sheet_corners
 from flexsheet.launch.viewing.json_channel import make_schema
@@ -54,14 +53,20 @@ from flexsheet.messages.types import (
 try:
     import foxglove
     from foxglove import messages as fg
+
+    from flexsheet.launch.viewing.foxglove_drawing import (
+        SKIN_COLOUR,
+        draw_finger,
+        draw_mesh,
+        make_estop_log,
+        make_frame,
+        make_stamp,
+    )
 except ImportError:
     HAS_FOXGLOVE = False
 else:
     HAS_FOXGLOVE = True
 
-SKIN_COLOUR = (0.85, 0.55, 0.50, 1.0)
-FINGER_COLOUR = (0.30, 0.65, 0.45, 1.0)
-LOST_COLOUR = (0.60, 0.60, 0.60, 0.5)
 FINGER_RADIUS_M = 0.007
 
 NamedImage = tuple[str, NDArray[np.uint8]]
@@ -200,53 +205,35 @@ class ViewState:
 
     def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
         """Yield the images and 3D data of a message as (channel, Foxglove message)."""
-        stamp = fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
+        stamp = make_stamp(at_ns)
         match message:
             case Scene():
                 self.scene = message
             case Skin():
                 self.skin = message
-                yield "object", _mesh("object", message.vertices_world_m, message.triangles, stamp)
+                yield "object", self._object(message.vertices_world_m, stamp)
             case SoftBody() if self.skin is not None and self.skin.mesh_id == message.mesh_id:
                 deformed = self.skin.vertices_world_m + message.displacement_world_m
-                yield "object", _mesh("object", deformed, self.skin.triangles, stamp)
+                yield "object", self._object(deformed, stamp)
             case Fingertip():
-                yield "finger", self._finger(message, stamp)
+                radius_m = self.scene.finger.radius_m if self.scene else FINGER_RADIUS_M
+                yield "finger", draw_finger(message, radius_m, stamp)
             case SheetTarget():
-                yield "tf", _frames({"sheet_target": message.world_from_sheet}, stamp)
+                yield "tf", _frames("sheet_target", message.world_from_sheet, stamp)
             case ArmState():
                 self.flanges[message.side] = message.world_from_flange
-                frame = {f"flange_{message.side}": message.world_from_flange}
-                yield "tf", _frames(frame, stamp)
+                yield "tf", _frames(f"flange_{message.side}", message.world_from_flange, stamp)
                 sheet = self._sheet(stamp)
                 if sheet is not None:
                     yield "sheet", sheet
             case EStop():
-                level = fg.LogLevel.Fatal if message.engaged else fg.LogLevel.Info
-                state = "engaged" if message.engaged else "reset"
-                text = f"e-stop {state}: {message.reason}"
-                yield "log", fg.Log(timestamp=stamp, level=level, message=text, name=topic)
+                yield "log", make_estop_log(message, stamp, topic)
         for name, image in list_images(topic, message):
             yield name, _raw_image(name, image, stamp)
 
-    def _finger(self, message: Fingertip, stamp: Any) -> Any:
-        radius_m = self.scene.finger.radius_m if self.scene else FINGER_RADIUS_M
-        colour = _colour(FINGER_COLOUR if message.valid else LOST_COLOUR)
-        ball = fg.SpherePrimitive(
-            pose=_pose(_translation(message.position_world_m)),
-            size=_vector(np.full(3, 2 * radius_m)),
-            color=colour,
-        )
-        ahead = fg.LinePrimitive(
-            type=fg.LinePrimitiveLineType.LineStrip,
-            thickness=0.001,
-            points=[_point(one) for one in message.predicted_path_world_m],
-            color=colour,
-        )
-        entity = fg.SceneEntity(
-            timestamp=stamp, frame_id="world", id="finger", spheres=[ball], lines=[ahead]
-        )
-        return fg.SceneUpdate(entities=[entity])
+    def _object(self, vertices: NDArray[Any], stamp: Any) -> Any:
+        assert self.skin is not None
+        return draw_mesh("object", vertices, self.skin.triangles, stamp, SKIN_COLOUR)
 
     def _sheet(self, stamp: Any) -> Any | None:
         """Return the sheet, drawn as a flat quadrilateral between both edges; None if unknown."""
@@ -254,7 +241,7 @@ class ViewState:
         if corners is None:
             return None
         triangles = np.array([[0, 2, 1], [1, 2, 3]])
-        return _mesh("sheet", corners, triangles, stamp, SHEET_COLOUR)
+        return draw_mesh("sheet", corners, triangles, stamp, SHEET_COLOUR)
 
 
 def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
@@ -290,36 +277,9 @@ def _channel(name: str, value: Any, context: Any) -> Any:
     return channel_type(name, context=context)
 
 
-def _mesh(
-    name: str,
-    vertices: NDArray[Any],
-    triangles: NDArray[Any],
-    stamp: Any,
-    colour: tuple[float, float, float, float] = SKIN_COLOUR,
-) -> Any:
-    surface = fg.TriangleListPrimitive(
-        pose=_pose(np.eye(4)),
-        points=[_point(vertex) for vertex in vertices],
-        indices=[int(index) for index in np.ravel(triangles)],
-        color=_colour(colour),
-    )
-    entity = fg.SceneEntity(timestamp=stamp, frame_id="world", id=name, triangles=[surface])
-    return fg.SceneUpdate(entities=[entity])
-
-
-def _frames(world_from: dict[str, NDArray[np.float64]], stamp: Any) -> Any:
-    transforms = []
-    for name, matrix in world_from.items():
-        transforms.append(
-            fg.FrameTransform(
-                timestamp=stamp,
-                parent_frame_id="world",
-                child_frame_id=name,
-                translation=_vector(matrix[:3, 3]),
-                rotation=_rotation(matrix),
-            )
-        )
-    return fg.FrameTransforms(transforms=transforms)
+def _frames(child: str, world_from_child: NDArray[np.float64], stamp: Any) -> Any:
+    frame = make_frame("world", child, world_from_child, stamp)
+    return fg.FrameTransforms(transforms=[frame])
 
 
 def _raw_image(name: str, image: NDArray[np.uint8], stamp: Any) -> Any:
@@ -334,30 +294,3 @@ def _raw_image(name: str, image: NDArray[np.uint8], stamp: Any) -> Any:
         step=width * channels,
         data=np.ascontiguousarray(image).tobytes(),
     )
-
-
-def _translation(position: NDArray[np.float64]) -> NDArray[np.float64]:
-    matrix = np.eye(4)
-    matrix[:3, 3] = position
-    return matrix
-
-
-def _pose(matrix: NDArray[np.float64]) -> Any:
-    return fg.Pose(position=_vector(matrix[:3, 3]), orientation=_rotation(matrix))
-
-
-def _vector(vector: NDArray[np.float64]) -> Any:
-    return fg.Vector3(x=vector[0], y=vector[1], z=vector[2])
-
-
-def _rotation(matrix: NDArray[np.float64]) -> Any:
-    x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat()
-    return fg.Quaternion(x=x, y=y, z=z, w=w)
-
-
-def _point(position: NDArray[Any]) -> Any:
-    return fg.Point3(x=float(position[0]), y=float(position[1]), z=float(position[2]))
-
-
-def _colour(rgba: tuple[float, float, float, float]) -> Any:
-    return fg.Color(r=rgba[0], g=rgba[1], b=rgba[2], a=rgba[3])

@@ -56,7 +56,7 @@ JOINTS = 6
 CONTEXT_TOPICS = frozenset({"scene", "skin", "arm_left", "arm_right"})
 """Topics whose latest messages are needed to convert messages of other topics."""
 
-SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
+SHEET_COLOUR = (0.97, 0.93, 0.84, 0.45)
 _TRIANGLE_LIST = 11
 _FLOAT32 = 7
 

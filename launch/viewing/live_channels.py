@@ -22,16 +22,27 @@ import cv2
 import numpy as np
 from foxglove import messages as fg
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from flexsheet.launch.bags.export import list_images
-from flexsheet.launch.ros2.mapping import list_joints
+from flexsheet.launch.ros2.mapping import SHEET_COLOUR, list_joints
 from flexsheet.launch.viewing.apparatus_model import (
     WORLD,
     ApparatusModel,
     Colour,
     Joint,
     make_model,
+)
+from flexsheet.launch.viewing.foxglove_drawing import (
+    SKIN_COLOUR,
+    draw_ball,
+    draw_finger,
+    draw_mesh,
+    make_colour,
+    make_entity,
+    make_estop_log,
+    make_frame,
+    make_pose,
+    make_vector,
 )
 from flexsheet.launch.viewing.json_channel import make_schema, to_json
 from flexsheet.messages.base import Message
@@ -59,10 +70,6 @@ Image = NDArray[np.uint8]
 
 VIEWER = "viewer"
 VIEWER_FROM_WORLD = transform(rotation_from_vector((0.5 * np.pi, 0.0, 0.0)), np.zeros(3))
-SKIN_COLOUR: Colour = (0.84, 0.38, 0.33, 1.0)
-SHEET_COLOUR: Colour = (0.97, 0.93, 0.84, 0.45)
-FINGER_COLOUR: Colour = (0.30, 0.65, 0.45, 1.0)
-LOST_COLOUR: Colour = (0.60, 0.60, 0.60, 0.5)
 EYE_COLOUR: Colour = (0.98, 0.98, 0.98, 1.0)
 EYE_RADIUS_M = 0.011
 SHEET_STEP = 2
@@ -238,33 +245,23 @@ def _make_frames(state: LiveState, message: Message | None, stamp: Any) -> Any:
             named = zip(list_joints(message.side), message.joints_rad.tolist(), strict=True)
             frames = []
             for joint, angle in ((state.joints[name], angle) for name, angle in named):
-                frames.append(_frame(joint.parent, joint.child, joint.pose(angle), stamp))
+                frames.append(make_frame(joint.parent, joint.child, joint.pose(angle), stamp))
         case SheetTarget():
-            frames = [_frame(WORLD, "sheet", message.world_from_sheet, stamp)]
+            frames = [make_frame(WORLD, "sheet", message.world_from_sheet, stamp)]
         case Fingertip() if message.valid:
             pose = transform(np.eye(3), message.position_world_m)
-            frames = [_frame(WORLD, "fingertip", pose, stamp)]
+            frames = [make_frame(WORLD, "fingertip", pose, stamp)]
         case _:
             return None
     return fg.FrameTransforms(transforms=frames)
 
 
 def _make_static_frames(state: LiveState, _: Message | None, stamp: Any) -> Any:
-    frames = [_frame(VIEWER, WORLD, VIEWER_FROM_WORLD, stamp)]
+    frames = [make_frame(VIEWER, WORLD, VIEWER_FROM_WORLD, stamp)]
     for joint in state.model.joints if state.model else ():
         if joint.limit is None:
-            frames.append(_frame(joint.parent, joint.child, joint.parent_from_child, stamp))
+            frames.append(make_frame(joint.parent, joint.child, joint.parent_from_child, stamp))
     return fg.FrameTransforms(transforms=frames)
-
-
-def _frame(parent: str, child: str, pose: Floats, stamp: Any) -> Any:
-    return fg.FrameTransform(
-        timestamp=stamp,
-        parent_frame_id=parent,
-        child_frame_id=child,
-        translation=_vector(pose[:3, 3]),
-        rotation=_rotation(pose),
-    )
 
 
 def _make_joint_states(_: LiveState, message: Message | None, stamp: Any) -> Any:
@@ -284,23 +281,19 @@ def _draw_apparatus(state: LiveState, _: Message | None, stamp: Any) -> Any:
             continue  # the sheet is drawn where it is
         cubes = [
             fg.CubePrimitive(
-                pose=_pose(transform(np.eye(3), box.centre_m)),
-                size=_vector(box.size_m),
-                color=_colour(box.colour),
+                pose=make_pose(transform(np.eye(3), box.centre_m)),
+                size=make_vector(box.size_m),
+                color=make_colour(box.colour),
             )
             for box in link.boxes
         ]
-        entities.append(
-            fg.SceneEntity(
-                timestamp=stamp, frame_id=link.name, id=link.name, frame_locked=True, cubes=cubes
-            )
-        )
+        entities.append(make_entity(link.name, stamp, link.name, frame_locked=True, cubes=cubes))
     eyes, half = state.scene.eyes, 0.5 * state.scene.eyes.interocular_m
     balls = [
-        _ball(eyes.centre_world_m + np.array([x, 0.0, 0.0]), EYE_RADIUS_M, EYE_COLOUR)
+        draw_ball(eyes.centre_world_m + np.array([x, 0.0, 0.0]), EYE_RADIUS_M, EYE_COLOUR)
         for x in (-half, half)
     ]
-    entities.append(_entity("eyes", stamp, spheres=balls))
+    entities.append(make_entity("eyes", stamp, spheres=balls))
     return fg.SceneUpdate(entities=entities)
 
 
@@ -318,7 +311,7 @@ def _draw_sheet(state: LiveState, _: Message | None, stamp: Any) -> Any:
         return None
     grid = points.reshape(ROWS, COLUMNS, 3)[::SHEET_STEP, ::SHEET_STEP]
     triangles = triangulate_grid(*grid.shape[:2])
-    return _mesh("sheet", grid.reshape(-1, 3), triangles, stamp, SHEET_COLOUR)
+    return draw_mesh("sheet", grid.reshape(-1, 3), triangles, stamp, SHEET_COLOUR)
 
 
 def _draw_object(state: LiveState, _: Message | None, stamp: Any) -> Any:
@@ -328,80 +321,21 @@ def _draw_object(state: LiveState, _: Message | None, stamp: Any) -> Any:
     vertices = skin.vertices_world_m
     if isinstance(body, SoftBody) and body.mesh_id == skin.mesh_id:
         vertices = vertices + body.displacement_world_m
-    return _mesh("object", vertices, skin.triangles, stamp, SKIN_COLOUR)
+    return draw_mesh("object", vertices, skin.triangles, stamp, SKIN_COLOUR)
 
 
 def _draw_finger(state: LiveState, message: Message | None, stamp: Any) -> Any:
     if not isinstance(message, Fingertip) or state.scene is None:
         return None
-    colour = FINGER_COLOUR if message.valid else LOST_COLOUR
-    path = fg.LinePrimitive(
-        type=fg.LinePrimitiveLineType.LineStrip,
-        thickness=0.001,
-        points=_points(message.predicted_path_world_m),
-        color=_colour(colour),
-    )
-    ball = _ball(message.position_world_m, state.scene.finger.radius_m, colour)
-    return fg.SceneUpdate(entities=[_entity("finger", stamp, spheres=[ball], lines=[path])])
+    return draw_finger(message, state.scene.finger.radius_m, stamp)
 
 
 def _make_log(_: LiveState, message: Message | None, stamp: Any) -> Any:
     match message:
         case EStop():
-            level = fg.LogLevel.Fatal if message.engaged else fg.LogLevel.Info
-            text = f"e-stop {'engaged' if message.engaged else 'reset'}: {message.reason}"
-            return fg.Log(timestamp=stamp, level=level, message=text, name="estop")
+            return make_estop_log(message, stamp, "estop")
         case Status() if message.state == "degraded" or message.note:
             text = message.note or message.last_error or message.state
             level = fg.LogLevel.Warning
             return fg.Log(timestamp=stamp, level=level, message=text, name=message.node)
     return None
-
-
-def make_stamp(at_ns: int) -> Any:
-    """Make a Foxglove timestamp from a time since 1970, ns."""
-    return fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
-
-
-def _mesh(
-    name: str, vertices: NDArray[Any], triangles: NDArray[Any], stamp: Any, rgba: Colour
-) -> Any:
-    surface = fg.TriangleListPrimitive(
-        pose=_pose(np.eye(4)),
-        points=_points(vertices),
-        indices=np.ravel(triangles).tolist(),
-        color=_colour(rgba),
-    )
-    return fg.SceneUpdate(entities=[_entity(name, stamp, triangles=[surface])])
-
-
-def _entity(name: str, stamp: Any, **shapes: Any) -> Any:
-    return fg.SceneEntity(timestamp=stamp, frame_id=WORLD, id=name, **shapes)
-
-
-def _ball(position_m: Floats, radius_m: float, rgba: Colour) -> Any:
-    pose = _pose(transform(np.eye(3), position_m))
-    return fg.SpherePrimitive(pose=pose, size=_vector((2 * radius_m,) * 3), color=_colour(rgba))
-
-
-def _points(points: NDArray[Any]) -> list[Any]:
-    return [fg.Point3(x=x, y=y, z=z) for x, y, z in points.tolist()]
-
-
-def _pose(matrix: Floats) -> Any:
-    return fg.Pose(position=_vector(matrix[:3, 3]), orientation=_rotation(matrix))
-
-
-def _vector(vector: Any) -> Any:
-    x, y, z = map(float, vector)
-    return fg.Vector3(x=x, y=y, z=z)
-
-
-def _rotation(matrix: Floats) -> Any:
-    x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat().tolist()
-    return fg.Quaternion(x=x, y=y, z=z, w=w)
-
-
-def _colour(rgba: Colour) -> Any:
-    red, green, blue, opacity = rgba
-    return fg.Color(r=red, g=green, b=blue, a=opacity)

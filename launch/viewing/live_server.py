@@ -22,12 +22,12 @@ from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.runs import Run
 from flexsheet.launch.running.tools import make_subscriber
 from flexsheet.launch.viewing.apparatus_model import make_model
+from flexsheet.launch.viewing.foxglove_drawing import make_stamp
 from flexsheet.launch.viewing.live_channels import (
     LiveChannel,
     LiveState,
     Pace,
     list_channels,
-    make_stamp,
 )
 from flexsheet.launch.viewing.urdf import make_urdf
 from flexsheet.messages.base import Header, Message
