@@ -61,7 +61,7 @@ class MarkerFitError(FlexsheetError, ValueError):
     """Raised for touches that do not determine the marker's position on the finger."""
 
     code = "marker-fit"
-    remedy = "Touch a known point in at least three orientations that differ by 15 degrees or more."
+    remedy = "Touch known points in at least three orientations that differ by 15 degrees or more."
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,11 +141,11 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
         covariance[np.diag_indices_from(covariance)] += noise
         weighted = np.linalg.solve(covariance, np.column_stack([matrix, values]))
         information = matrix.T @ weighted[:, :3]
-        offset = np.linalg.solve(information, matrix.T @ weighted[:, 3])
-        errors: Floats = weighted[:, 3] - weighted[:, :3] @ offset
+        offset = np.asarray(np.linalg.solve(information, matrix.T @ weighted[:, 3]), np.float64)
+        errors = weighted[:, 3] - weighted[:, :3] @ offset
         cost = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
         cost += (values - matrix @ offset) @ errors + np.sum((logarithms / PRIOR_STD_LN) ** 2)
-        return float(cost), offset, np.linalg.inv(information), errors
+        return float(cost), offset, np.asarray(np.linalg.inv(information)), errors
 
     simplex = 0.5 * np.vstack([np.zeros(3), np.eye(3)])
     options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.01}
