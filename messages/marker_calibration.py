@@ -16,6 +16,8 @@ from flexsheet.messages.scene import FingerLengths, NonNegative, Part, Scene
 
 MARKER_CALIBRATION_VERSION = 1
 
+Triple = tuple[float, float, float]
+
 
 class MarkerCalibration(Part):
     """Position of the marker on a finger, with its uncertainty, for the triangulator."""
@@ -29,12 +31,19 @@ class MarkerCalibration(Part):
         description="marker's centre relative to the pad's contact point, finger's frame"
     )
     standard_deviations_m: tuple[NonNegative, NonNegative, NonNegative]
+    covariance_m2: tuple[Triple, ...] | None = Field(
+        default=None,
+        min_length=3,
+        max_length=3,
+        description="covariance of the position; not given: uncorrelated components",
+    )
     point_offset_m: FingerLengths = Field(
-        description="error that all touched points have in common, world frame"
+        description="mean estimated error of the touched points, world frame"
     )
     residual_rms_m: NonNegative
     max_residual_m: NonNegative
     touches: Annotated[int, Field(ge=1)]
+    points: Annotated[int, Field(ge=1)] = 1
     orientations: Annotated[int, Field(ge=1)]
 
 

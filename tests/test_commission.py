@@ -49,6 +49,7 @@ from flexsheet.messages.calibration import load_calibration
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import ArmState
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
@@ -264,7 +265,7 @@ def test_the_marker_is_calibrated_in_the_usual_orientation_of_the_finger() -> No
     given = changed("finger", marker_from_pad_m=[1e-3, -1e-3, 0.010], finger_tilt_rad=[0.2, -0.15])
     touches = simulate_touches(SCENE, given, calibration=load_calibration(OPTICS), seed=1)
     found = fit_marker(touches, SCENE, "twin")
-    used_m = touches[0].world_from_finger @ np.array(found.marker_from_pad_m)
+    used_m = world_from_finger(SCENE.finger.direction_world) @ np.array(found.marker_from_pad_m)
     true_m = find_marker_offset(given)
     assert np.abs(used_m - true_m).max() < 3.0 * max(found.standard_deviations_m)
 
@@ -460,12 +461,12 @@ def test_a_laboratory_is_doubted_for_each_reason(tmp_path: Path) -> None:
 
 def test_predicted_errors_match_errors_drawn_from_the_same_uncertainties() -> None:
     """The reference draws fingertip errors without the evaluator: marker and timestamp."""
-    deviations_m = (2e-4, 1e-4, 3e-4)
+    covariance_m2 = 1e-8 * np.array([[4.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
     optics = load_calibration(OPTICS)
     given = changed("finger", marker_from_pad_m=[1e-3, -1e-3, 0.010])
     touches = simulate_touches(SCENE, given, calibration=optics, seed=1)
     marker = fit_marker(touches, SCENE, "twin").model_copy(
-        update={"standard_deviations_m": deviations_m}
+        update={"covariance_m2": tuple(map(tuple, covariance_m2.tolist()))}
     )
     known = Knowledge(
         scene=SCENE,
@@ -479,7 +480,9 @@ def test_predicted_errors_match_errors_drawn_from_the_same_uncertainties() -> No
     believed = known.calibrations.find_marker_offset_m(SCENE)
     drawn = np.array([find_marker_offset(draw_apparatus(known, random)) for _ in range(400)])
     assert drawn.mean(axis=0) == pytest.approx(believed, abs=5e-5)
-    assert drawn.std(axis=0) == pytest.approx(deviations_m, rel=0.12)
+    turned = world_from_finger(SCENE.finger.direction_world)
+    expected_m = np.sqrt(np.diag(turned @ covariance_m2 @ turned.T))
+    assert drawn.std(axis=0) == pytest.approx(expected_m, rel=0.12)
 
 
 # The command
@@ -584,7 +587,7 @@ def test_real_devices_stop_at_the_first_step_without_data(
         (("--data", "camera=nowhere"), "--data camera=nowhere: does not exist"),
         (("--check",), "--check: the steps camera, arms, .* are not done"),
         (("--check", "--step", "arms"), "--check only repeats the verification"),
-        (("--apparatus", "seed:1", "--data", "camera=x"), "--data.* are for real devices"),
+        (("--apparatus", "seed:1", "--data", "camera=x"), "--data, .* are for real devices"),
         (("--board", "9"), "--board 9: expected COLUMNSxROWS"),
     ],
 )

@@ -70,6 +70,28 @@ def test_touches_of_a_point_give_the_offset() -> None:
     assert 1e-4 < fit.residual_rms_m < 5e-4
 
 
+def test_errors_of_points_and_orientations_determine_the_covariance() -> None:
+    """The errors are drawn from the model, so that their squared normalized length has mean 3."""
+    lengths, stated_m = [], []
+    for seed, error_m in enumerate([5e-5] * 8 + [3e-4] * 8):
+        random = np.random.default_rng(seed)
+        turned = random.normal(0.0, error_m, (len(TILTS_DEG), 3))
+        touches = []
+        for place in random.uniform(-0.05, 0.05, (6, 3)):
+            point_error = random.normal(0.0, 1e-4, 3)
+            for tilt, bias in zip(TILTS_DEG, turned, strict=True):
+                one = touch(tilt, random)
+                marker = one.marker_m - POINT_M + place + bias
+                touches.append(Touch(marker, place + point_error, one.world_from_finger))
+        fit = fit_marker(touches)
+        assert (fit.points, fit.orientations) == (6, len(TILTS_DEG))
+        error = fit.marker_from_pad_m - OFFSET_M
+        lengths.append(error @ np.linalg.solve(fit.covariance_m2, error))
+        stated_m.append(float(np.sqrt(np.trace(fit.covariance_m2))))
+    assert 1.5 < np.mean(lengths) < 5.0
+    assert np.mean(stated_m[8:]) > 1.5 * np.mean(stated_m[:8])
+
+
 def test_touches_of_the_sheet_give_the_offset() -> None:
     """The pad may be anywhere on a plane: its position along the plane has no influence."""
     random = np.random.default_rng(6)

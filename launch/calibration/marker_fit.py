@@ -1,9 +1,14 @@
 """Fit the marker's position on the finger to touches of known points in several orientations.
 
-The marker's centre is at p + e + R o. Here p is the touched point, e an error that all touched
-points have in common, R the finger's orientation and o the wanted offset in the finger's frame. A
-touched plane, such as the sheet, only determines the component along its normal. Several
-orientations are needed to separate o from e.
+The marker's centre is at p + e + R o + b + noise. Here p is the touched point, e the error of its
+position, which all touches of this point share, R the finger's orientation, and o the wanted offset
+in the finger's frame. b is an error that all touches in one orientation share: the detected centre
+of a tilted marker is biased. A touched plane, such as the sheet, only determines the component
+along its normal.
+
+This is a linear model with random effects e and b. Their variances are estimated with the offset
+by restricted maximum likelihood and prior distributions, so that the covariance of the offset
+follows from the residuals (Searle, Casella and McCulloch 1992, chapter 6).
 """
 
 from __future__ import annotations
@@ -13,17 +18,27 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from flexsheet.messages.errors import FlexsheetError
 
 Floats = NDArray[np.float64]
 
-TOUCH_NOISE_M = 2e-4
-"""Expected standard deviation of a touch along one axis, from camera, hand and orientation."""
+TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M = 2e-4, 1e-4, 1e-4
+"""Expected standard deviations per axis: of a touch, from camera, hand and measured angle; of the
+error that all touches in one orientation share; of the position of a touched point."""
 
-POINT_ERROR_M = 1e-4
-"""Expected standard deviation per axis of the error that all touched points share, for a point
-whose position the stereo camera measures; it limits accuracy."""
+COMMON_ERROR_M = 3e-5
+"""Standard deviation per axis of the error that all touches share, which residuals cannot show.
+
+The cause is the mean bias of the detected centre of a tilted marker, from images of the simulator.
+"""
+
+PRIOR_STD_LN = np.array([0.5, 0.7, 0.4])
+"""Standard deviations of the logarithms of the three standard deviations above."""
+
+POINT_GRID_M = 1e-6
+"""Coordinates of one touched point are equal after rounding to this grid."""
 
 MIN_TOUCHES, MIN_ORIENTATIONS = 4, 3
 MIN_ANGLE_RAD = np.radians(8.0)
@@ -35,6 +50,9 @@ MAX_DEVIATION_M = 5e-4
 MAX_RESIDUAL_M = 1e-3
 """Maximum root mean square residual of touches that count as consistent."""
 
+MAX_CONDITION = 1e6
+"""Maximum condition number of touches that determine all components of the offset."""
+
 MAX_OFFSET_M = 0.05
 """Maximum plausible distance between the marker and the finger's pad."""
 
@@ -43,7 +61,7 @@ class MarkerFitError(FlexsheetError, ValueError):
     """Raised for touches that do not determine the marker's position on the finger."""
 
     code = "marker-fit"
-    remedy = "Touch a known point in at least three orientations that differ by 15 degrees or more."
+    remedy = "Touch known points in at least three orientations that differ by 15 degrees or more."
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,17 +80,23 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class MarkerFit:
-    """Fitted offset of the marker (3,) in the finger's frame, m, and its uncertainty.
+    """Fitted offset of the marker (3,) in the finger's frame, m, and its covariance (3, 3), m².
 
-    point_offset_m: common error of the touched points. residuals_m: residual distances (touches,).
-    orientations: number of different orientations.
+    point_offset_m: mean of the estimated errors of the touched points, world. residuals_m: residual
+    distances (touches,). points, orientations: numbers of different points and orientations.
     """
 
     marker_from_pad_m: Floats
-    standard_deviations_m: Floats
+    covariance_m2: Floats
     point_offset_m: Floats
     residuals_m: Floats
+    points: int
     orientations: int
+
+    @property
+    def standard_deviations_m(self) -> Floats:
+        """Return the standard deviations (3,) of the offset's components, m."""
+        return np.sqrt(np.diag(self.covariance_m2))
 
     @property
     def residual_rms_m(self) -> float:
@@ -81,37 +105,63 @@ class MarkerFit:
 
 
 def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
-    """Fit the marker's offset by linear least squares.
+    """Fit the marker's offset by restricted maximum likelihood.
 
     Raises MarkerFitError for too few touches or orientations, for touches that contradict each
     other, and for an implausible or undetermined offset.
     """
-    orientations = count_orientations([touch.world_from_finger for touch in touches])
+    orientation = np.array(group_orientations([touch.world_from_finger for touch in touches]))
+    orientations = len(set(orientation))
     if len(touches) < MIN_TOUCHES or orientations < MIN_ORIENTATIONS:
         raise MarkerFitError(
             f"{len(touches)} touches in {orientations} orientations; at least {MIN_TOUCHES} "
             f"touches in {MIN_ORIENTATIONS} orientations are needed"
         )
-    rows, values = [], []
-    for touch in touches:
-        seen = np.eye(3) if touch.normal is None else touch.normal[None]
-        rows.append(np.hstack([seen @ touch.world_from_finger, seen]))
-        values.append(seen @ (touch.marker_m - touch.point_m))
-    prior = np.hstack([np.zeros((3, 3)), np.eye(3)]) / POINT_ERROR_M
-    measured = np.vstack(rows)
-    matrix = np.vstack([measured / TOUCH_NOISE_M, prior])
-    wanted = np.concatenate([np.concatenate(values) / TOUCH_NOISE_M, np.zeros(3)])
-    information = matrix.T @ matrix
-    if np.linalg.cond(information) > 1e12:
+    rounded = np.rint(np.array([touch.point_m for touch in touches]) / POINT_GRID_M)
+    places, point = np.unique(rounded, axis=0, return_inverse=True)
+    seen = [np.eye(3) if touch.normal is None else touch.normal[None] for touch in touches]
+    rows = np.repeat(np.arange(len(touches)), [len(one) for one in seen])
+    directions = np.vstack(seen)
+    parallel = directions @ directions.T
+    same_orientation, same_point = (
+        parallel * (group[rows][:, None] == group[rows]) for group in (orientation, point.ravel())
+    )
+    pairs = list(zip(seen, touches, strict=True))
+    matrix = np.vstack([one @ touch.world_from_finger for one, touch in pairs])
+    values = np.concatenate([one @ (touch.marker_m - touch.point_m) for one, touch in pairs])
+    if np.linalg.cond(matrix) > MAX_CONDITION:
         raise MarkerFitError("the touches do not determine the offset: all are along one direction")
-    solution = np.linalg.solve(information, matrix.T @ wanted)
-    errors = np.concatenate(values) - measured @ solution
-    ends = np.cumsum([len(value) for value in values])[:-1]
-    residuals = np.array([float(np.linalg.norm(one)) for one in np.split(errors, ends)])
-    freedom = max(len(errors) - 3, 1)
-    spread = max(1.0, float(errors @ errors) / (TOUCH_NOISE_M**2 * freedom))
-    deviations = np.sqrt(np.diag(np.linalg.inv(information))[:3] * spread)
-    fit = MarkerFit(solution[:3], deviations, solution[3:], residuals, orientations)
+    fixed = COMMON_ERROR_M**2 * parallel
+    expected_m = np.array([TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M])
+
+    def solve(logarithms: Floats) -> tuple[float, Floats, Floats, Floats]:
+        """Return the cost, the offset, its covariance, and the weighted residuals."""
+        noise, turned, placed = (expected_m * np.exp(logarithms)) ** 2
+        covariance = fixed + turned * same_orientation + placed * same_point
+        covariance[np.diag_indices_from(covariance)] += noise
+        weighted = np.linalg.solve(covariance, np.column_stack([matrix, values]))
+        information = matrix.T @ weighted[:, :3]
+        offset = np.asarray(np.linalg.solve(information, matrix.T @ weighted[:, 3]), np.float64)
+        errors = weighted[:, 3] - weighted[:, :3] @ offset
+        cost = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
+        cost += (values - matrix @ offset) @ errors + np.sum((logarithms / PRIOR_STD_LN) ** 2)
+        return float(cost), offset, np.asarray(np.linalg.inv(information)), errors
+
+    simplex = 0.5 * np.vstack([np.zeros(3), np.eye(3)])
+    options = {"initial_simplex": simplex, "xatol": 0.02, "fatol": 0.01}
+    best = minimize(lambda x: solve(x)[0], np.zeros(3), method="Nelder-Mead", options=options)
+    _, offset, covariance, weighted = solve(best.x)
+    placed = (POINT_ERROR_M * np.exp(best.x[2])) ** 2
+    shifts = np.array(
+        [
+            placed * directions[at].T @ weighted[at]
+            for at in (point.ravel()[rows] == number for number in range(len(places)))
+        ]
+    )
+    point_errors = np.einsum("ni,ni->n", directions, shifts[point.ravel()[rows]])
+    errors = values - matrix @ offset - point_errors
+    residuals = np.sqrt(np.bincount(rows, errors**2))
+    fit = MarkerFit(offset, covariance, shifts.mean(axis=0), residuals, len(places), orientations)
     _check_fit(fit)
     return fit
 
@@ -138,14 +188,17 @@ def _check_fit(fit: MarkerFit) -> None:
         )
 
 
-def count_orientations(rotations: Sequence[Floats]) -> int:
-    """Count the rotations (3, 3) that differ from all counted before."""
-    counted: list[Floats] = []
+def group_orientations(rotations: Sequence[Floats]) -> list[int]:
+    """Return for each rotation (3, 3) the number of the first similar one among the different."""
+    different: list[Floats] = []
+    groups = []
     for rotation in rotations:
         angles = [
             np.arccos(np.clip(0.5 * (np.trace(other.T @ rotation) - 1.0), -1.0, 1.0))
-            for other in counted
+            for other in different
         ]
         if all(angle >= MIN_ANGLE_RAD for angle in angles):
-            counted.append(rotation)
-    return len(counted)
+            angles.append(0.0)
+            different.append(rotation)
+        groups.append(int(np.argmin(angles)))
+    return groups

@@ -33,6 +33,7 @@ from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import SheetCalibration
+from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, vector_from_rotation
 from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.nail import Nail
@@ -119,6 +120,8 @@ def predict_errors(
 ) -> dict[Metric, PredictedError]:
     """Predict the errors of sheet and fingertip during a stroke, and of image and force at rest.
 
+    The finger moves at the working speed of the scene.
+
     tracking_m: mean tracking error of the sheet that the devices report during a stroke. It is
     independent of the calibration errors, so it is added to them in quadrature. draws: number of
     random apparatuses.
@@ -134,9 +137,11 @@ def predict_errors(
         }  # fmt: skip
         given = NodeCalibrations(given.stereo.model_copy(update=exact), given.sheet, given.marker)
     evaluator = OfflineEvaluator(scene, given, metres_per_px=PIXEL_M, cells=CELLS)
+    speed_m_per_s = scene.working_range.speed_m_per_s
     metrics = ALL_METRICS if scene.projector is not None else ALL_METRICS - {Metric.IMAGE}
     drawn = [
-        evaluator.evaluate(draw_apparatus(known, random), metrics).figures() for _ in range(draws)
+        evaluator.evaluate(draw_apparatus(known, random), metrics, speed_m_per_s).figures()
+        for _ in range(draws)
     ]
     tolerances = metric_tolerances(scene)
     predicted = {}
@@ -295,8 +300,14 @@ def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Rando
 def draw_marker(scene: Scene, given: NodeCalibrations, random: Random) -> tuple[float, ...]:
     """Draw a random true position (3,) of the marker in the simulator's finger frame, m."""
     world_m = given.find_marker_offset_m(scene)
-    if given.marker is not None:
-        world_m = world_m + np.array(given.marker.standard_deviations_m) * random.standard_normal(3)
+    if (marker := given.marker) is not None:
+        covariance_m2 = (
+            np.diag(np.square(marker.standard_deviations_m))
+            if marker.covariance_m2 is None
+            else np.array(marker.covariance_m2)
+        )
+        turned = world_from_finger(scene.finger.direction_world)
+        world_m = world_m + turned @ _draw(covariance_m2, random)
     units = ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.01))
     axes = [100.0 * Nail.of(FingerTruth(marker_from_pad_m=unit)).marker_offset_m for unit in units]
     return tuple(np.linalg.solve(np.column_stack(axes), world_m).tolist())

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.marker_fit import POINT_ERROR_M, Touch
+from flexsheet.launch.calibration.marker_fit import Touch
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
@@ -19,7 +19,11 @@ from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
-from flexsheet.nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
+from flexsheet.nodes.triangulator.triangulation import (
+    TRIANGULATION_METHODS,
+    StereoGeometry,
+    TriangulatedPoint,
+)
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
@@ -142,12 +146,15 @@ def _make_touch(values: dict[str, float], scene: Scene) -> Touch:
 SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20), (-15, 20),
                        (12, -18), (12, 18), (0, 12), (10, 10), (-10, 10), (20, 0), (0, -12),
                        (10, -10), (-10, -10), (-10, 0), (25, 10), (25, -10), (0, 18),
-                       (30, 0), (20, 20), (-25, 10), (8, 25))  # fmt: skip
-"""Orientations that are tried, like a person would, until MAX_TOUCHES show the marker."""
-MAX_TOUCHES = 15
-SIMULATED_POINT_M = np.array([0.01, 0.02, 0.01])
-SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, math.radians(1.0)
-"""Standard deviations of the simulated pad's position and of the finger's angles."""
+                       (30, 0), (20, 20), (-25, 10), (8, 25), (40, 0), (35, 20),
+                       (35, -20))  # fmt: skip
+"""Orientations in which the marker is looked at, like a person would, before the touches."""
+TOUCHED_ORIENTATIONS = 6
+"""Number of these orientations, those in which the camera sees the marker best, for the touches."""
+SIMULATED_POINTS_M = np.array([[x, y, 0.01] for y in (0.0, 0.04) for x in (-0.03, 0.01, 0.05)])
+"""Corners of a board that are touched, (n, 3)."""
+SIMULATED_CORNER_M, SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, 1e-4, math.radians(1.0)
+"""Standard deviations per axis of the measured corners, of the pad's position, and of angles."""
 
 
 def simulate_touches(
@@ -157,48 +164,56 @@ def simulate_touches(
     calibration: StereoCalibration | None,
     seed: int,
 ) -> list[Touch]:
-    """Simulate touches of a known point that the simulated stereo camera observes.
+    """Simulate touches of known points that the simulated stereo camera observes.
 
-    The orientations of `SIMULATED_TILTS_DEG`, relative to the usual orientation of the finger, are
-    used in sequence. The fit takes the usual one for `direction_world`, so that its offset is right
-    in use. The marker positions are those that the triangulator's detector finds; a touch whose
-    marker it does not accept is left out. calibration: optics that the detector uses; None: the
-    scene's optics.
+    The finger shows the marker in all orientations of `SIMULATED_TILTS_DEG`, relative to its usual
+    orientation. It then touches each point in the orientations with the smallest uncertainty of the
+    marker that the triangulator's detector states. The fit takes the usual orientation for
+    `direction_world`, so that its offset is right in use. A touch whose marker the detector does
+    not accept is left out. calibration: optics that the detector uses; None: the scene's optics.
     """
     geometry = StereoGeometry.of(scene.camera, calibration)
     true_scene = apply_apparatus(scene, apparatus)
+    true_camera = make_true_camera(true_scene.camera)
     random = np.random.default_rng(seed)
     usual = Nail.of(apparatus.finger)
-    measured_point = SIMULATED_POINT_M + random.normal(0.0, POINT_ERROR_M, 3)
-    touches = []
-    for number, tilt_deg in enumerate(SIMULATED_TILTS_DEG):
-        tilt_rad = np.radians(tilt_deg)
+
+    def see(tilt_rad: Floats, point: Floats) -> TriangulatedPoint | None:
         held = tilt_rad + random.normal(0.0, SIMULATED_TILT_RAD, 2)
         turn = rotation_from_vector([*held, 0.0])
         camera = TwinCamera(
-            make_true_camera(true_scene.camera),
+            true_camera,
             finger_radius_m=true_scene.finger.radius_m,
-            seed=seed + number,
+            seed=int(random.integers(2**31)),
             nail=Nail(
                 turn @ usual.marker_offset_m,
                 None if usual.marker_normal is None else turn @ usual.marker_normal,
                 turn @ usual.direction,
             ),
         )
-        pad = SIMULATED_POINT_M + random.normal(0.0, SIMULATED_HAND_M, 3)
-        seen = _see_marker(camera, scene, geometry, pad)
-        if seen is not None:
-            turned = world_from_finger(scene.finger.direction_world, tilt_rad)
-            touches.append(Touch(seen, measured_point, turned))
-        if len(touches) == MAX_TOUCHES:
-            break
+        pad = point + random.normal(0.0, SIMULATED_HAND_M, 3)
+        return _see_marker(camera, scene, geometry, pad)
+
+    shown = [
+        (float(np.trace(found.covariance)), tuple(tilt_rad))
+        for tilt_rad in np.radians(SIMULATED_TILTS_DEG)
+        if (found := see(tilt_rad, SIMULATED_POINTS_M[1])) is not None
+    ]
+    best = [np.array(tilt_rad) for _, tilt_rad in sorted(shown)[:TOUCHED_ORIENTATIONS]]
+    touches = []
+    for point in SIMULATED_POINTS_M:
+        measured_point = point + random.normal(0.0, SIMULATED_CORNER_M, 3)
+        for tilt_rad in best:
+            if (found := see(tilt_rad, point)) is not None:
+                turned = world_from_finger(scene.finger.direction_world, tilt_rad)
+                touches.append(Touch(found.point_world, measured_point, turned))
     return touches
 
 
 def _see_marker(
     camera: TwinCamera, scene: Scene, geometry: StereoGeometry, pad: Floats
-) -> Floats | None:
-    """Return the detected marker position (3,) for a pad position; None if it is not accepted."""
+) -> TriangulatedPoint | None:
+    """Return the detected marker for a pad position; None if it is not accepted."""
     left, right = camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s)
     given = TriangulatorParameters()
     found = detect_all(
@@ -220,4 +235,4 @@ def _see_marker(
         gate=None,
     )
     measured = found.measured
-    return measured.point_world if found.reason == "ok" and measured is not None else None
+    return measured if found.reason == "ok" else None

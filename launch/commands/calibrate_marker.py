@@ -123,10 +123,12 @@ def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerC
         scene=scene.name,
         marker_from_pad_m=tuple(fit.marker_from_pad_m.tolist()),
         standard_deviations_m=tuple(fit.standard_deviations_m.tolist()),
+        covariance_m2=tuple((x, y, z) for x, y, z in fit.covariance_m2.tolist()),
         point_offset_m=tuple(fit.point_offset_m.tolist()),
         residual_rms_m=fit.residual_rms_m,
         max_residual_m=float(fit.residuals_m.max()),
         touches=len(touches),
+        points=fit.points,
         orientations=fit.orientations,
     )
 
@@ -140,7 +142,11 @@ def _print_result(calibration: MarkerCalibration, output: Path, as_json: bool) -
     print_fields(
         [
             ("calibration", output),
-            ("touches", f"{calibration.touches} in {calibration.orientations} orientations"),
+            (
+                "touches",
+                f"{calibration.touches} of {calibration.points} points in "
+                f"{calibration.orientations} orientations",
+            ),
             *(
                 (f"marker from pad, {axis}", f"{1e3 * value:.2f} ± {1e3 * deviation:.2f} mm")
                 for axis, (value, deviation) in zip("xyz", offsets, strict=True)

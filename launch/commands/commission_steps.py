@@ -559,14 +559,19 @@ def collect_knowledge(lab: Commissioning) -> Knowledge:
 def run_verification(
     lab: Commissioning, seconds: float, seed: int, *, simulated_time: bool
 ) -> dict[str, Any]:
-    """Run a stroke in a simulated laboratory, and evaluate its true errors at rest.
+    """Run a stroke in a simulated laboratory, and evaluate its true errors without a graph.
 
+    The errors are evaluated at rest, and those of fingertip and sheet also at the working speed.
     simulated_time: run the stroke without a graph and without self-checks, and omit the errors
     before calibration.
     """
     from flexsheet.launch.experiments.maps import draw_cross_errors
     from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
-    from flexsheet.launch.experiments.offline import OfflineEvaluator, exceeded_tolerances
+    from flexsheet.launch.experiments.offline import (
+        MOVING_METRICS,
+        OfflineEvaluator,
+        exceeded_tolerances,
+    )
     from flexsheet.launch.experiments.run import require_scene
     from flexsheet.launch.experiments.simulated_time import LoopSettings, stroke_in_simulated_time
     from flexsheet.launch.experiments.trial import run_stroke
@@ -597,11 +602,14 @@ def run_verification(
         evaluator = OfflineEvaluator(scene, NodeCalibrations.of(plan))
         at_rest[name] = evaluator.evaluate(apparatus).figures()
     assert apparatus is not None
+    speed_m_per_s = scene.working_range.speed_m_per_s
+    moving = evaluator.evaluate(apparatus, MOVING_METRICS, speed_m_per_s).figures()
     crosses = evaluator.compare_crosses(apparatus)
     draw_cross_errors(crosses, lab.folder / CROSSES_FILE)
     return {
         "stroke": stroke,
         "at_rest": at_rest,
+        "at_working_speed": {one: moving[one] for one in MOVING_METRICS},
         "co_location": crosses.figures(),
         "out_of_tolerance": exceeded_tolerances(scene, at_rest["after"]),
         "flagged": stroke["flagged"],

@@ -2,10 +2,12 @@
 
 An apparatus is a set of true parameters of the simulated hardware. The nodes' methods get the
 parameters of the scene, and the simulator's models those of the apparatus. The errors of fingertip,
-sheet, image and felt force are computed at rest. Only the force model of the rubber depends on
-time: it simulates a push in and out. So servo lag, delays, frame rate, tremor and backlash have no
-effect here; an experiment with running nodes measures those. Images have no noise. The references
-for the errors have their own models of camera, arms, membrane and eye, not those of the nodes.
+sheet, image and felt force are computed at rest. Those of fingertip and sheet can also be computed
+for a constant speed of the finger, at which wrong exposure times cause errors. Only the force model
+of the rubber depends on time: it simulates a push in and out. So servo lag, delays, frame rate,
+tremor and backlash have no effect here; an experiment with running nodes measures those. Images
+have no noise. The references for the errors have their own models of camera, arms, membrane and
+eye, not those of the nodes.
 """
 
 from __future__ import annotations
@@ -78,6 +80,8 @@ class Metric(StrEnum):
 
 
 ALL_METRICS = frozenset(Metric)
+MOVING_METRICS = frozenset({Metric.SHEET, Metric.FINGERTIP})
+"""Metrics that can be evaluated while the finger moves."""
 
 
 CROSS_RATIOS, CROSS_ASIDES_M = (-1.0, -0.5, 0.0, 0.5, 1.0), (-0.03, 0.0, 0.03)
@@ -238,21 +242,28 @@ class OfflineEvaluator:
         )
 
     def evaluate(
-        self, apparatus: Apparatus, metrics: frozenset[Metric] = ALL_METRICS
+        self,
+        apparatus: Apparatus,
+        metrics: frozenset[Metric] = ALL_METRICS,
+        speed_m_per_s: float = 0.0,
     ) -> Evaluation:
         """Evaluate the given metrics of an apparatus.
 
+        speed_m_per_s: speed of the finger along the object; affects fingertip and sheet only.
         Raises ExperimentError if there is no solution.
         """
         try:
-            return self._evaluate(apparatus, metrics)
+            return self._evaluate(apparatus, metrics, speed_m_per_s)
         except (NotConvergedError, ValueError) as error:
             raise ExperimentError(f"apparatus {apparatus.origin}: {error}") from error
 
-    def _evaluate(self, apparatus: Apparatus, metrics: frozenset[Metric]) -> Evaluation:
+    def _evaluate(
+        self, apparatus: Apparatus, metrics: frozenset[Metric], speed_m_per_s: float
+    ) -> Evaluation:
         scene = apply_apparatus(self._scene, apparatus)
         contacts = [self._touch(place_m) for place_m in self._places_m]
-        tip_errors = self._measure_fingertips(scene, apparatus, contacts)
+        moving_errors = self._measure_fingertips(scene, apparatus, contacts, speed_m_per_s)
+        resting = self._measure_fingertips(scene, apparatus, contacts[:1])[0]
         arms = ArmPair(self._scene, apparatus)
         sheet = image = felt = expected = None
         if Metric.SHEET in metrics:
@@ -260,14 +271,14 @@ class OfflineEvaluator:
             sheet = np.array(
                 [
                     self._sheet_error(arms, surface, *pair)
-                    for pair in zip(contacts, tip_errors, strict=True)
+                    for pair in zip(contacts, moving_errors, strict=True)
                 ]
             )
         if Metric.FORCE in metrics:
-            felt, expected = self._compare_forces(scene, apparatus, arms, tip_errors[0])
+            felt, expected = self._compare_forces(scene, apparatus, arms, resting)
         if Metric.IMAGE in metrics:
-            image = self._compare_images(scene, apparatus, arms, tip_errors[0])
-        fingertip = tip_errors if Metric.FINGERTIP in metrics else None
+            image = self._compare_images(scene, apparatus, arms, resting)
+        fingertip = moving_errors if Metric.FINGERTIP in metrics else None
         return Evaluation(fingertip, sheet, image, felt, expected)
 
     def _touch(self, around_m: float, aside_m: float = 0.0) -> Contact:
@@ -290,20 +301,24 @@ class OfflineEvaluator:
         return Contact(transform(rotation, point - rotation @ on_sheet_m), point)
 
     def _measure_fingertips(
-        self, scene: Scene, apparatus: Apparatus, contacts: list[Contact]
+        self,
+        scene: Scene,
+        apparatus: Apparatus,
+        contacts: list[Contact],
+        speed_m_per_s: float = 0.0,
     ) -> Floats:
         """Return measured minus true fingertip positions (n, 3), one for each contact.
 
         Pixels are computed with the true camera, and triangulated with the nodes' calibration. The
-        finger strokes upwards at the scene's working speed. So wrong timestamps and different
-        exposure times of both cameras also cause errors.
+        finger strokes upwards at the given speed, at which wrong timestamps and different exposure
+        times of both cameras also cause errors.
         """
         camera = rig.make_true_camera(scene.camera)
         left_from_world = inverse(pose_matrix(camera.world_from_left))
         offset_m = Nail.of(apparatus.finger).marker_offset_m
         errors = []
         for contact in contacts:
-            velocity = self._scene.working_range.speed_m_per_s * contact.world_from_sheet[:3, 1]
+            velocity = speed_m_per_s * contact.world_from_sheet[:3, 1]
             times_s = apparatus.camera.stamp_offset_s + np.array([0.0, apparatus.camera.skew_s])
             markers = contact.point + offset_m + times_s[:, None] * velocity
             in_left = apply(left_from_world, markers)

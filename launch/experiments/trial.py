@@ -157,6 +157,7 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
         "out_of_tolerance": exceeded_tolerances(load_scene(lab.scene_copy), figures),
         "flagged": found["flagged"],
         "at_rest": found["at_rest"]["after"],
+        "at_working_speed": found["at_working_speed"],
         "measured_delta_d_mm": found["stroke"]["delta_d_mm"]["mean"],
         "predicted": found["predicted"],
         "doubts": found["doubts"],
@@ -169,13 +170,14 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the effects of deviations of one apparatus parameter, at rest and without a graph."""
+    """Return the effects of deviations of one apparatus parameter, without a graph."""
     plan = load_graph(Path(trial["launch_file"]))
     scene = require_scene(plan)
     evaluator = OfflineEvaluator(scene, NodeCalibrations.of(plan))
     metrics = frozenset(Metric(name) for name in trial["metrics"])
 
-    nominal = evaluator.evaluate(nominal_apparatus(scene), metrics)
+    speed_m_per_s = scene.working_range.speed_m_per_s
+    nominal = evaluator.evaluate(nominal_apparatus(scene), metrics, speed_m_per_s)
     effects: dict[str, Any] = {}
     for sigma in trial["sigmas"]:
         apparatus = deviate_apparatus(
@@ -185,7 +187,7 @@ def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
             profile=Profile(trial["profile"]),
             calibrated=trial["calibrated"],
         )
-        found = evaluator.evaluate(apparatus, metrics)
+        found = evaluator.evaluate(apparatus, metrics, speed_m_per_s)
         effects[f"{sigma:g}"] = found.change_from(nominal)
     return {"parameter": trial["parameter"], "effects": effects}
 
