@@ -28,13 +28,14 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.methods import Correction, resolve_method
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import FingerPath, SheetTarget
+from flexsheet.messages.types import FingerPath, Frame, SheetTarget
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
 from flexsheet.nodes.twin.sheet_surface import SheetSurface
+from flexsheet.nodes.twin.truth import find_display_delay_s
 
 Times = NDArray[np.int64]
 
@@ -242,10 +243,13 @@ def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats
     """
     to_arm: dict[tuple[str, int], float] = {}
     to_light: dict[int, float] = {}
-    late_s = 0.0
+    apparatus: Apparatus | None = None
+    frame: Frame | None = None
     for _, message, header, _ in BagReader(bag, topics=DELAY_TOPICS):
         if isinstance(message, Apparatus):
-            late_s = message.projector.latency_offset_s
+            apparatus = message
+        elif isinstance(message, Frame):
+            frame = message
         for event, exposure_ns, at_ns in stroke.list_events(message, header):
             if begin_ns <= exposure_ns <= end_ns:
                 delay_s = 1e-9 * (at_ns - exposure_ns)
@@ -253,7 +257,9 @@ def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats
                     to_light.setdefault(exposure_ns, delay_s)
                 elif event in stroke.ARM_EVENTS.values():
                     to_arm.setdefault((event, exposure_ns), delay_s)
-    return np.array(list(to_arm.values())), np.array(list(to_light.values())) + late_s
+    return np.array(list(to_arm.values())), (
+        np.array(list(to_light.values())) + find_display_delay_s(frame, apparatus)
+    )
 
 
 def read_offsets(bag: Path) -> stroke.SampledMotion:
