@@ -87,10 +87,12 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     other, and for an implausible or undetermined offset.
     """
     orientations = count_orientations([touch.world_from_finger for touch in touches])
-    if len(touches) < MIN_TOUCHES or orientations < MIN_ORIENTATIONS:
+    if not is_sufficient(touches):
+        missing = max(MIN_ORIENTATIONS - orientations, MIN_TOUCHES - len(touches))
         raise MarkerFitError(
             f"{len(touches)} touches in {orientations} orientations; at least {MIN_TOUCHES} "
-            f"touches in {MIN_ORIENTATIONS} orientations are needed"
+            f"touches in {MIN_ORIENTATIONS} orientations are needed: touch in at least {missing} "
+            "more orientations"
         )
     rows, values = [], []
     for touch in touches:
@@ -136,6 +138,12 @@ def _check_fit(fit: MarkerFit) -> None:
             f"the marker would be {1e3 * length_m:.0f} mm from the pad, at most "
             f"{1e3 * MAX_OFFSET_M:g} mm; check units and touched points"
         )
+
+
+def is_sufficient(touches: Sequence[Touch]) -> bool:
+    """Return whether there are enough touches and different orientations for a fit."""
+    orientations = count_orientations([touch.world_from_finger for touch in touches])
+    return len(touches) >= MIN_TOUCHES and orientations >= MIN_ORIENTATIONS
 
 
 def count_orientations(rotations: Sequence[Floats]) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.marker_fit import POINT_ERROR_M, Touch
+from flexsheet.launch.calibration.marker_fit import POINT_ERROR_M, Touch, is_sufficient
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
@@ -144,6 +144,8 @@ SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20),
                        (10, -10), (-10, -10), (-10, 0), (25, 10), (25, -10), (0, 18),
                        (30, 0), (20, 20), (-25, 10), (8, 25))  # fmt: skip
 """Orientations that are tried, like a person would, until MAX_TOUCHES show the marker."""
+MORE_TILTS_DEG = tuple((x, y) for x in (-45, -30, 30, 45) for y in (-40, -20, 0, 20, 40))
+"""Further orientations, tried only until the touches suffice for the fit."""
 MAX_TOUCHES = 15
 SIMULATED_POINT_M = np.array([0.01, 0.02, 0.01])
 SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, math.radians(1.0)
@@ -160,8 +162,9 @@ def simulate_touches(
     """Simulate touches of a known point that the simulated stereo camera observes.
 
     The orientations of `SIMULATED_TILTS_DEG`, relative to the usual orientation of the finger, are
-    used in sequence. The fit takes the usual one for `direction_world`, so that its offset is right
-    in use. The marker positions are those that the triangulator's detector finds; a touch whose
+    used in sequence, and then those of `MORE_TILTS_DEG` while the touches are too few. The fit
+    takes the usual one for `direction_world`, so that its offset is right in use.
+    The marker positions are those that the triangulator's detector finds; a touch whose
     marker it does not accept is left out. calibration: optics that the detector uses; None: the
     scene's optics.
     """
@@ -171,7 +174,9 @@ def simulate_touches(
     usual = Nail.of(apparatus.finger)
     measured_point = SIMULATED_POINT_M + random.normal(0.0, POINT_ERROR_M, 3)
     touches = []
-    for number, tilt_deg in enumerate(SIMULATED_TILTS_DEG):
+    for number, tilt_deg in enumerate((*SIMULATED_TILTS_DEG, *MORE_TILTS_DEG)):
+        if number >= len(SIMULATED_TILTS_DEG) and is_sufficient(touches):
+            break
         tilt_rad = np.radians(tilt_deg)
         held = tilt_rad + random.normal(0.0, SIMULATED_TILT_RAD, 2)
         turn = rotation_from_vector([*held, 0.0])
