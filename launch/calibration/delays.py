@@ -52,9 +52,9 @@ from flexsheet.nodes.renderer.sheet import SheetPose
 from flexsheet.nodes.renderer.sheet_mesh import flat_mesh
 from flexsheet.nodes.triangulator.projection_check import LATENCY_MEMORY_S, ProjectionCheck
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
-from flexsheet.nodes.twin.eye import TrueProjector
 from flexsheet.nodes.twin.pixels import TwinCamera
-from flexsheet.nodes.twin.rig import make_true_camera, pixels_of
+from flexsheet.nodes.twin.projector import on_plane
+from flexsheet.nodes.twin.rig import make_true_camera, pixels_of, slopes_of
 from flexsheet.nodes.twin.truth import apply_apparatus, find_display_delay_s
 
 SIDES: tuple[Side, Side] = ("left", "right")
@@ -77,7 +77,7 @@ the exposures relative to the frames is not uniformly distributed."""
 MARK_SWING_M, MARK_FREQUENCY_HZ, MARK_SECONDS = 0.02, 1.0, 8.0
 """Simulated motion of the sheet for the stamp offset: amplitude, frequency and duration."""
 
-CHECK_SWING_M, CHECK_FREQUENCY_HZ, CHECK_SECONDS = 0.03, 0.25, 64.0
+CHECK_SWING_M, CHECK_FREQUENCY_HZ, CHECK_SECONDS = 0.03, 0.25, 34.0
 """Simulated motion for the display latency. Between two placements of the check marks, the sheet
 moves less than the radius within which the self-check assigns points to marks."""
 
@@ -403,6 +403,7 @@ def simulate_latency_check(
         StereoGeometry.of(scene.camera, calibration),
     )
     left_from_world = inverse(pose_matrix(camera.world_from_left))
+    light_pose = pose_matrix(true_scene.projector.world_from_projector)
     check = ProjectionCheck(projector)
     waiting: list[Frame] = []
     shown: list[tuple[int, Floats]] = []
@@ -431,10 +432,13 @@ def simulate_latency_check(
             continue
         while waiting and waiting[0].light_ns <= exposed_ns + CHECK_MARKS_PERIOD_NS:
             check.on_frame(waiting.pop(0))
-        vertices = np.array(corners(*(_pose_at(edge, exposed_ns) for edge in true), height_m))
-        lit = TrueProjector(true_scene.projector, vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+        left, right = (_pose_at(edge, exposed_ns) for edge in true)
+        plane = transform(left[:3, :3], 0.5 * (left[:3, 3] + right[:3, 3]))
+        slopes = slopes_of(true_scene.projector.lens, visible[-1])
+        rays = np.column_stack([slopes, np.ones(len(slopes))]) @ light_pose[:3, :3].T
         points = []
-        for point in lit.intersect_surface(visible[-1])[0]:
+        for ray in rays:
+            point = on_plane(light_pose[:3, 3], ray, plane)[0]
             in_left = apply(left_from_world, point[None])
             in_right = apply(camera.right_from_left, in_left)
             pixels = [
