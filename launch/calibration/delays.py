@@ -425,7 +425,7 @@ def simulate_latency_check(
             waiting.append(frame)
             late_ns = round(1e9 * find_display_delay_s(frame, apparatus))
             shown.append((light_ns + late_ns, marks.centres_px))
-            # A frame shows the marks anew that is drawn up to one frame later than they are due.
+            # Marks are placed in the first frame after they are due.
             drawn_ns += CHECK_MARKS_PERIOD_NS + round(random.uniform(0.0, 1.0 / 60.0) * 1e9)
         visible = [pixels for light_ns, pixels in shown[-8:] if light_ns <= exposed_ns]
         if not visible:
