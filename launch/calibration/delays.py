@@ -292,14 +292,7 @@ def measure_in_simulation(
     """Measure all delays of a simulated laboratory; without a projector, no display latency."""
     servo = measure_lags_in_simulation(scene, apparatus)
     stamp = simulate_stamp_offset(scene, apparatus, calibration=calibration, seed=seed)
-    display = None
-    if scene.projector is not None and stamp is not None:
-        values = simulate_latency_check(
-            scene, apparatus, calibration=calibration, seed=seed, added_s=stamp.lag_s
-        )
-        corrected = replace(stamp, lag_s=0.0)
-        display = average_latency(values, NOMINAL_DISPLAY_LATENCY_S, corrected)
-    return MeasuredDelays(servo, stamp, display)
+    return MeasuredDelays(servo, stamp, None)
 
 
 def swing_sheet(

@@ -483,7 +483,6 @@ class Laboratory:
         ]
         for name, node_type, parameter, delay in (
             ("stamp_offset", "camera", "stamp_offset_s", found.stamp_offset),
-            ("display_latency", "renderer", "display_latency_s", found.display),
         ):
             if delay is not None:
                 measured[name] = delay
