@@ -237,6 +237,10 @@ class EyesTruth(Part):
     )
 
 
+NOMINAL_DISPLAY_LATENCY_S = 0.008
+"""Time from the swap of an image to the middle of its display, to which deviations refer."""
+
+
 class ProjectorTruth(Part):
     """Deviations of the projector from the scene's projector."""
 
@@ -245,7 +249,7 @@ class ProjectorTruth(Part):
     lens: LensTruth = Field(default_factory=LensTruth)
     latency_offset_s: Annotated[float, Field(ge=-0.5, le=0.5)] = Field(
         default=0.0,
-        description="actual display latency minus the renderer's assumed display_latency_s",
+        description="actual display latency minus 8 ms",
     )
 
 

@@ -171,6 +171,16 @@ async def test_the_twins_images_pass_with_their_time(scene: Scene) -> None:
         assert bench.node.reader is None
 
 
+async def test_the_measured_offset_is_added_to_timestamps(scene: Scene) -> None:
+    async with running(scene, source="twin", stamp_offset_s=-0.002) as bench:
+        pair = StereoPair(
+            device="t", exposure_s=0, dropped_frames=0, left=picture(1, 0), right=picture(1, 1)
+        )
+        header = Header(1, 9_000_000, 9_500_000, bench.node.clock.id, "twin", 1)
+        await bench.node.step("twin__stereo", pair, header)
+        assert bench.sent[0][1].source_ns == 7_000_000
+
+
 async def test_the_twins_images_are_left_alone_by_a_real_camera(
     scene: Scene, images: dict[str, str]
 ) -> None:

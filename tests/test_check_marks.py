@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.apparatus import nominal_apparatus
+from flexsheet.messages.apparatus import NOMINAL_DISPLAY_LATENCY_S, nominal_apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Display, Frame, StereoMode, StereoPair, TwinArms
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
@@ -20,7 +20,7 @@ from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from flexsheet.nodes.twin.lit_marks import LitMarks
 from flexsheet.nodes.twin.pixels import TwinCamera
-from flexsheet.nodes.twin.truth import apply_apparatus
+from flexsheet.nodes.twin.truth import apply_apparatus, find_display_delay_s
 from tests.node_harness import build_node
 
 CYLINDER = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
@@ -129,3 +129,18 @@ def test_rays_hit_the_nearest_point_of_their_triangle_or_nothing() -> None:
     points = np.einsum("nk,nki->ni", weights, square[triangles])
     np.testing.assert_allclose(points[:2], [[0.2, 0.3, 0.0], [0.7, 0.8, 0.0]], atol=1e-12)
     assert np.isnan(points[2]).all()
+
+
+@pytest.mark.parametrize(("assumed_s", "late_s"), [(0.008, 0.02), (0.028, 0.0), (0.03, -0.002)])
+def test_the_true_display_time_does_not_depend_on_the_assumed_latency(
+    assumed_s: float, late_s: float
+) -> None:
+    apparatus = nominal_apparatus(SCENE)
+    projector = apparatus.projector.model_copy(update={"latency_offset_s": 0.02})
+    apparatus = apparatus.model_copy(update={"projector": projector})
+    frame = Frame.model_construct(
+        drawn_ns=1_000, swapped_ns=0, light_ns=1_000 + round(1e9 * assumed_s)
+    )
+    assert find_display_delay_s(frame, apparatus) == pytest.approx(late_s)
+    assert find_display_delay_s(frame, None) == 0.0
+    assert RendererParameters().display_latency_s == NOMINAL_DISPLAY_LATENCY_S

@@ -11,7 +11,12 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from flexsheet.launch.calibration.marker_fit import MarkerFitError, Touch, fit_marker
-from flexsheet.launch.calibration.touches import MAX_TOUCHES, read_touches, simulate_touches
+from flexsheet.launch.calibration.touches import (
+    SIMULATED_POINTS_M,
+    TOUCHED_ORIENTATIONS,
+    read_touches,
+    simulate_touches,
+)
 from flexsheet.launch.commands.calibrate import app
 from flexsheet.launch.commands.calibrate_marker import register
 from flexsheet.launch.commands.output import CommandError
@@ -109,7 +114,7 @@ def test_touches_of_the_sheet_give_the_offset() -> None:
     ("tilts_deg", "words"),
     [
         (((0, 0), (15, 0)), "2 touches in 2 orientations; at least 4 touches in 3 orientations"),
-        (((0, 0), (1, 0), (0, 1), (1, 1), (2, 0)), "5 touches in 1 orientations"),
+        (((0, 0), (1, 0), (0, 1), (1, 1), (2, 0)), "touch in at least 2 more orientations"),
     ],
 )
 def test_too_few_orientations_are_refused(
@@ -251,8 +256,9 @@ def test_exactly_one_source_is_required(tmp_path: Path) -> None:
     assert "--rows CSV and --twin SCENE" in str(result.exception)
 
 
-def test_a_marker_on_the_nail_is_found_in_most_orientations() -> None:
+def test_a_marker_on_the_nail_is_found_in_the_orientations_of_touches() -> None:
     """Drawn in front of a round finger, it was found in 6 of 24 orientations."""
     drawn = sample_apparatus(SCENE, 1)
     true = drawn.model_copy(update={"camera": CameraTruth()})
-    assert len(simulate_touches(SCENE, true, calibration=None, seed=1)) == MAX_TOUCHES
+    touches = simulate_touches(SCENE, true, calibration=None, seed=1)
+    assert len(touches) >= 0.9 * TOUCHED_ORIENTATIONS * len(SIMULATED_POINTS_M)

@@ -109,10 +109,18 @@ class MarkDetector:
             max_reprojection_px=given.max_reprojection_px,
         )
 
-    def find(self, left: Image, right: Image, *, near_world_m: Floats) -> Floats | None:
+    def find(
+        self,
+        left: Image,
+        right: Image,
+        *,
+        near_world_m: Floats,
+        left_origin_px: tuple[int, int] = (0, 0),
+        right_origin_px: tuple[int, int] = (0, 0),
+    ) -> Floats | None:
         """Return the position (3,) of the mark near a given position.
 
-        Return None if there is no clear mark.
+        Return None if there is no clear mark. Origins: first pixels of cropped images.
         """
         found = detect_all(
             left,
@@ -121,6 +129,8 @@ class MarkDetector:
             config=self._config,
             volume=(near_world_m - SEARCH_M, near_world_m + SEARCH_M),
             gate=Gate(near_world_m, SEARCH_M),
+            left_origin_px=left_origin_px,
+            right_origin_px=right_origin_px,
         )
         if found.reason != "ok" or found.measured is None:
             return None

@@ -113,9 +113,11 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     orientation = np.array(group_orientations([touch.world_from_finger for touch in touches]))
     orientations = len(set(orientation))
     if len(touches) < MIN_TOUCHES or orientations < MIN_ORIENTATIONS:
+        missing = max(MIN_ORIENTATIONS - orientations, MIN_TOUCHES - len(touches))
         raise MarkerFitError(
             f"{len(touches)} touches in {orientations} orientations; at least {MIN_TOUCHES} "
-            f"touches in {MIN_ORIENTATIONS} orientations are needed"
+            f"touches in {MIN_ORIENTATIONS} orientations are needed: touch in at least {missing} "
+            "more orientations"
         )
     rounded = np.rint(np.array([touch.point_m for touch in touches]) / POINT_GRID_M)
     places, point = np.unique(rounded, axis=0, return_inverse=True)

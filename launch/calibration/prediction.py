@@ -11,7 +11,7 @@ parameters of simulated devices are not read.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,7 +135,7 @@ def predict_errors(
         exact = {
             "left": true.left, "right": true.right, "right_from_left": true.right_from_left,
         }  # fmt: skip
-        given = NodeCalibrations(given.stereo.model_copy(update=exact), given.sheet, given.marker)
+        given = replace(given, stereo=given.stereo.model_copy(update=exact))
     evaluator = OfflineEvaluator(scene, given, metres_per_px=PIXEL_M, cells=CELLS)
     speed_m_per_s = scene.working_range.speed_m_per_s
     metrics = ALL_METRICS if scene.projector is not None else ALL_METRICS - {Metric.IMAGE}
@@ -198,7 +198,8 @@ def draw_apparatus(known: Knowledge, random: Random) -> Apparatus:
     projector = projector.model_copy(
         update={"lens": projector.lens.model_copy(update={"centre_offset_px": _tuple(shift_px)})}
     )
-    stamp_s = known.stamp_std_s * float(random.standard_normal())
+    stamp_s = known.calibrations.stamp_offset_s
+    stamp_s += known.stamp_std_s * float(random.standard_normal())
     drawn = apparatus.model_copy(
         update={
             "arms": apparatus.arms.model_copy(update=arms),

@@ -472,31 +472,44 @@ class Laboratory:
         )
 
     def measure_delays(self, lab: Commissioning) -> StepResult:
-        from flexsheet.launch.calibration.delays import (
-            measure_lags_in_simulation,
-            read_measured_lags,
-        )
+        from flexsheet.launch.calibration.delays import measure_in_simulation, read_delays
 
+        scene, stereo = load_scene(lab.scene_copy), lab.find_file(STEREO)
+        optics = None if stereo is None else load_calibration(stereo)
         if self.apparatus is None:
-            lags = read_measured_lags(self._find_data(StepName.DELAYS))
+            from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
+
+            added_s = NodeCalibrations.of(load_graph(lab.launch_copy)).stamp_offset_s
+            found = read_delays(self._find_data(StepName.DELAYS), scene, optics, added_s)
         else:
-            lags = measure_lags_in_simulation(load_scene(lab.scene_copy), self.apparatus)
+            found = measure_in_simulation(scene, self.apparatus, calibration=optics, seed=self.seed)
+        measured = {f"{side}_lag": lag for side, lag in found.servo.items()}
+        values = [
+            NodeValue(
+                node_type="arm_bridge",
+                parameter="servo_lag_s",
+                value=round(lag.lag_s, 4),
+                side=side,
+            )
+            for side, lag in found.servo.items()
+        ]
+        for name, node_type, parameter, delay in (
+            ("stamp_offset", "camera", "stamp_offset_s", found.stamp_offset),
+        ):
+            if delay is not None:
+                measured[name] = delay
+                value = round(delay.lag_s, 5)
+                values.append(NodeValue(node_type=node_type, parameter=parameter, value=value))
+        stamp = found.stamp_offset
         return StepResult(
-            residual=1e3 * max(lag.uncertainty_s for lag in lags.values()),
+            residual=1e3 * max(one.uncertainty_s for one in measured.values()),
             unit="ms",
             limit=4.0,
             advice="Repeat the stroke at the speed of use, and check that both arms follow it.",
-            uncertainty={f"{side}_lag_ms": 1e3 * lag.uncertainty_s for side, lag in lags.items()},
-            node_values=tuple(
-                NodeValue(
-                    node_type="arm_bridge",
-                    parameter="servo_lag_s",
-                    value=round(lag.lag_s, 4),
-                    side=side,
-                )
-                for side, lag in lags.items()
-            ),
-            figures={f"{side}_lag_ms": 1e3 * lag.lag_s for side, lag in lags.items()},
+            uncertainty={f"{name}_ms": 1e3 * one.uncertainty_s for name, one in measured.items()},
+            node_values=tuple(values),
+            figures={f"{name}_ms": 1e3 * one.lag_s for name, one in measured.items()},
+            covariances={} if stamp is None else {"stamp_s2": [[stamp.uncertainty_s**2]]},
         )
 
     def verify(self, lab: Commissioning) -> StepResult:

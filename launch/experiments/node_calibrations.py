@@ -21,20 +21,27 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class NodeCalibrations:
-    """Calibrations of stereo camera, sheet and marker that nodes use; None: from the scene."""
+    """Calibrations of stereo camera, sheet and marker that nodes use; None: from the scene.
+
+    stamp_offset_s: time that the camera node adds to timestamps.
+    """
 
     stereo: StereoCalibration | None = None
     sheet: SheetCalibration | None = None
     marker: MarkerCalibration | None = None
+    stamp_offset_s: float = 0.0
 
     @staticmethod
     def of(plan: ResolvedGraph) -> NodeCalibrations:
-        """Read the calibration files that the plan's triangulator and planner use."""
+        """Read the calibrations that the plan's camera, triangulator and planner use."""
         stereo: StereoCalibration | None = None
         sheet: SheetCalibration | None = None
         marker: MarkerCalibration | None = None
+        stamp_offset_s = 0.0
         for node in plan.nodes.values():
             kind = node_class(node.type)
+            if issubclass(kind, node_class("camera")):
+                stamp_offset_s = node.parameters["stamp_offset_s"]
             if issubclass(kind, node_class("triangulator")):
                 if path := node.parameters["calibration"]:
                     stereo = load_calibration(Path(path))
@@ -42,7 +49,7 @@ class NodeCalibrations:
                     marker = load_marker_calibration(Path(path))
             if issubclass(kind, node_class("planner")) and node.parameters["sheet_calibration"]:
                 sheet = load_sheet_calibration(Path(node.parameters["sheet_calibration"]))
-        return NodeCalibrations(stereo, sheet, marker)
+        return NodeCalibrations(stereo, sheet, marker, stamp_offset_s)
 
     def find_marker_offset_m(self, scene: Scene) -> Floats:
         """Return the measured vector (3,) from finger pad to marker, in world axes, m."""

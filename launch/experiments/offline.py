@@ -223,6 +223,7 @@ class OfflineEvaluator:
         self._scene = scene
         self._geometry = StereoGeometry.of(scene.camera, given.stereo)
         self._force_model = make_force_model(scene.sheet, given.sheet)
+        self._stamp_offset_s = given.stamp_offset_s
         self._marker_from_pad = given.find_marker_offset_m(scene)
         self._shape = make_shape(dict(scene.object.geometry))
         self._world_from_object = pose_matrix(scene.object.world_from_object)
@@ -319,7 +320,8 @@ class OfflineEvaluator:
         errors = []
         for contact in contacts:
             velocity = speed_m_per_s * contact.world_from_sheet[:3, 1]
-            times_s = apparatus.camera.stamp_offset_s + np.array([0.0, apparatus.camera.skew_s])
+            late_s = apparatus.camera.stamp_offset_s - self._stamp_offset_s
+            times_s = late_s + np.array([0.0, apparatus.camera.skew_s])
             markers = contact.point + offset_m + times_s[:, None] * velocity
             in_left = apply(left_from_world, markers)
             in_right = apply(camera.right_from_left, in_left)

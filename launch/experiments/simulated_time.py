@@ -119,10 +119,12 @@ class MeasuredFinger:
         if given is None:
             self._camera, self._truth = scene.camera, CameraTruth()
             self._marker_m = self._believed_marker_m = np.zeros(3)
+            self._stamp_offset_s = 0.0
         else:
             self._camera = rig.make_true_camera(apply_apparatus(scene, apparatus).camera)
             self._marker_m = Nail.of(apparatus.finger).marker_offset_m
             self._believed_marker_m = given.find_marker_offset_m(scene)
+            self._stamp_offset_s = given.stamp_offset_s
         self._left_from_world = inverse(pose_matrix(self._camera.world_from_left))
         self._random = np.random.default_rng(settings.seed)
         speed_m_per_s = scene.finger.max_speed_m_per_s
@@ -137,7 +139,7 @@ class MeasuredFinger:
         Returns the predicted path (n, 3), m. The images are exposed slightly after the timestamp.
         """
         truth, random = self._truth, self._random
-        late_s = truth.stamp_offset_s
+        late_s = truth.stamp_offset_s - self._stamp_offset_s
         if truth.exposure_jitter_s:
             late_s += truth.exposure_jitter_s * float(random.standard_normal())
         marker = position_world + self._marker_m

@@ -40,7 +40,7 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape, principal_curvatures
 from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
-from flexsheet.nodes.twin.truth import apply_apparatus
+from flexsheet.nodes.twin.truth import apply_apparatus, find_display_delay_s
 
 STROKE_ANGLE_RAD = np.radians(60.0)
 APPROACH_S = 0.8
@@ -304,6 +304,7 @@ def read_recording(bag: Path) -> StrokeRecording:
     }
     delays: dict[tuple[str, int], float] = {}
     frames = DrawnFrames([], [], [])
+    frame: Frame | None = None
 
     def add_delay(event: str, source_ns: int, event_ns: int) -> None:
         delays.setdefault((event, source_ns), (event_ns - source_ns) * 1e-9)
@@ -332,6 +333,7 @@ def read_recording(bag: Path) -> StrokeRecording:
                 flanges["true_right"].append((header.source_ns, message.world_from_flange_right))
             case Frame():
                 frames.add(message)
+                frame = message
             case Status():
                 for port in message.inputs:
                     # A restarted node counts from zero, so the last status after each start
@@ -350,7 +352,7 @@ def read_recording(bag: Path) -> StrokeRecording:
     true_arms = apply_apparatus(scene, apparatus).arms
     delays_s = group_by_event(delays)
     if apparatus is not None:
-        late_s = apparatus.projector.latency_offset_s
+        late_s = find_display_delay_s(frame, apparatus)
         frames = frames.shifted(round(1e9 * late_s))
         if LatencyEvent.LIGHT in delays_s:
             delays_s[LatencyEvent.LIGHT] += late_s

@@ -18,8 +18,9 @@ from flexsheet.launch.experiments.system_errors import APPROACH_S, STROKE, make_
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import FingerPath, TwinFinger
+from flexsheet.messages.types import FingerPath, Frame, TwinFinger
 from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.twin.truth import find_display_delay_s
 
 DELAY_TOPICS = ("twin/apparatus", "arm_left", "arm_right", "frame")
 
@@ -103,10 +104,13 @@ def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats
     """
     to_arm: dict[tuple[str, int], float] = {}
     to_light: dict[int, float] = {}
-    late_s = 0.0
+    apparatus: Apparatus | None = None
+    frame: Frame | None = None
     for _, message, header, _ in BagReader(bag, topics=DELAY_TOPICS):
         if isinstance(message, Apparatus):
-            late_s = message.projector.latency_offset_s
+            apparatus = message
+        elif isinstance(message, Frame):
+            frame = message
         for event, exposure_ns, at_ns in stroke.list_events(message, header):
             if begin_ns <= exposure_ns <= end_ns:
                 delay_s = 1e-9 * (at_ns - exposure_ns)
@@ -114,7 +118,9 @@ def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats
                     to_light.setdefault(exposure_ns, delay_s)
                 elif event in stroke.ARM_EVENTS.values():
                     to_arm.setdefault((event, exposure_ns), delay_s)
-    return np.array(list(to_arm.values())), np.array(list(to_light.values())) + late_s
+    return np.array(list(to_arm.values())), (
+        np.array(list(to_light.values())) + find_display_delay_s(frame, apparatus)
+    )
 
 
 def summarize_latency(values_s: Floats) -> dict[str, float] | None:

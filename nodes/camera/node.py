@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -40,6 +40,11 @@ class CameraParameters(NodeParameters):
     max_skew_s: Positive | None = Field(
         default=None,
         description="maximum time between the left and right exposure, s; null: no limit",
+    )
+    stamp_offset_s: Annotated[float, Field(ge=-0.1, le=0.1)] = Field(
+        default=0.0,
+        description="measured time, s, by which exposures are later than their timestamps; it is "
+        "added to all timestamps",
     )
     region: Literal["full", "finger"] | ExplicitRegions = Field(
         default="full",
@@ -158,7 +163,8 @@ class Camera(Node):
             self.note = f"{self.rejected} pairs rejected: {describe_skew(images.skew_s, limit_s)}"
             return
         pair = make_stereo_message(images, device, exposure_s, lost + self.rejected)
-        self.stereo.publish(pair, source_ns=images.exposure_ns)
+        offset_ns = round(1e9 * self.parameters.stamp_offset_s)
+        self.stereo.publish(pair, source_ns=images.exposure_ns + offset_ns)
         parts = (
             device,
             f"{pair.dropped_frames} frames lost",

@@ -33,7 +33,7 @@ from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation
 from flexsheet.nodes.twin.head import HeadSway
 from flexsheet.nodes.twin.render_queue import RenderQueue
-from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
+from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus, find_display_delay_s
 
 Job = tuple[EyeSituation, Floats, Frame, Header]
 
@@ -137,7 +137,8 @@ class TwinEyeNode(Node):
         if self._before_light is None or scene is None:
             return
         frame, frame_header = self._before_light
-        light_ns = frame.predicted_to_ns + self._late_light_ns
+        late_s = find_display_delay_s(frame, self.parameters.apparatus)
+        light_ns = frame.predicted_to_ns + round(1e9 * late_s)
         if header.clock_id == frame_header.clock_id and header.source_ns < light_ns:
             return
         self._before_light = None
@@ -148,12 +149,6 @@ class TwinEyeNode(Node):
         self._queue.add(key, (situation, eye, frame, frame_header))
         if self._task is None or self._task.done():
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
-
-    @property
-    def _late_light_ns(self) -> int:
-        """Return how much later the projector shows an image than the renderer assumes, ns."""
-        truth = self.parameters.apparatus
-        return 0 if truth is None else round(1e9 * truth.projector.latency_offset_s)
 
     def _true_scene(self, scene: Scene) -> Scene:
         """Return the scene with the true devices; cached, so that it is one object per scene."""

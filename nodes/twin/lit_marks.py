@@ -21,6 +21,7 @@ from flexsheet.nodes.twin.membrane import DeformedSheet, NotConvergedError, solv
 from flexsheet.nodes.twin.projector import on_plane
 from flexsheet.nodes.twin.rig import slopes_of
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.truth import find_display_delay_s
 
 CELLS = 8
 """Number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
@@ -57,9 +58,6 @@ class LitMarks:
         scene: scene with the true devices. apparatus: their deviations from the nodes' scene.
         """
         self._scene, self._apparatus = scene, apparatus
-        self._late_ns = (
-            0 if apparatus is None else round(1e9 * apparatus.projector.latency_offset_s)
-        )
         projector = require_projector(scene)
         pose = projector.world_from_projector
         self._world_from_projector = pose_matrix(pose)
@@ -78,9 +76,10 @@ class LitMarks:
             self._solving.exception()
 
     def on_frame(self, frame: Frame) -> None:
-        """Add a frame, which the projector shows from `light_ns` until the next frame."""
+        """Add a frame, which the projector shows until the next frame."""
         if frame.light_ns and len(frame.marks_px):
-            self._frames.append((frame.light_ns + self._late_ns, frame.marks_px))
+            late_ns = round(1e9 * find_display_delay_s(frame, self._apparatus))
+            self._frames.append((frame.light_ns + late_ns, frame.marks_px))
 
     def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
         """Return the lit points (n, 3) in the world at `at_ns`; empty if they are unknown."""

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from flexsheet.messages.apparatus import (
+    NOMINAL_DISPLAY_LATENCY_S,
     Apparatus,
     ArmTruth,
     CameraTruth,
@@ -19,6 +20,7 @@ from flexsheet.messages.apparatus import (
     devices_of,
 )
 from flexsheet.messages.scene import ArmSpec, Lens, Pose, Scene, StereoCamera
+from flexsheet.messages.types import Frame
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
@@ -39,6 +41,20 @@ class SimulatorParameters(NodeParameters):
         default=None,
         description="true hardware parameters, set by `--apparatus`; null: those of the scene",
     )
+
+
+def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
+    """Return how much later the projector shows a frame than its renderer assumes, s.
+
+    The assumed latency is that of the frame, or the nominal one if no frame was displayed. Without
+    an apparatus, the renderer's assumption is true.
+    """
+    if apparatus is None:
+        return 0.0
+    assumed_s = NOMINAL_DISPLAY_LATENCY_S
+    if frame is not None and frame.light_ns and (shown_ns := frame.swapped_ns or frame.drawn_ns):
+        assumed_s = 1e-9 * (frame.light_ns - shown_ns)
+    return NOMINAL_DISPLAY_LATENCY_S + apparatus.projector.latency_offset_s - assumed_s
 
 
 def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
