@@ -304,7 +304,8 @@ def test_the_risk_of_the_loop_follows_from_object_and_delay(
 def test_a_graph_is_checked_with_the_delay_of_its_planner(monkeypatch: pytest.MonkeyPatch) -> None:
     curve = soft_curve(0.8)
     rows = np.column_stack([curve.depths_m, curve.forces_n])
-    body = SimpleNamespace(at_rest=lambda: SimpleNamespace(force_curve=rows))
+    method = SimpleNamespace(name="nonlinear_table")
+    body = SimpleNamespace(method=method, at_rest=lambda: SimpleNamespace(force_curve=rows))
     table = make_bounds_60_hz()
     monkeypatch.setattr(compliance_check, "load_cached", lambda *_: table)
     cached = {"bodies": lambda *_: [body], "is_cached": lambda *_: True}
@@ -318,6 +319,9 @@ def test_a_graph_is_checked_with_the_delay_of_its_planner(monkeypatch: pytest.Mo
     assert check_graph(load_graph(DEMO, settings=[*late, f"scene={RIGID}"])) is None
     shown = CliRunner().invoke(app, ["launch", str(DEMO), "--dry-run", "--set", *late])
     assert "can oscillate at a delay of 212 ms" in " ".join(shown.stderr.split())
+    method.name = "linear"
+    assert check_graph(load_graph(DEMO, settings=late)) is None
+    method.name = "nonlinear_table"
     monkeypatch.setattr(compliance_check.SoftBodyFactory, "is_cached", lambda *_: False)
     assert check_graph(load_graph(DEMO, settings=late)) is None
 

@@ -86,7 +86,10 @@ def compliance(
                 ("stretch", f"{result['stretch_ratio']:.3f}"),
                 ("maximum edge force", f"{result['max_edge_force_n']:.1f} N"),
                 ("sheet motion per finger depth", f"{result['advance_per_depth']:.2f}"),
-                ("low-pass filter of the depth", f"{result['filter_ms']:.0f} ms"),
+                (
+                    "bandwidth of the depth's filter",
+                    f"{result['filter_bandwidth_rad_per_s']:.1f} rad/s",
+                ),
                 ("maximum error", f"{100 * result['worst_error_ratio']:.1f} %"),
                 ("result", result["note"] or "the error is within the tolerance"),
             ]

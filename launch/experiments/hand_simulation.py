@@ -19,6 +19,7 @@ from flexsheet.nodes.arrays import Floats
 Curve = Callable[[Floats], Floats]
 
 STEPS_PER_PERIOD = 64
+FILTER_DAMPING_RATIO = 0.5
 PAD_STIFFNESS_N_PER_M, PAD_DAMPING_NS_PER_M = 1100.0, 1.0
 """Stiffness and damping of the finger pad at 1 N: Hertz contact, tissue of 0.07 to 0.2 MPa."""
 
@@ -44,8 +45,8 @@ class Cases:
     delay_s: time from exposure to the sheet's motion. jitter_s: maximum additional delay of a
     measurement, uniformly distributed; a measurement that a newer one overtakes is lost.
     depth_m: finger depth at equilibrium. gain: factor of the sheet's motion relative to its
-    position at equilibrium. filter_s, lead_s: time constants of the low-pass filter and of the lead
-    (prediction) applied to the measured depth.
+    position at equilibrium. bandwidth_rad_per_s: natural frequency of the filter of the measured
+    depth; infinite for none. lead_s: time by which the filtered depth is extrapolated.
     """
 
     mass_kg: Floats
@@ -55,7 +56,7 @@ class Cases:
     jitter_s: Floats
     depth_m: Floats
     gain: Floats
-    filter_s: Floats
+    bandwidth_rad_per_s: Floats
     lead_s: Floats
 
     def __len__(self) -> int:
@@ -96,12 +97,17 @@ class HeldOffset:
 
     def __init__(self, cases: Cases, offset: Curve, period_s: float, step_s: float) -> None:
         self._cases, self._offset, self._period_s, self._step_s = cases, offset, period_s, step_s
-        self._weight = np.where(
-            cases.filter_s > 0.0,
-            -np.expm1(-period_s / np.maximum(cases.filter_s, 1e-9)),
-            1.0,
-        )
-        self._filtered = cases.depth_m.copy()
+        # The filter is a difference equation with the poles `pole` and its complex conjugate.
+        # Its numerator makes the result exact, except for the lead, for a constant rate.
+        angle = period_s * np.minimum(cases.bandwidth_rad_per_s, 1e6)
+        pole = np.exp(angle * np.exp(1j * (np.pi - np.arccos(FILTER_DAMPING_RATIO))))
+        twice, square = 2.0 * pole.real, np.abs(pole) ** 2
+        lead = cases.lead_s / period_s * (1.0 - twice + square)
+        self._feedback = np.array([twice, -square])
+        self._gains = np.array([1.0 - square + lead, 2.0 * square - twice - lead])
+        # Last two measured and last two filtered depths, newest first.
+        self._seen = np.tile(cases.depth_m, (2, 1))
+        self._filtered = np.tile(cases.depth_m, (2, 1))
         self._rest_m = offset(cases.depth_m)
         self._random = np.random.default_rng(JITTER_SEED)
         self._delays = np.round(cases.delay_s / step_s).astype(int)
@@ -119,13 +125,12 @@ class HeldOffset:
     def sample(self, step: int, depths_m: Floats) -> None:
         """Measure the finger depths (n,), and queue the offsets that are computed from them."""
         seen = CAMERA_RESOLUTION_M * np.round(depths_m / CAMERA_RESOLUTION_M)
-        before = self._filtered
-        self._filtered = before + self._weight * (seen - before)
-        lead = self._cases.lead_s / self._period_s * (self._filtered - before)
-        present = self._scale(self._offset(np.maximum(self._filtered, 0.0)))
-        wanted = self._scale(self._offset(np.maximum(self._filtered + lead, 0.0)))
-        rate = (present - self._last) / self._period_s
-        self._last = present
+        self._seen = np.array([seen, self._seen[0]])
+        filtered = np.sum(self._gains * self._seen + self._feedback * self._filtered, axis=0)
+        self._filtered = np.array([filtered, self._filtered[0]])
+        wanted = self._scale(self._offset(np.maximum(filtered, 0.0)))
+        rate = (wanted - self._last) / self._period_s
+        self._last = wanted
         late = self._random.integers(0, self._jitters, endpoint=True)
         rows = (step + self._delays + late) % self._ring
         self._sampled[rows, self._columns] = step

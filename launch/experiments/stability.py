@@ -14,6 +14,7 @@ are therefore tested with hands that were not used to derive them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -63,8 +64,8 @@ MAX_BOUNDARY_SLOPE = 1.5
 """Maximum compared critical slope. Above it, the finger loses contact with the sheet."""
 
 SLOPES = 32
-FILTERS = ((0.0, False), (0.0, True), (0.08, False))
-"""Time constant of the depth filter (s), and whether the depth is predicted over the delay."""
+FILTERS = ((math.inf, False), (math.inf, True), (10.0, False))
+"""Bandwidth of the depth's filter (rad/s), and whether the depth is predicted over the delay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +122,7 @@ def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
         jitter_s=repeat(one.jitter_s for one in trials),
         depth_m=repeat(one.depth_m for one in trials),
         gain=np.tile(gains, len(trials)),
-        filter_s=repeat(one.loop.filter_s for one in trials),
+        bandwidth_rad_per_s=repeat(one.loop.bandwidth_rad_per_s for one in trials),
         lead_s=repeat(one.loop.lead_s for one in trials),
     )
 
@@ -156,10 +157,10 @@ def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[di
         trials = [
             Trial(
                 hand,
-                SampledLoop(1.0 / rate_hz, delay_s, filter_s, lead_s=delay_s if lead else 0.0),
+                SampledLoop(1.0 / rate_hz, delay_s, bandwidth, delay_s if predicted else 0.0),
                 LINEAR_DEPTH_M,
             )
-            for hand, delay_s, (filter_s, lead) in product(hands, settings.delays_s, FILTERS)
+            for hand, delay_s, (bandwidth, predicted) in product(hands, settings.delays_s, FILTERS)
         ]
         simulated = find_critical_slopes(trials, towards_finger=towards)
         for trial, measured in zip(trials, simulated, strict=True):
@@ -176,7 +177,7 @@ def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[di
                 {
                     **_describe(trial.hand, trial.loop.delay_s),
                     "rate_hz": rate_hz,
-                    "filter_ms": 1e3 * trial.loop.filter_s,
+                    "filter_bandwidth_rad_per_s": _finite(trial.loop.bandwidth_rad_per_s),
                     "predicted_depth": trial.loop.lead_s > 0.0,
                     "towards_finger": towards,
                     "simulated_slope": float(measured),
@@ -185,6 +186,10 @@ def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[di
                 }
             )
     return rows
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _describe(hand: Hand, delay_s: float) -> dict[str, float]:
@@ -230,8 +235,8 @@ def measure_map(
             fitted = compute_compliance(
                 scene, model, scaled, bounds=table.at_delay(delay_s + 0.5 * jitter_s)
             )
-            filter_s, suffices = fitted.choose_filter_s()
-            loops = [SampledLoop(period_s, delay_s, filter_s)]
+            bandwidth, suffices = fitted.choose_bandwidth_rad_per_s()
+            loops = [SampledLoop(period_s, delay_s, bandwidth)]
             for row in _simulate_pushes(fitted, hands, loops, jitter_s):
                 rows.append(
                     {"object_pa": object_pa, "kind": "bounded", "warned": not suffices} | row
@@ -283,7 +288,7 @@ def _simulate_pushes(
             {
                 **_describe(hand, loop.delay_s),
                 "jitter_ms": 1e3 * jitter_s,
-                "filter_ms": 1e3 * loop.filter_s,
+                "filter_bandwidth_rad_per_s": _finite(loop.bandwidth_rad_per_s),
                 "advance_per_depth": fitted.centre.advance_per_depth,
                 "stable": bool(gains[0]),
                 "margin": float(margin),

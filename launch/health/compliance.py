@@ -147,7 +147,7 @@ def find_loop_risk(
     """
     bounded = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
     error_ratio = float(np.abs(bounded.centre.error_ratio).max())
-    if not bounded.choose_filter_s()[1]:
+    if not bounded.choose_bandwidth_rad_per_s()[1]:
         return LoopFinding(LoopRisk.OSCILLATION, delay_s, error_ratio)
     if error_ratio <= TARGET_ERROR_RATIO:
         return None
@@ -160,8 +160,8 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     """Return the risk of the feedback loop of sheet and hand in a graph, before it starts.
 
     The delay is that of the planner's parameters. Only cached data are used, since computing them
-    takes up to minutes. If the stability bounds or the soft body are not cached, None is returned;
-    the planner reports the risk when they have been computed.
+    takes up to minutes. If the stability bounds or the body of the chosen method are not
+    cached, None is returned; the planner reports the risk when they have been computed.
     """
     scene = plan.scene_message()
     planners, solvers = plan.nodes_of_type("planner"), plan.nodes_of_type("fem_solver")
@@ -178,6 +178,8 @@ def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
     if not factory.is_cached(scene):
         return None
     best, *_ = factory.bodies(scene, method, lambda done, total, need: None)
+    if method != "linear" and best.method.name == "linear":
+        return None
     calibration = given.sheet_calibration
     law = make_force_model(
         scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
@@ -203,7 +205,7 @@ def compliance_result(
     """
     table = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
     shown = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
-    filter_s, stable = shown.choose_filter_s()
+    bandwidth, stable = shown.choose_bandwidth_rad_per_s()
     finding = find_loop_risk(scene, law, curve, table, delay_s)
     # `shown.note` already describes what the sheet itself cannot render.
     by_loop = finding is not None and finding.risk is not LoopRisk.SHEET
@@ -235,7 +237,7 @@ def compliance_result(
             shown.centre, scene.tolerances.sheet_position_m
         ),
         "delay_ms": 1e3 * delay_s,
-        "filter_ms": 1e3 * filter_s,
+        "filter_bandwidth_rad_per_s": bandwidth,
         "stable_for_every_hand": stable,
         "risk": None if finding is None else finding.risk,
         "note": "; ".join(filter(None, (shown.note, loop_note))),

@@ -9,13 +9,15 @@ damping b and stiffness k, the sheet the stiffness ks.  With the depth x and the
     m x'' + b x' + k x + ks (x - s) = 0
     s(t) = slope (y_j + y'_j (t - j T - delay))
 
-Here y_j is the low-pass filtered depth x(j T) of measurement j, and y'_j is its rate.  The state
-changes over one period by an exact linear map.  The loop is stable if all eigenvalues of this map
-are inside the unit circle.
+Here y_j is the filtered depth of measurement j, and y'_j is its change per period.  The filter is
+an alpha-beta filter: it estimates the depth and its rate, so it does not lag behind a depth that
+changes at a constant rate.  The state changes over one period by an exact linear map.  The loop is
+stable if all eigenvalues of this map are inside the unit circle.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,9 +39,12 @@ SLOPES = 32
 """Number of slopes at which the search evaluates the decay rate."""
 
 DELAYS_S = (0.02, 0.04, 0.06, 0.08, 0.1, 0.13, 0.17)
-FILTERS_S = (0.03, 0.08, 0.16)
+BANDWIDTHS_RAD_PER_S = (4.5, 5.5, 6.5, 8.0, 10.0, 12.5, 16.0, 20.0)
 SHEET_STIFFNESSES_N_PER_M = (50.0, 120.0, 300.0)
-"""Grid of `OffsetBoundsTable`: delays, filter time constants and stiffnesses of the sheet."""
+"""Grid of `OffsetBoundsTable`: delays, bandwidths of the filter and stiffnesses of the sheet."""
+
+FILTER_DAMPING_RATIO = 0.5
+"""Damping ratio of the depth's filter.  A larger one permits smaller offsets per depth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,19 +82,28 @@ class SampledLoop:
 
     period_s: time between two measurements.
     delay_s: time from a measurement until the sheet reaches the position that follows from it.
-    filter_s: time constant of the depth's low-pass filter; 0 for none.
-    lead_s: time by which the filtered depth is extrapolated (prediction); 0 for none.
+    bandwidth_rad_per_s: natural frequency of the depth's filter; infinite for none.
+    lead_s: time by which the filtered depth is extrapolated with its estimated rate.
     """
 
     period_s: float
     delay_s: float
-    filter_s: float = 0.0
+    bandwidth_rad_per_s: float = math.inf
     lead_s: float = 0.0
 
-    @property
-    def filter_weight(self) -> float:
-        """Return the weight of the newest depth in the low-pass filter."""
-        return 1.0 - float(np.exp(-self.period_s / self.filter_s)) if self.filter_s > 0.0 else 1.0
+
+def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[float, float]:
+    """Return the gains (alpha, beta) of the depth's filter for the time since the last measurement.
+
+    Its poles are those of a continuous filter with `FILTER_DAMPING_RATIO`.  With an infinite
+    bandwidth, the estimates are the measured depth and its last change.
+    """
+    if math.isinf(bandwidth_rad_per_s):
+        return 1.0, 1.0
+    angle = bandwidth_rad_per_s * step_s
+    radius = math.exp(-FILTER_DAMPING_RATIO * angle)
+    turn = math.sqrt(1.0 - FILTER_DAMPING_RATIO**2) * angle
+    return 1.0 - radius**2, 1.0 + radius**2 - 2.0 * radius * math.cos(turn)
 
 
 def make_loop_matrices(
@@ -97,12 +111,12 @@ def make_loop_matrices(
 ) -> Floats:
     """Return the matrices (k, n, n) that map the state over one period, for slopes (k,).
 
-    The state contains depth, speed and the newest two filtered depths.  The offsets that have not
-    yet taken effect follow with their rates, newest first.
+    The state contains depth and speed, and the filter's estimates of both.  The offsets that have
+    not yet taken effect and the last two that have follow, newest first.
     """
     whole, fraction = divmod(loop.delay_s / loop.period_s, 1.0)
     waiting = int(whole) + 1
-    size = 4 + 2 * waiting
+    size = 5 + waiting
     flow = np.zeros((4, 4))
     flow[0, 1] = flow[2, 3] = 1.0
     flow[1, :3] = (
@@ -114,27 +128,29 @@ def make_loop_matrices(
         flow * loop.period_s * np.array([fraction, 1.0 - fraction])[:, None, None]
     )
 
-    # `measure` adds a measurement: it extends the state by filtered depth, offset and its rate.
-    measure = np.zeros((len(slopes), size + 2, size))
+    # `measure` adds a measurement: it updates the filter and extends the state by an offset.
+    measure = np.zeros((len(slopes), size + 1, size))
     measure[:, :2, :2] = np.eye(2)
-    weight = loop.filter_weight
-    measure[:, 2, 0], measure[:, 2, 2], measure[:, 3, 2] = weight, 1.0 - weight, 1.0
-    rate = (measure[:, 2] - measure[:, 3]) / loop.period_s
-    measure[:, 4] = slopes[:, None] * (measure[:, 2] + loop.lead_s * rate)
-    measure[:, 5] = slopes[:, None] * rate
-    measure[:, 6:, 4:] = np.eye(2 * waiting)
+    alpha, beta = compute_filter_gains(loop.bandwidth_rad_per_s, loop.period_s)
+    measure[:, 2, [0, 2, 3]] = alpha, 1.0 - alpha, (1.0 - alpha) * loop.period_s
+    measure[:, 3, [0, 2, 3]] = beta / loop.period_s, -beta / loop.period_s, 1.0 - beta
+    measure[:, 4] = slopes[:, None] * (measure[:, 2] + loop.lead_s * measure[:, 3])
+    measure[:, 5:, 4:] = np.eye(1 + waiting)
 
     # `move` moves the hand for one period: for its `fraction` with the oldest offset, then with
-    # the next one.  The oldest offset took effect (1 - fraction) T before this period.
-    start = np.zeros((4, size + 2))
+    # the next one.  The oldest offset took effect (1 - fraction) T before this period.  Its rate
+    # is its difference from the offset before it.
+    start = np.zeros((4, size + 1))
     start[:2, :2] = np.eye(2)
-    start[2, -2], start[2, -1], start[3, -1] = 1.0, (1.0 - fraction) * loop.period_s, 1.0
+    start[2, -2:] = 2.0 - fraction, fraction - 1.0
+    start[3, -2:] = np.array([1.0, -1.0]) / loop.period_s
     between = first @ start
     between[2:] = 0.0
-    between[2, -4] = between[3, -3] = 1.0
-    move = np.zeros((size, size + 2))
+    between[2, -3] = 1.0
+    between[3, -3:-1] = np.array([1.0, -1.0]) / loop.period_s
+    move = np.zeros((size, size + 1))
     move[:2] = (second @ between)[:2]
-    move[2:, 2:-2] = np.eye(size - 2)
+    move[2:, 2:-1] = np.eye(size - 2)
     return np.asarray(move @ measure)
 
 
@@ -186,26 +202,28 @@ def compute_critical_slope(
 class OffsetBounds:
     """Maximum slopes at which every hand is stable; slope: sheet offset divided by finger depth.
 
-    filters_s (f,): time constants of the depth's low-pass filter.
+    bandwidths_rad_per_s (f,): bandwidths of the depth's filter, ascending.
     sheet_stiffnesses_n_per_m (k,): stiffness of the sheet under the finger.
     max_advances, max_retreats (f, k): maximum slopes towards the finger and away from it.
     """
 
-    filters_s: Floats
+    bandwidths_rad_per_s: Floats
     sheet_stiffnesses_n_per_m: Floats
     max_advances: Floats
     max_retreats: Floats
 
-    def max_advance(self, filter_s: float, stiffnesses_n_per_m: Floats) -> Floats:
+    def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
         """Return the maximum slope (n,) towards the finger for stiffnesses (n,) of the sheet."""
-        return self._interpolate(self.max_advances, filter_s, stiffnesses_n_per_m)
+        return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
-    def max_retreat(self, filter_s: float, stiffnesses_n_per_m: Floats) -> Floats:
+    def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
         """Return the maximum slope (n,) away from the finger for stiffnesses (n,) of the sheet."""
-        return self._interpolate(self.max_retreats, filter_s, stiffnesses_n_per_m)
+        return self._interpolate(self.max_retreats, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
-    def _interpolate(self, slopes: Floats, filter_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        row = int(np.argmin(np.abs(self.filters_s - filter_s)))
+    def _interpolate(
+        self, slopes: Floats, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats
+    ) -> Floats:
+        row = int(np.argmin(np.abs(self.bandwidths_rad_per_s - bandwidth_rad_per_s)))
         return np.asarray(
             np.interp(stiffnesses_n_per_m, self.sheet_stiffnesses_n_per_m, slopes[row])
         )
@@ -216,7 +234,7 @@ class OffsetBoundsTable:
     """Table of `OffsetBounds` over delays (d,), for one camera period; the slopes are (d, f, k)."""
 
     delays_s: Floats
-    filters_s: Floats
+    bandwidths_rad_per_s: Floats
     sheet_stiffnesses_n_per_m: Floats
     max_advances: Floats
     max_retreats: Floats
@@ -224,7 +242,7 @@ class OffsetBoundsTable:
     def at_delay(self, delay_s: float) -> OffsetBounds:
         """Return the bounds at the next longer delay of the table; beyond the last, bounds of 0."""
         row = int(np.searchsorted(self.delays_s, delay_s - 1e-9))
-        axes = self.filters_s, self.sheet_stiffnesses_n_per_m
+        axes = self.bandwidths_rad_per_s, self.sheet_stiffnesses_n_per_m
         if row == len(self.delays_s):
             none = np.zeros(self.max_advances.shape[1:])
             return OffsetBounds(*axes, none, none)
@@ -238,10 +256,10 @@ def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBou
     sheet's stiffness instead, because a slope cannot exceed 1.  The sheet never retreats by more
     than the finger moves.
     """
-    shape = len(DELAYS_S), len(FILTERS_S), len(SHEET_STIFFNESSES_N_PER_M)
+    shape = len(DELAYS_S), len(BANDWIDTHS_RAD_PER_S), len(SHEET_STIFFNESSES_N_PER_M)
     advances, retreats = np.empty(shape), np.empty(shape)
     for at in np.ndindex(shape):
-        loop = SampledLoop(period_s, DELAYS_S[at[0]] + DELAY_MARGIN_S, FILTERS_S[at[1]])
+        loop = SampledLoop(period_s, DELAYS_S[at[0]] + DELAY_MARGIN_S, BANDWIDTHS_RAD_PER_S[at[1]])
         stiffness = SHEET_STIFFNESSES_N_PER_M[at[2]]
         advances[at] = min(
             compute_critical_slope(
@@ -266,7 +284,7 @@ def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBou
         )
     return OffsetBoundsTable(
         np.array(DELAYS_S),
-        np.array(FILTERS_S),
+        np.array(BANDWIDTHS_RAD_PER_S),
         np.array(SHEET_STIFFNESSES_N_PER_M),
         # Bounds must not rise with stiffness or delay.  They then also hold between grid points.
         _descend(advances),

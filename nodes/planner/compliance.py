@@ -20,6 +20,7 @@ the camera while a finger only strokes.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -159,8 +160,8 @@ class StretchLimits:
         result = np.full(len(stiffnesses_n_per_m), self.max_advance_per_depth)
         if self.bounds is None:
             return result
-        longest_s = float(self.bounds.filters_s[-1])
-        bounded = self.bounds.max_advance(longest_s, stiffnesses_n_per_m)
+        lowest = float(self.bounds.bandwidths_rad_per_s[0])
+        bounded = self.bounds.max_advance(lowest, stiffnesses_n_per_m)
         return np.asarray(np.minimum(result, bounded))
 
 
@@ -371,23 +372,23 @@ class Compliance:
             return 1.0
         return 1.0 - float(self._growth(depth_m) @ self._weights(position_m))
 
-    def choose_filter_s(self) -> tuple[float, bool]:
-        """Choose the time constant (s) of the depth's low-pass filter so that hands are stable.
+    def choose_bandwidth_rad_per_s(self) -> tuple[float, bool]:
+        """Choose the bandwidth (rad/s) of the depth's filter so that hands are stable.
 
-        It is the shortest that permits the offset's slopes for a push at the centre.  If none does,
-        it is the longest, and the second result is False.
+        It is the largest that permits the offset's slopes for a push at the centre.  If none does,
+        it is the smallest, and the second result is False.  Without bounds it is infinite.
         """
         bounds, push = self.limits.bounds, self.centre
         if bounds is None:
-            return 0.0, True
+            return math.inf, True
         slopes = 1.0 - np.diff(push.indentation_m) / np.diff(push.depths_m)
         stiffnesses = np.maximum(push.stiffness_n_per_m[1:], push.stiffness_n_per_m[:-1])
-        for filter_s in bounds.filters_s:
-            low = -bounds.max_advance(float(filter_s), stiffnesses) - SLOPE_TOLERANCE
-            high = bounds.max_retreat(float(filter_s), stiffnesses) + SLOPE_TOLERANCE
+        for bandwidth in bounds.bandwidths_rad_per_s[::-1].tolist():
+            low = -bounds.max_advance(bandwidth, stiffnesses) - SLOPE_TOLERANCE
+            high = bounds.max_retreat(bandwidth, stiffnesses) + SLOPE_TOLERANCE
             if ((low <= slopes) & (slopes <= high)).all():
-                return float(filter_s), True
-        return float(bounds.filters_s[-1]), False
+                return bandwidth, True
+        return float(bounds.bandwidths_rad_per_s[0]), False
 
     def rendered_force_n(self, depths_m: Floats, position_m: SheetPosition = CENTRE) -> Floats:
         """Return the force (n,), N, that the sheet's model predicts at depths (n,)."""

@@ -41,7 +41,7 @@ class ComplianceController:
         value in the scene.
     bounds: bounds on the offset's slope for a stable loop with the hand; None if there is no hand.
     delay_s: time from a measured depth until the sheet has moved accordingly.
-    filter_s: time constant of the low-pass filter on the depth; None if there are no bounds.
+    bandwidth_rad_per_s: bandwidth of the depth's filter; None if there are no bounds.
     mode: "force_curve" renders the object's force as a function of depth.  "stiffness" renders its
     stiffness at small pushes by the stretch (Furukawa et al. 2007).  "constant_stretch" keeps the
     minimum.
@@ -64,7 +64,9 @@ class ComplianceController:
         self._hysteresis = HysteresisCorrection(ratio) if ratio else None
         self._bounds, self.delay_s, self._bounded_delay_s = bounds, delay_s, delay_s
         self._limits = self._make_limits()
-        self.filter_s: float | None = None if bounds is None else float(bounds.filters_s[-1])
+        self.bandwidth_rad_per_s: float | None = (
+            None if bounds is None else float(bounds.bandwidths_rad_per_s[0])
+        )
         self._curve: ObjectCurve | None = None
         self._compared_m = scene.working_range.push_depth_m * COMPARED_FRACTIONS
         self._fitted_n: Floats | None = None
@@ -126,7 +128,7 @@ class ComplianceController:
         self.stretch_ratio = fitted.stretch_ratio
         hand_note = ""
         if self._bounds is not None:
-            self.filter_s, suffices = fitted.choose_filter_s()
+            self.bandwidth_rad_per_s, suffices = fitted.choose_bandwidth_rad_per_s()
             if not suffices:
                 hand_note = (
                     f"a hand of low damping can oscillate with this object: the sheet follows "

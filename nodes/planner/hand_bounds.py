@@ -10,7 +10,7 @@ from flexsheet.nodes.models import hand_loop
 from flexsheet.nodes.models.hand_loop import OffsetBoundsTable, compute_offset_bounds
 from flexsheet.nodes.planner.compliance import MAX_ADVANCE_PER_DEPTH
 
-VERSION = 1
+VERSION = 2
 """Version of the computation; tables of another version are computed again."""
 
 
@@ -21,7 +21,8 @@ def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
         "rate_hz": rate_hz,
         "advance_limit": MAX_ADVANCE_PER_DEPTH,
         "delays_s": hand_loop.DELAYS_S,
-        "filters_s": hand_loop.FILTERS_S,
+        "bandwidths_rad_per_s": hand_loop.BANDWIDTHS_RAD_PER_S,
+        "filter_damping_ratio": hand_loop.FILTER_DAMPING_RATIO,
         "stiffnesses_n_per_m": hand_loop.SHEET_STIFFNESSES_N_PER_M,
         "margins": [hand_loop.GAIN_MARGIN, hand_loop.DELAY_MARGIN_S, hand_loop.MIN_DECAY_PER_S],
         "hands": [asdict(hand) for hand in hand_loop.LIMITING_HANDS],

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-import numpy as np
-
+from flexsheet.nodes.models.hand_loop import compute_filter_gains
 from flexsheet.nodes.planner.oscillation_watchdog import OscillationWatchdog
 
 OffsetAtDepth = Callable[[float], float]
@@ -15,14 +14,15 @@ OffsetAtDepth = Callable[[float], float]
 class StabilizedOffset:
     """Offset of the sheet behind the object's tangent plane, computed separately for each contact.
 
-    It follows from the measured, low-pass filtered depth.  A predicted depth would shift the least
-    stable frequency of the loop into the range of hand oscillation.  The offset never exceeds the
-    depth, so that the sheet stays in contact with a finger that moves away.
+    It follows from the measured depth through the filter of `hand_loop`.  A depth that is
+    predicted over the whole delay would shift the least stable frequency of the loop into the range
+    of hand oscillation.  The offset never exceeds the depth, so that the sheet stays in contact
+    with a finger that moves away.
     """
 
     def __init__(self) -> None:
         self.watchdog = OscillationWatchdog()
-        self._filtered_m = self._offset_m = self._time_s = 0.0
+        self._filtered_m = self._rate_m_per_s = self._offset_m = self._time_s = 0.0
         self._passive_m: float | None = None
         self._commanded: deque[tuple[float, float]] = deque()
 
@@ -32,20 +32,23 @@ class StabilizedOffset:
         offset_at_depth: OffsetAtDepth,
         *,
         step_s: float,
-        filter_s: float,
+        bandwidth_rad_per_s: float,
         delay_s: float,
     ) -> tuple[float, float]:
         """Return the offset (m) and its rate (m/s) after a measurement.
 
         offset_at_depth: function from the depth to the offset, m.  step_s: time since the last
-        measurement.  filter_s: time constant of the low-pass filter.  delay_s: time from a
-        measurement until the sheet has moved.
+        measurement.  bandwidth_rad_per_s: bandwidth of the depth's filter; infinite for none.
+        delay_s: time from a measurement until the sheet has moved.
         """
         if measured_depth_m <= 0.0:
             self._restart()
             return 0.0, 0.0
-        weight = -float(np.expm1(-step_s / filter_s)) if filter_s > 0.0 else 1.0
-        self._filtered_m += weight * (measured_depth_m - self._filtered_m)
+        alpha, beta = compute_filter_gains(bandwidth_rad_per_s, step_s)
+        predicted_m = self._filtered_m + step_s * self._rate_m_per_s
+        error_m = measured_depth_m - predicted_m
+        self._filtered_m = predicted_m + alpha * error_m
+        self._rate_m_per_s += beta / step_s * error_m
         offset_m = offset_at_depth(self._filtered_m)
         follow = self.watchdog.update(measured_depth_m, self._offset_at(delay_s), step_s)
         if follow < 1.0:
@@ -69,6 +72,6 @@ class StabilizedOffset:
 
     def _restart(self) -> None:
         self.watchdog.reset()
-        self._filtered_m = self._offset_m = 0.0
+        self._filtered_m = self._rate_m_per_s = self._offset_m = 0.0
         self._passive_m = None
         self._commanded.clear()

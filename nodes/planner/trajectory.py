@@ -175,14 +175,14 @@ class SheetTrajectoryPlanner:
         x, y = self._command.contact.position_sheet_m
         at = (float(x), float(y))
         depth_m = self._command.push_depth_m
-        if compliance.filter_s is None:
+        if compliance.bandwidth_rad_per_s is None:
             self._normal_offset_m, per_depth = compliance.normal_offset(depth_m, at)
             return -per_depth * speed_m_per_s
         self._normal_offset_m, rate = self._offset.update(
             depth_m + moved_m if depth_m > 0.0 else 0.0,
             lambda filtered_m: compliance.normal_offset(filtered_m, at)[0],
             step_s=step_s,
-            filter_s=compliance.filter_s,
+            bandwidth_rad_per_s=compliance.bandwidth_rad_per_s,
             delay_s=compliance.delay_s,
         )
         return rate
