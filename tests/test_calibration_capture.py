@@ -375,7 +375,7 @@ def test_the_twin_is_calibrated_by_the_command(
     crossed = json.loads(out)
     assert crossed["rigid_fit_rms_mm"] < 1.0
     assert crossed["calibrate_plain_opencv"]["pairs"] == crossed["pairs"] == len(crossed["rows"])
-    code, out, err = flexsheet("calibrate", "cross-check", *given, "--leave-out", 2)
+    code, out, err = flexsheet("calibrate", "cross-check", *given, "--leave-out", 4)
     assert code == 0, err
     assert "rigid_fit_rms_mm" in out
 

@@ -72,7 +72,14 @@ def held(press: Press, depth_m: float, normal_offset_m: float) -> ComplianceReco
     )
 
 
-@pytest.mark.parametrize("press", make_presses(SCENE)[::2], ids=lambda press: press.path.label)
+@pytest.mark.parametrize(
+    "press",
+    [
+        pytest.param(press, marks=pytest.mark.long if number else ())
+        for number, press in enumerate(make_presses(SCENE)[::2])
+    ],
+    ids=lambda press: press.path.label,
+)
 @pytest.mark.parametrize(
     ("depth_m", "normal_offset_m"), [(0.02, 0.0), (0.045, 0.02), (0.005, -0.002)]
 )

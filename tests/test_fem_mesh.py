@@ -442,7 +442,7 @@ def test_a_strip_holds_what_faces_away(name: str) -> None:
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_push_on_every_shape_goes_in_and_is_held(name: str) -> None:
-    solid = mesh_scene(scene(SHAPES[name]), 0.008 if name == "plane" else 0.006)
+    solid = mesh(name, 0.008) if name == "plane" else mesh(name)
     stiffness = stiffness_matrix(
         solid.nodes, solid.elements, young_modulus_pa=4000.0, poisson_ratio=0.45
     )

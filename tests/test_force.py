@@ -299,8 +299,15 @@ def test_pushes_in_motion_and_in_gaps_are_not_used() -> None:
     assert select_pushes(SCENE, [(late_ns, 1.0)], resting, left, right) == []
 
 
-@pytest.mark.parametrize("ratio", [0.8, 1.25])
-@pytest.mark.parametrize("stretches", [(1.03,), (1.02, 1.04, 1.07)])
+@pytest.mark.parametrize(
+    ("ratio", "stretches"),
+    [
+        (0.8, (1.03,)),
+        (1.25, (1.02, 1.04, 1.07)),
+        pytest.param(0.8, (1.02, 1.04, 1.07), marks=pytest.mark.long),
+        pytest.param(1.25, (1.03,), marks=pytest.mark.long),
+    ],
+)
 def test_a_recording_with_forces_calibrates_the_sheet(
     ratio: float, stretches: tuple[float, ...]
 ) -> None:

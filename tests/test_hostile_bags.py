@@ -159,9 +159,16 @@ HOSTILE: dict[str, Callable[[bytes], bytes]] = {
     "a wrong plan": made(wrong_plan),
     "no messages": made(lambda writer: None),
 }
+MORE_OF_THE_SAME = ("bits flipped 2", "bits flipped 3", "channel of 2^33", "attachment of 2^63")
 
 
-@pytest.mark.parametrize("name", list(HOSTILE))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long if name in MORE_OF_THE_SAME else ())
+        for name in HOSTILE
+    ],
+)
 def test_a_hostile_bag_is_rejected_or_read_in_part(
     whole: bytes, command: Command, tmp_path: Path, name: str
 ) -> None:

@@ -54,10 +54,7 @@ def start_up_s(tmp_path_factory: pytest.TempPathFactory) -> float:
 
 
 FRACTIONS = [
-    *(
-        pytest.param(0.1 * i, marks=() if i in (2, 5, 8) else pytest.mark.long)
-        for i in range(1, 11)
-    ),
+    *(pytest.param(0.1 * i, marks=() if i == 5 else pytest.mark.long) for i in range(1, 11)),
     None,
 ]
 

@@ -638,7 +638,9 @@ def object_way_m(planned: list[PlannedStep]) -> float:
 
 
 @pytest.mark.parametrize("name", ["cylinder", "sphere", "ellipsoid", "box", "meshed"])
-@pytest.mark.parametrize("deepest_share", [0.1, 0.4, 0.8])
+@pytest.mark.parametrize(
+    "deepest_share", [*(pytest.param(share, marks=pytest.mark.long) for share in (0.1, 0.4)), 0.8]
+)
 def test_stroking_while_pushing_neither_steps_nor_slips(name: str, deepest_share: float) -> None:
     """A finger strokes back and forth and pushes in and out simultaneously, to a fraction of the
     radius."""

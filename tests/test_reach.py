@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flexsheet.launch import cli
+from flexsheet.launch.health import layout
 from flexsheet.launch.health.layout import (
     Layout,
     check_layout,
@@ -398,8 +399,17 @@ def test_the_commands_exit_code_is_the_reachability(
 
 
 def test_the_command_fails_and_offers_a_remedy(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    barred: Layout,
 ) -> None:
+    def known_layout(scene: Scene, **_: object) -> Layout:
+        moved, wanted = (one.arms.left.world_from_base for one in (scene, barred_scene()))
+        assert moved.position_m == pytest.approx(wanted.position_m)
+        return barred
+
+    monkeypatch.setattr(layout, "check_layout", known_layout)
     far = tmp_path / "far.yaml"
     text = SCENE_FILE.read_text()
     far.write_text(text.replace("position_m: [-0.5, -0.45, 0.0]", "position_m: [-0.6, -0.5, 0.06]"))

@@ -39,7 +39,12 @@ RADIUS = 0.007
 
 
 @pytest.mark.parametrize(
-    ("stretch", "place"), [(1.04, (0.0, 0.0)), (1.06, (0.05, -0.06)), (1.08, (0.0, 0.08))]
+    ("stretch", "place"),
+    [
+        pytest.param(1.04, (0.0, 0.0), marks=pytest.mark.long),
+        (1.06, (0.05, -0.06)),
+        pytest.param(1.08, (0.0, 0.08), marks=pytest.mark.long),
+    ],
 )
 def test_it_agrees_with_the_twins_elements(stretch: float, place: tuple[float, float]) -> None:
     depths = np.array([0.005, 0.020])
@@ -79,7 +84,7 @@ def test_wrinkles_carry_no_pressure() -> None:
 @pytest.mark.parametrize("stretch", [0.97, 1.0, 1.0005])
 def test_a_slack_sheet_is_found(stretch: float) -> None:
     path = push_path(
-        RUBBER, stretch_ratio=stretch, depths_m=[0.012, 0.03], finger_radius_m=RADIUS, cells=16
+        RUBBER, stretch_ratio=stretch, depths_m=[0.012, 0.03], finger_radius_m=RADIUS, cells=12
     )
     assert np.isfinite(path.positions).all()
     assert 0.0 <= path.forces_n[0] < 0.15
@@ -110,7 +115,7 @@ def test_near_the_free_edge_and_the_clamp_there_is_an_answer() -> None:
             depths_m=[0.01, 0.03],
             position_m=place,
             finger_radius_m=RADIUS,
-            cells=20,
+            cells=14,
         )
         assert 0.0 < path.forces_n[0] < path.forces_n[1]
     law = MembraneSheetModel(RUBBER)
