@@ -343,7 +343,7 @@ def test_methods_change_the_errors_of_the_stages_that_they_belong_to() -> None:
     scene = load_scene(SCENES / "rigid-plane.yaml")
     calibrations = NodeCalibrations.of(load_graph(DEMO_FILE))
     errors = system_errors.ErrorEvaluator(
-        scene, nominal_apparatus(scene), calibrations, seconds=2.0, seed=3
+        scene, nominal_apparatus(scene), calibrations, seconds=0.7, seed=3
     )
     exact, paper = (errors.evaluate(one, {}) for one in (FINEST, PAPER))
     assert exact["image_mm"] is exact["force_percent"] is None

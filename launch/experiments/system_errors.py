@@ -282,6 +282,8 @@ def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: A
 
     The total is the object's point nearest to the true finger, moved inward by the commanded
     offset (n, 1), minus the contact point of the true sheet. Vectors are in the object's frame.
+    A displacement of a flat sheet along a flat object changes nothing that is presented. There, the
+    total is the distance between the planes only, which is zero if the arms move within the plane.
     """
     world_from_object = object_pose(recording.scene)
     object_from_world = inverse(world_from_object)
