@@ -41,12 +41,8 @@ from flexsheet.launch.experiments.ports import choose_ports
 from flexsheet.launch.experiments.run import DEMO_FILE, run_experiment
 from flexsheet.launch.experiments.stroke import read_recording
 from flexsheet.launch.experiments.sweep import open_sweep, read_rows
-from flexsheet.launch.experiments.system_run import (
-    APPROACH_S,
-    STROKE,
-    evaluate_system,
-    make_stroke,
-)
+from flexsheet.launch.experiments.system_errors import APPROACH_S, STROKE, make_stroke
+from flexsheet.launch.experiments.system_run import evaluate_stroke
 from flexsheet.launch.methods.configurations import write_launch_file
 from flexsheet.launch.methods.results import describe_load, machine_name, replace_non_finite
 from flexsheet.launch.methods.svg import COLOURS, page_style, save_svg
@@ -169,7 +165,7 @@ def run_level(name: str, level: float, seconds: float, folder: Path) -> dict[str
     begin_ns += round(1e9 * APPROACH_S)
     arms = [read_arm(folder, side, scene, host="main", truth="twin/arms") for side in ARMS]
     return {
-        **evaluate_system(bag, has_images=False, has_forces=False),
+        **evaluate_stroke(bag),
         **evaluate_arms(folder, arms, scene, (begin_ns, end_ns), host="main"),
     }
 

@@ -14,11 +14,17 @@ import psutil
 from flexsheet.launch.experiments import stroke
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import Progress, run_experiment
-from flexsheet.launch.experiments.system_errors import APPROACH_S, STROKE, make_stroke
+from flexsheet.launch.experiments.system_errors import (
+    APPROACH_S,
+    STROKE,
+    make_stroke,
+    split_sheet_error,
+    summarize_errors,
+)
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import FingerPath, Frame, TwinFinger
+from flexsheet.messages.types import FingerPath, Frame, SheetTarget, TwinFinger
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.truth import find_display_delay_s
 
@@ -94,6 +100,37 @@ def read_window_ns(bag: Path) -> tuple[int, int]:
         if isinstance(message, TwinFinger) and message.path_label == STROKE:
             window = header.source_ns - round(1e9 * message.path_time_s), header.source_ns
     return window
+
+
+def evaluate_stroke(bag: Path) -> dict[str, Any]:
+    """Compute latencies, errors and lost messages of the recorded stroke of a running graph.
+
+    Latencies have quantiles p50, p95 and p99. Errors of sheet and fingertip have mean, p95 and max.
+    """
+    recording = stroke.read_recording(bag)
+    begin_ns, end_ns = recording.windows_ns[STROKE]
+    begin_ns += round(1e9 * APPROACH_S)
+    exposures = recording.finger.times_ns
+    inside = (exposures >= begin_ns) & (exposures <= end_ns)
+    for motion in (recording.fingertip, *recording.measured_edges, *recording.true_edges):
+        inside &= motion.covers(exposures)
+    times = exposures[inside]
+    rows = [
+        (message.valid_at_ns, np.array([message.normal_offset_m]))
+        for _, message, _, _ in BagReader(bag, topics=["sheet_target"])
+        if isinstance(message, SheetTarget)
+    ]
+    offsets_m = stroke.make_motion(rows, "sheet_target").interpolate(times)
+    errors = split_sheet_error(recording, offsets_m, times)
+    off_m = recording.fingertip.interpolate(times) - recording.finger.interpolate(times)
+    to_arm_s, to_light_s = read_delays_s(bag, begin_ns, end_ns)
+    return {
+        "exposure_to_arm_ms": summarize_latency(to_arm_s),
+        "exposure_to_light_ms": summarize_latency(to_light_s),
+        "sheet_mm": summarize_errors(1e3 * np.linalg.norm(errors.sum(axis=0), axis=1)),
+        "fingertip_mm": summarize_errors(1e3 * np.linalg.norm(off_m, axis=1)),
+        "drops": recording.drops,
+    }
 
 
 def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats]:
