@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from flexsheet.launch.calibration.delays import (
-    MeasuredLag,
-    average_latency,
     estimate_stamp_offset,
 )
 from flexsheet.launch.calibration.edge_marks import MarkDetector
@@ -55,12 +53,3 @@ def test_a_stamp_offset_is_separated_from_backlash(offset_s: float, seconds: flo
     assert found is not None
     assert found.lag_s == pytest.approx(offset_s, abs=3e-4)
     assert found.uncertainty_s < 1e-3
-
-
-def test_the_display_latency_counts_from_the_true_time_of_the_exposures() -> None:
-    values = [(0.1 * number, 0.020 + 0.001 * (-1) ** (number // 80)) for number in range(330)]
-    found = average_latency(values, 0.008, MeasuredLag(-0.003, 0.001))
-    assert found is not None
-    assert found.lag_s == pytest.approx(0.025, abs=5e-4)
-    assert found.uncertainty_s > 0.001
-    assert average_latency(values[:50], 0.008, MeasuredLag(0.0, 0.0)) is None
