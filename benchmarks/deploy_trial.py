@@ -243,13 +243,13 @@ def evaluate_stroke(bag: Path) -> Stroke:
     times = np.array([at for at, _ in targets if begin <= at <= end])
     wanted = np.array([centre for at, centre in targets if begin <= at <= end])
     edges, follow = [], np.ones(len(times), dtype=bool)
-    for side, said in states.items():
+    for side, printed in states.items():
         mount = getattr(scene.arms, side).flange_from_edge
         flange_from_edge = transform_from_rpy(mount.position_m, mount.rpy_rad)
-        at = np.array([stamp for stamp, _ in said])
-        edge = np.array([(one.world_from_flange @ flange_from_edge)[:3, 3] for _, one in said])
+        at = np.array([stamp for stamp, _ in printed])
+        edge = np.array([(one.world_from_flange @ flange_from_edge)[:3, 3] for _, one in printed])
         edges.append(np.column_stack([np.interp(times, at, edge[:, k]) for k in range(3)]))
-        modes = np.array([one.mode == "follow" for _, one in said])
+        modes = np.array([one.mode == "follow" for _, one in printed])
         follow &= modes[np.searchsorted(at, times).clip(max=len(at) - 1)]
     centre = (edges[0] + edges[1]) / 2
     apart = np.linalg.norm(centre - wanted, axis=1)[follow]

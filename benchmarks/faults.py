@@ -72,7 +72,7 @@ class Result:
     reasons: the three most frequent reasons why an arm did not follow.
     """
 
-    trouble: str
+    problem: str
     stopped_s: float | None
     back_s: float | None
     during_ns: tuple[int, int]
@@ -91,7 +91,7 @@ async def run_fault(lab: Lab, name: str, work: Work) -> Result:
         f"both to follow a stroke, before {name}",
     )
     begin, span = len(lab.seen), Span()
-    told: list[tuple[float, set[str]]] = []
+    reported: list[tuple[float, set[str]]] = []
 
     async def watch() -> None:
         newest: dict[str, tuple[float, object]] = {}
@@ -104,8 +104,8 @@ async def run_fault(lab: Lab, name: str, work: Work) -> Result:
                 max_age_s = KILLED_SILENT_S if side == span.killed_side else SILENT_S
                 is_silent = time.monotonic() - newest[side][0] > max_age_s
                 modes.add(state.mode if isinstance(state, ArmState) and not is_silent else "silent")
-            if not told or told[-1][1] != modes:
-                told.append((time.monotonic(), modes))
+            if not reported or reported[-1][1] != modes:
+                reported.append((time.monotonic(), modes))
             await asyncio.sleep(0.005)
 
     watching = asyncio.create_task(watch())
@@ -119,9 +119,9 @@ async def run_fault(lab: Lab, name: str, work: Work) -> Result:
     finally:
         watching.cancel()
     stopped_s = next(
-        (at for at, modes in told if at > span.begun_s and "follow" not in modes), None
+        (at for at, modes in reported if at > span.begun_s and "follow" not in modes), None
     )
-    back_s = None if failed else longest_away_s(told, span)
+    back_s = None if failed else longest_away_s(reported, span)
     states = [state for _, state in lab.seen[begin:] if isinstance(state, ArmState)]
     faults = {fault for state in states for fault in state.faults if state.mode == "fault"}
     reasons = Counter(state.reason for state in states if state.mode != "follow")
@@ -137,14 +137,14 @@ async def run_fault(lab: Lab, name: str, work: Work) -> Result:
     )
 
 
-def longest_away_s(told: list[tuple[float, set[str]]], span: Span) -> float:
+def longest_away_s(reported: list[tuple[float, set[str]]], span: Span) -> float:
     """Return the longest time after the fault in which not both arms followed.
 
     Shorter holds also occur on a busy computer without a fault.
     """
     longest_s = 0.0
     since_s: float | None = None
-    for at_s, modes in [*told, (time.monotonic(), {"follow"})]:
+    for at_s, modes in [*reported, (time.monotonic(), {"follow"})]:
         if modes != {"follow"}:
             since_s = at_s if since_s is None else since_s
         elif since_s is not None:
@@ -252,10 +252,10 @@ def summarize(results: list[Result]) -> dict[str, float]:
 
     follow_again: both arms follow again after the kill of a node's process.
     """
-    killed = [one for one in results if one.stopped_s is not None and "killed" in one.trouble]
+    killed = [one for one in results if one.stopped_s is not None and "killed" in one.problem]
     found: dict[str, float] = {}
     for kind, words in KILLED_KINDS.items():
-        chosen = [one for one in killed if any(word in one.trouble for word in words)]
+        chosen = [one for one in killed if any(word in one.problem for word in words)]
         killed = [one for one in killed if one not in chosen]
         stopped = [one.stopped_s for one in chosen if one.stopped_s is not None]
         back = [one.back_s for one in chosen if one.back_s is not None]
@@ -352,7 +352,7 @@ async def main() -> int:
     bad = [
         one for one in results if one.back_s is None or one.faults or one.longest_m > MAX_LENGTH_M
     ]
-    violations = [one.trouble for one in bad]
+    violations = [one.problem for one in bad]
     speed = max(arm.fastest() for arm in pair)
     violations += ["joint speed"] if speed > 1.0 else []
     violations += ["joint range"] if any(arm.leaves_range() for arm in pair) else []

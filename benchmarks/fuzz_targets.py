@@ -299,10 +299,10 @@ def wire_seeds() -> list[bytes]:
 def listener(name: str) -> Subscriber:
     """Return a subscriber without a connection, to which frames are passed directly."""
 
-    def heard(message: Message, header: Header) -> None:
+    def inbox(message: Message, header: Header) -> None:
         """Do nothing with a message."""
 
-    return Subscriber(TOPICS[name], [], heard, PortCounts(), on_problem=_log.debug, plan="plan")
+    return Subscriber(TOPICS[name], [], inbox, PortCounts(), on_problem=_log.debug, plan="plan")
 
 
 def wire_frames(data: bytes) -> tuple[str, list[Any]]:

@@ -109,7 +109,7 @@ class Tally:
 
     commands: int = 0
     violations: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    excused: int = 0
+    expected: int = 0
     worst: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     pass_ns: list[int] = field(default_factory=list)
     under: dict[str, AdversaryCounts] = field(default_factory=lambda: defaultdict(AdversaryCounts))
@@ -120,7 +120,7 @@ class Tally:
         if shares.size == 0:
             return
         over, free = ~(shares <= WITHIN), np.broadcast_to(allowed, shares.shape)
-        self.excused += int((over & free).sum())
+        self.expected += int((over & free).sum())
         self.violations[name] += int((over & ~free).sum())
         self.worst[name] = max(self.worst[name], float(np.where(free, 0.0, shares).max()))
 
@@ -856,8 +856,8 @@ def report(tally: Tally, sheets: Tally, stroke_ns: list[int], seconds: float) ->
         "worst_share": {
             name: round(max(tally.worst[name], sheets.worst[name]), 4) for name in names
         },
-        "harder_braking": tally.excused,
-        "excused_ms": sheets.excused,
+        "harder_braking": tally.expected,
+        "excused_ms": sheets.expected,
         "under": {
             name: {
                 "cycles": under.cycles,

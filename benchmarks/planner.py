@@ -89,7 +89,7 @@ def make_planner(scene: Scene, geometry: Mapping[str, Any]) -> SheetTrajectoryPl
 def make_compliance(scene: Scene) -> ComplianceController:
     """Make the compliance for an object of 60 N/m that stiffens by 30 % per 10 mm."""
     depths = np.linspace(0.0, scene.working_range.push_depth_m, 20)
-    told = SoftBody(
+    reported = SoftBody(
         mesh_id="benchmark",
         method="benchmark",
         in_range=True,
@@ -100,7 +100,7 @@ def make_compliance(scene: Scene) -> ComplianceController:
         displacement_world_m=np.zeros((0, 3), dtype=np.float32),
     )
     compliance = ComplianceController(scene, make_force_model(scene.sheet), "force_curve")
-    compliance.update(told, in_contact=False)
+    compliance.update(reported, in_contact=False)
     return compliance
 
 

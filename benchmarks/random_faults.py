@@ -141,14 +141,14 @@ async def spoil_cable(lab: Lab, fault: Fault, span: Span, **how: Any) -> None:
 async def stop_and_reset(lab: Lab, host: str, span: Span) -> None:
     """Stop both arms by a command on any host, and reset the stop on the main host."""
     span.begin()
-    code, said = await lab.run(host, "arms", "stop", "--reason", f"drawn on {host}")
-    assert code == 0, said
+    code, printed = await lab.run(host, "arms", "stop", "--reason", f"drawn on {host}")
+    assert code == 0, printed
     await lab.until(lambda: lab.modes() == {"estop"}, "both arms to stop")
     for _ in range(RESET_TRIES):
-        code, said = await lab.run("main", "arms", "reset")
+        code, printed = await lab.run("main", "arms", "reset")
         if code == 0:
             break
-    assert code == 0, said
+    assert code == 0, printed
     span.end()
 
 
@@ -277,7 +277,7 @@ def missing_by_fault(lost: list[Gap], results: list[Result]) -> dict[str, float]
     longest: dict[str, float] = {}
     for gap in lost:
         earlier = [one for one in results if one.during_ns[0] - MARGIN_NS <= gap.from_ns]
-        name = max(earlier, key=lambda one: one.during_ns[0]).trouble if earlier else "start"
+        name = max(earlier, key=lambda one: one.during_ns[0]).problem if earlier else "start"
         longest[name] = max(longest.get(name, 0.0), gap.seconds)
     return dict(sorted(longest.items(), key=lambda item: -item[1]))
 
@@ -361,8 +361,8 @@ def evaluate(lab: Lab, results: list[Result], watch: ProcessMonitor) -> dict[str
     """Evaluate the bags, the simulated joints and the processes."""
     scene = lab.plan().scene_message()
     assert scene is not None
-    violations = [f"stuck after: {one.trouble}" for one in results if one.back_s is None]
-    violations += [f"{one.trouble}: {', '.join(one.faults)}" for one in results if one.faults]
+    violations = [f"stuck after: {one.problem}" for one in results if one.back_s is None]
+    violations += [f"{one.problem}: {', '.join(one.faults)}" for one in results if one.faults]
     longest_m = max((one.longest_m for one in results), default=0.0)
     if longest_m > MAX_LENGTH_M:
         violations.append(f"sheet of {1e3 * longest_m:.0f} mm")

@@ -277,7 +277,7 @@ class Soak:
         self.seconds, self.window_s, self.folder, self.busy = seconds, window_s, folder, busy
         self.samples: dict[str, list[Sample]] = defaultdict(list)
         self.machine: list[MachineSample] = []
-        self.heard = StatusTotals()
+        self.inbox = StatusTotals()
         self.windows: list[Window] = []
         self.problems: list[str] = []
         self.paths_followed = 0
@@ -311,7 +311,7 @@ class Soak:
 
     async def _use(self, driver: Driver, scene: Scene) -> None:
         status = make_subscriber(
-            "status", self.plan, self.graph.run, self.heard.take, on_problem=self.problems.append
+            "status", self.plan, self.graph.run, self.inbox.take, on_problem=self.problems.append
         )
         writer = GraphWriter(self.plan, self.graph.run, ["recording"])
         status.start()
@@ -480,7 +480,7 @@ def make_report(soak: Soak) -> dict[str, Any]:
     windows = [window_report(soak, window) for window in soak.windows]
     ports = [
         {"node": node, "topic": topic, "delivery": TOPICS[topic].delivery.value, **asdict(total)}
-        for (node, topic), total in sorted(soak.heard.ports.items())
+        for (node, topic), total in sorted(soak.inbox.ports.items())
     ]
     result = {
         "machine": machine_name(),
@@ -492,8 +492,8 @@ def make_report(soak: Soak) -> dict[str, Any]:
         "windows": windows,
         "restarts": {name: number for name, number in soak.graph.restarts.items() if number},
         "hangs": {name: number for name, number in soak.graph.hangs.items() if number},
-        "errors": dict(soak.heard.errors),
-        "last_errors": soak.heard.last_error,
+        "errors": dict(soak.inbox.errors),
+        "last_errors": soak.inbox.last_error,
         "logs_bytes_per_h": logs_growth(soak.machine),
         "log_lines": {name: lines for name, lines in soak.log_lines.items() if lines},
         "series": {name: thin_out(samples) for name, samples in soak.samples.items()},

@@ -35,13 +35,13 @@ class Stroker(Node):
 
     async def setup(self) -> None:
         self._scene = load_cylinder()
-        self._told = False
+        self._reported = False
 
     @periodic("rate_hz")
     def stroke(self) -> None:
-        if not self._told:
+        if not self._reported:
             self.scene.publish(self._scene)
-            self._told = True
+            self._reported = True
         now_ns = self.clock.now_ns()
         phase = 2.0 * math.pi * now_ns * 1e-9 / PERIOD_S
         rate = LEAN_RAD * 2.0 * math.pi / PERIOD_S * math.cos(phase)

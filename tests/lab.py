@@ -207,8 +207,10 @@ class Lab:
             running = {host: one for host, one in self.launchers.items() if one.poll() is None}
             for process in running.values():
                 process.send_signal(signal.SIGINT)
-            deaf = [host for host, one in running.items() if not await _ends(one)]
-            assert not deaf, f"launchers on {deaf} did not end after SIGINT and were killed"
+            unreachable = [host for host, one in running.items() if not await _ends(one)]
+            assert not unreachable, (
+                f"launchers on {unreachable} did not end after SIGINT and were killed"
+            )
         finally:
             await self.network.__aexit__()
             shutil.rmtree(self.folder)
@@ -325,19 +327,19 @@ class Lab:
         plan = self.plan()
         scene = plan.scene_message()
         assert scene is not None
-        path, told, writer = strokes_path(scene), self.folder, None
+        path, reported, writer = strokes_path(scene), self.folder, None
         # We stand beside the namespaces, where the sockets in files are all that there is.
         ends = [one.model_copy(update={"tcp": None}) for one in plan.writers[FINGER_PATH]]
         plan = plan.model_copy(update={"writers": {**plan.writers, FINGER_PATH: tuple(ends)}})
         try:
             while True:
                 directory = self._watched.get("main")
-                if directory is not None and directory != told:
+                if directory is not None and directory != reported:
                     if writer is not None:
                         writer.close()
                     writer = GraphWriter(plan, Run(directory.name, directory), [FINGER_PATH])
                     writer.publish(FINGER_PATH, path)
-                    told = directory
+                    reported = directory
                 finger = self.newest.get("twin/finger")
                 if writer is not None and isinstance(finger, TwinFinger) and finger.path_done:
                     del self.newest["twin/finger"]
@@ -400,14 +402,14 @@ class Lab:
 
     def _state(self) -> str:
         arms = [self.newest.get(f"arm_{side}") for side in ("left", "right")]
-        said = [
+        printed = [
             str((one.mode, one.reason, one.faults)) for one in arms if isinstance(one, ArmState)
         ]
         finger = self.newest.get("twin/finger")
         if isinstance(finger, TwinFinger):
-            said.append(f'finger on "{finger.path_label}" for {finger.path_time_s:.1f} s')
+            printed.append(f'finger on "{finger.path_label}" for {finger.path_time_s:.1f} s')
         logs = [(self.folder / f"{host}.log") for host in HOSTS]
-        return f"{said}\n" + "\n".join(log.read_text()[-1500:] for log in logs if log.exists())
+        return f"{printed}\n" + "\n".join(log.read_text()[-1500:] for log in logs if log.exists())
 
 
 def _only_data(folder: str, names: list[str]) -> list[str]:

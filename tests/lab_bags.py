@@ -65,12 +65,12 @@ class Arm:
         """Return the time spans of a mode, without silent periods."""
         spans = []
         begin: int | None = None
-        for i, (at_ns, said) in enumerate(zip(self.said_ns, self.modes, strict=True)):
+        for i, (at_ns, printed) in enumerate(zip(self.said_ns, self.modes, strict=True)):
             silent = i > 0 and at_ns - self.said_ns[i - 1] > SILENT_NS
-            if begin is not None and (said != mode or silent):
+            if begin is not None and (printed != mode or silent):
                 spans.append((begin, int(self.said_ns[i - 1])))
                 begin = None
-            if begin is None and said == mode:
+            if begin is None and printed == mode:
                 begin = int(at_ns)
         return spans if begin is None else [*spans, (begin, int(self.said_ns[-1]))]
 
@@ -145,7 +145,7 @@ def read_arm(
     mount = (scene.arms.left if side == "left" else scene.arms.right).flange_from_edge
     flange_from_edge = transform_from_rpy(mount.position_m, mount.rpy_rad)
     true: list[tuple[int, Floats, Floats, int]] = []
-    said: list[tuple[int, str, int, Floats]] = []
+    printed: list[tuple[int, str, int, Floats]] = []
     for _, message, header in _all(
         folder, host or side, f"arm_{side}", truth or f"twin/arms_{side}"
     ):
@@ -160,16 +160,16 @@ def read_arm(
                 true.append((header.source_ns, joints, edge, header.epoch))
             case ArmState():
                 one = (message.mode, message.command_sent_ns, message.joints_commanded_rad)
-                said.append((header.publish_ns, *one))
+                printed.append((header.publish_ns, *one))
     return Arm(
         np.array([row[0] for row in true], dtype=np.int64),
         np.array([row[1] for row in true]).reshape(-1, 6),
         np.array([row[2] for row in true]).reshape(-1, 3),
         np.array([row[3] for row in true], dtype=np.int64),
-        np.array([row[0] for row in said], dtype=np.int64),
-        np.array([row[1] for row in said], dtype=np.str_),
-        np.array([row[2] for row in said], dtype=np.int64),
-        np.array([row[3] for row in said]).reshape(-1, 6),
+        np.array([row[0] for row in printed], dtype=np.int64),
+        np.array([row[1] for row in printed], dtype=np.str_),
+        np.array([row[2] for row in printed], dtype=np.int64),
+        np.array([row[3] for row in printed]).reshape(-1, 6),
     )
 
 

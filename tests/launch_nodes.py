@@ -23,7 +23,7 @@ class BeaconParameters(NodeParameters):
     crash_after: int = 0
     mark: Path | None = None
     ready_after_s: float = 0.0
-    deaf: bool = False
+    unreachable: bool = False
     exit_code: int | None = None
     with_child: bool = False
 
@@ -49,7 +49,7 @@ class Beacon(Node):
         self.count = 0
         if self.parameters.with_child:
             await asyncio.create_subprocess_exec("sleep", "1000")
-        if self.parameters.deaf:
+        if self.parameters.unreachable:
             for number in (signal.SIGINT, signal.SIGTERM):
                 asyncio.get_running_loop().remove_signal_handler(number)
                 signal.signal(number, signal.SIG_IGN)
@@ -72,7 +72,7 @@ class Beacon(Node):
                 velocity_world_m_per_s=[0.0, 0.0, 0.0],
             )
         )
-        while self.parameters.deaf and self.count > 2:
+        while self.parameters.unreachable and self.count > 2:
             time.sleep(1.0)
 
 
@@ -108,11 +108,11 @@ class Listener(Node):
     parameter: Input[ParameterChange]
     estop: Output[EStop]
 
-    said = False
+    printed = False
 
     def on_twin__finger(self, finger: TwinFinger, header: Header) -> None:
-        if finger.path_time_s >= 10.0 and not self.said:
-            self.said = True
+        if finger.path_time_s >= 10.0 and not self.printed:
+            self.printed = True
             self.estop.publish(EStop(engaged=True, reason="ten"), source_ns=header.source_ns)
 
 

@@ -259,16 +259,16 @@ async def test_an_arm_that_moves_fifty_milliseconds_late_stops_both_in_a_fast_st
 async def test_an_arm_whose_state_comes_late_makes_the_other_hold() -> None:
     async with mid_stroke() as stroke:
         loop, listeners = asyncio.get_running_loop(), stroke.rig.listeners["arm_left"]
-        (told,) = listeners
+        (reported,) = listeners
 
         def later(message: Message, header: Header) -> None:
             # Longer than any trajectory, shorter than the time after which the arm stops.
-            loop.call_later(0.5, told, message, header)
+            loop.call_later(0.5, reported, message, header)
 
         listeners[:] = [later]
         await until(lambda: stroke.mode("right") == "hold")
         assert stroke.reasons() == ""
-        listeners[:] = [told]
+        listeners[:] = [reported]
         await stroke.goes_on()
 
 
@@ -307,7 +307,10 @@ Listeners = dict[str, list[Callable[[Message, Header], None]]]
 
 def without(listeners: Listeners, topics: tuple[str, ...], keep: int) -> Listeners:
     """Return the listeners with only the first `keep` of these topics."""
-    return {topic: told[:keep] if topic in topics else told for topic, told in listeners.items()}
+    return {
+        topic: reported[:keep] if topic in topics else reported
+        for topic, reported in listeners.items()
+    }
 
 
 @pytest.mark.parametrize("topics", [("sheet_target",), ("sheet_target", "arm_left", "arm_right")])

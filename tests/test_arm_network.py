@@ -138,7 +138,7 @@ async def three_computers(*, clock_limit_s: float = 0.05) -> AsyncIterator[tuple
             "scene": ("scene", (Source(scene, "stroker", "main"),)),
             "sheet_target": ("sheet_target", (Source(target, "stroker", "main"),)),
         }
-        told = {side: f"{tcp[side]}:7002" for side in SIDES}
+        reported = {side: f"{tcp[side]}:7002" for side in SIDES}
         outputs = {"scene": ("scene", (scene,)), "sheet_target": ("sheet_target", (target,))}
         jobs = {
             "main": [
@@ -148,7 +148,7 @@ async def three_computers(*, clock_limit_s: float = 0.05) -> AsyncIterator[tuple
         for side, other in (SIDES, SIDES[::-1]):
             ports = {f"{one}_port": 5020 + number for number, one in enumerate(SIDES)}
             seen = {"scene": from_main["scene"]}
-            from_other = Source(told[other], f"arm_{other}_bridge", other)
+            from_other = Source(reported[other], f"arm_{other}_bridge", other)
             jobs[side] = [
                 config(
                     f"twin_{side}", "twin_arms", seen, {}, keys=keys[side], **ports, **PATIENT_TWIN
@@ -158,7 +158,7 @@ async def three_computers(*, clock_limit_s: float = 0.05) -> AsyncIterator[tuple
                     "arm_bridge",
                     from_main | {"other_arm": (f"arm_{other}", (from_other,))},
                     {
-                        "arm": (f"arm_{side}", (f"ipc://{folder}/{side}", told[side])),
+                        "arm": (f"arm_{side}", (f"ipc://{folder}/{side}", reported[side])),
                         "status": ("status", (f"ipc://{folder}/status-{side}",)),
                     },
                     keys=keys[side],
@@ -178,12 +178,12 @@ async def three_computers(*, clock_limit_s: float = 0.05) -> AsyncIterator[tuple
                         name, "-m", "tests.arm_computer", *configs, ahead_s=AHEAD_S[name]
                     )
                 )
-            heard: list[tuple[str, str, Any]] = [
+            inbox: list[tuple[str, str, Any]] = [
                 *((f"arm_{side}", side, partial(watch.take, side)) for side in SIDES),
                 *(("status", f"status-{side}", watch.take_status) for side in SIDES),
                 *(("clocks", f"clocks-{one}", partial(watch.take_clocks, one)) for one in AHEAD_S),
             ]
-            for topic, file, take in heard:
+            for topic, file, take in inbox:
                 subscribers.append(
                     Subscriber(find_topic(topic), [f"ipc://{folder}/{file}"], take, PortCounts())
                 )

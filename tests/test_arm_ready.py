@@ -110,10 +110,10 @@ def trip_watchdog(arm: Arm) -> None:
     arm.control.on_measurement(arm.joints, (ArmFault.WATCHDOG,))
 
 
-@pytest.mark.parametrize("trouble", [lose_arm, trip_watchdog])
-def test_an_arm_that_was_away_comes_back_standing(trouble: Callable[[Arm], None]) -> None:
+@pytest.mark.parametrize("problem", [lose_arm, trip_watchdog])
+def test_an_arm_that_was_away_comes_back_standing(problem: Callable[[Arm], None]) -> None:
     arms = following()
-    trouble(arms[0])
+    problem(arms[0])
     arms[1].cycle(GOAL, arms[0].as_other())
     run(arms, GOAL, 700)
     assert_stands(arms)
@@ -281,12 +281,12 @@ async def test_an_arm_that_is_not_enabled_gets_fewer_commands_until_an_event() -
 
 
 async def test_the_node_receives_arming_and_reports_its_state() -> None:
-    clock, said = VirtualClock(10**9, clock_id="here"), []
+    clock, printed = VirtualClock(10**9, clock_id="here"), []
     node = ArmBridge(
         ArmBridgeParameters(side="left"),
         name="bridge",
         clock=clock,
-        send=lambda topic, message, header: said.append(message),
+        send=lambda topic, message, header: printed.append(message),
         topics={"arm": "arm_left", "other_arm": "arm_right"},
     )
     await node.setup()

@@ -192,8 +192,8 @@ async def test_another_user_stops_nothing(
     sockets: Sockets, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sockets.open("launcher", "launch")
-    stranger = os.getuid() + 1
-    monkeypatch.setattr(stop_socket, "read_peer", lambda connection: (1, stranger))
+    outsider = os.getuid() + 1
+    monkeypatch.setattr(stop_socket, "read_peer", lambda connection: (1, outsider))
     attempts = await sockets.stop()
     assert [one.worked for one in attempts] == [False]
     assert sockets.reasons == []

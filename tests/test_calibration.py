@@ -140,13 +140,13 @@ def test_calibration_recovers_the_rendering_rig(calibration: StereoCalibration) 
 def test_held_out_pairs_are_measured_within_corner_accuracy(
     rendered: Pictures, calibration: StereoCalibration
 ) -> None:
-    told: list[tuple[int, int, str]] = []
+    reported: list[tuple[int, int, str]] = []
     result = check_stereo(
         calibration,
         rendered.left[9:],
         rendered.right[9:],
         board=BOARD,
-        progress=lambda *step: told.append(step),
+        progress=lambda *step: reported.append(step),
     )
     assert result["pairs"] == 3
     assert result["used_to_calibrate"] == []
@@ -154,7 +154,7 @@ def test_held_out_pairs_are_measured_within_corner_accuracy(
     assert result["square_rms_mm"] < 0.1
     assert result["diagonal_rms_mm"] < 0.3
     assert result["reprojection_rms_px"] < 0.1
-    assert [step[:2] for step in told] == [(1, 3), (2, 3), (3, 3)]
+    assert [step[:2] for step in reported] == [(1, 3), (2, 3), (3, 3)]
     smaller = check_stereo(
         calibration,
         rendered.left[9:],
@@ -195,14 +195,14 @@ def test_unusable_images_are_named(
     text.write_text("no picture")
     cv2.imwrite(str(small), np.zeros((90, 120), np.uint8))
     left, right = rendered.left, rendered.right
-    for bad_left, bad_right, said in (
+    for bad_left, bad_right, printed in (
         (left[:3], right[:2], "3 left and 2 right images"),
         ([], [], "no images"),
         ([text], right[:1], r"text\.png: cannot read the image"),
         ([tmp_path / "absent.png"], right[:1], r"absent\.png: cannot read the image"),
         ([left[0], small], right[:2], r"small\.png: 120x90 px, expected 480x360"),
     ):
-        with pytest.raises(CalibrationError, match=said):
+        with pytest.raises(CalibrationError, match=printed):
             calibrate(bad_left, bad_right)
     other = calibration.model_copy(update={"width_px": 640})
     with pytest.raises(
@@ -248,7 +248,7 @@ def without(key: str) -> Callable[[str], str]:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "said"),
+    ("corrupt", "said"),
     [
         (
             lambda text: text.replace("version: 2", "version: 1", 1),
@@ -264,12 +264,12 @@ def without(key: str) -> Callable[[str], str]:
     ids=["version", "no version", "missing", "foreign", "type", "cut", "empty"],
 )
 def test_a_spoilt_file_is_rejected(
-    tmp_path: Path, calibration: StereoCalibration, spoil: Callable[[str], str], said: str
+    tmp_path: Path, calibration: StereoCalibration, corrupt: Callable[[str], str], printed: str
 ) -> None:
     path = tmp_path / "rig.yaml"
     save_calibration(calibration, path)
-    path.write_text(spoil(path.read_text()))
-    with pytest.raises(CalibrationFileError, match=said) as raised:
+    path.write_text(corrupt(path.read_text()))
+    with pytest.raises(CalibrationFileError, match=printed) as raised:
         load_calibration(path)
     assert str(path) in str(raised.value)
 
@@ -322,9 +322,9 @@ def test_outlying_corners_are_left_out(
     pair = found(rendered)[2]
     for x, y in np.rint(pair.left.pixels[[8, 16, 24]]).astype(int):
         image[y - 2 : y + 3, x + 1 : x + 4] = 120
-    spoilt = tmp_path / rendered.left[2].name
-    cv2.imwrite(str(spoilt), image)
-    left = [*rendered.left[:2], spoilt, *rendered.left[3:9]]
+    corrupted = tmp_path / rendered.left[2].name
+    cv2.imwrite(str(corrupted), image)
+    left = [*rendered.left[:2], corrupted, *rendered.left[3:9]]
     result = calibrate(left, rendered.right[:9])
     assert result.pairs[2].used
     assert 1 <= result.pairs[2].stray_corners <= 4

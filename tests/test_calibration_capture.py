@@ -128,8 +128,8 @@ def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
         ({"columns": 14, "rows": 10}, "needs 82 markers, DICT_4X4_50 contains 50"),
     ],
 )
-def test_impossible_charuco_boards_are_rejected(change: dict[str, Any], said: str) -> None:
-    with pytest.raises(CalibrationError, match=said):
+def test_impossible_charuco_boards_are_rejected(change: dict[str, Any], printed: str) -> None:
+    with pytest.raises(CalibrationError, match=printed):
         CornerFinder(CHARUCO.model_copy(update=change))
 
 
@@ -255,7 +255,7 @@ def test_missing_coverage_is_requested(camera: StereoCamera) -> None:
     assert Bin("left cell", "0,0") not in wanted
     capture.counts.update(dict.fromkeys(wanted, 8))
     assert capture.complete
-    for one, said in (
+    for one, printed in (
         (Bin("tilt", "left side back"), "with its left side tilted back"),
         (Bin("tilt", "upright"), "facing the camera"),
         (Bin("distance", "far"), "further away"),
@@ -265,7 +265,7 @@ def test_missing_coverage_is_requested(camera: StereoCamera) -> None:
         capture.counts[one] = 0
         assert capture.missing() == [one]
         (picture,) = shown(CHESSBOARD, camera, 1, seed=6)
-        assert said in capture._make_hint("")
+        assert printed in capture._make_hint("")
         capture.counts[one] = 8
         assert picture[0].shape == (camera.height_px, camera.width_px)
     assert _describe_cell(Bin("right cell", "0,0")) == "at the top left of"
@@ -420,12 +420,12 @@ def test_images_are_taken_from_the_camera_source(
     ],
 )
 def test_errors_name_a_remedy(
-    flexsheet: Flexsheet, scene_file: Path, tmp_path: Path, given: tuple[str, ...], said: str
+    flexsheet: Flexsheet, scene_file: Path, tmp_path: Path, given: tuple[str, ...], printed: str
 ) -> None:
     words = [str(scene_file) if word == "SCENE" else word for word in given]
     code, _, err = flexsheet("calibrate", "stereo", *words, *GIVEN, "-o", tmp_path / "c.yaml")
     assert code == 2
-    assert said in err
+    assert printed in err
 
 
 def test_a_board_to_print_is_written(flexsheet: Flexsheet, tmp_path: Path) -> None:
@@ -457,13 +457,13 @@ def test_a_plan_refuses_a_calibration_that_does_not_belong(tmp_path: Path) -> No
     (tmp_path / "own.yaml").write_text(shipped)
     plan = load_graph(launch_file(tmp_path, Path("own.yaml")))
     assert plan.nodes["triangulator"].parameters["calibration"] == str(tmp_path / "own.yaml")
-    for old, new, said in (
+    for old, new, printed in (
         ("device: twin-bumblebee", "device: other", 'is of device "other", the scene\'s camera'),
         ("width_px: 640", "width_px: 320", "is for 320x480 px"),
         ("version: 2", "version: 1", "version: expected 2, found 1; calibrate again"),
     ):
         (tmp_path / "foreign.yaml").write_text(shipped.replace(old, new))
-        with pytest.raises(BadInputError, match=said) as refused:
+        with pytest.raises(BadInputError, match=printed) as refused:
             load_graph(launch_file(tmp_path, Path("foreign.yaml")))
         (problem,) = refused.value.problems
         assert problem.where == f"{tmp_path / 'graph.yaml'}:3"

@@ -208,11 +208,11 @@ def test_the_jackknife_agrees_where_the_noise_is_independent() -> None:
     slopes = compute_position_jacobian(true, sample_working_plane(true, (640, 480), 0.5))
     pairs = noisy(seed=3, sigma_px=0.05, count=20)
     fit = fit_pairs(pairs, POINTS, (640, 480))
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     refits = compute_jackknife_covariance(
-        fit, pairs, POINTS, lambda done, total, _: told.append((done, total))
+        fit, pairs, POINTS, lambda done, total, _: reported.append((done, total))
     )
-    assert told == [(number, 20) for number in range(1, 21)]
+    assert reported == [(number, 20) for number in range(1, 21)]
     ratio = np.hypot(*compute_position_std(slopes, refits)) / np.hypot(
         *compute_position_std(slopes, fit.covariance)
     )

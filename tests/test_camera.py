@@ -210,12 +210,12 @@ async def test_the_twins_images_are_left_alone_by_a_real_camera(
     ids=["absent video", "no video", "absent camera", "no images", "unequal images"],
 )
 def test_what_cannot_be_opened_is_named(
-    scene: Scene, tmp_path: Path, source: Callable[[Path], Any], said: str
+    scene: Scene, tmp_path: Path, source: Callable[[Path], Any], printed: str
 ) -> None:
     (tmp_path / "text.avi").write_text("no video")
     for name in ("a1.png", "a2.png", "b1.png"):
         cv2.imwrite(str(tmp_path / name), picture(0, 0))
-    with pytest.raises(DeviceError, match=said):
+    with pytest.raises(DeviceError, match=printed):
         open_reader(source(tmp_path), scene.camera, lambda: 0)
 
 

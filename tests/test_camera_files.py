@@ -216,10 +216,10 @@ def test_one_looping_pair_comes_at_the_given_rate(scene: Scene, tmp_path: Path) 
         ("t_s\n2\n2\n", r"times\.csv, line 3: t_s 2 is not after the previous one"),
     ],
 )
-def test_wrong_times_are_named(tmp_path: Path, text: str, said: str) -> None:
+def test_wrong_times_are_named(tmp_path: Path, text: str, printed: str) -> None:
     path = tmp_path / "times.csv"
     path.write_text(text)
-    with pytest.raises(DeviceError, match=said):
+    with pytest.raises(DeviceError, match=printed):
         read_times(path, 2)
 
 
@@ -265,7 +265,7 @@ def test_all_errors_of_a_reader_are_reported() -> None:
     """A thread that ends without a report would leave a node that seems healthy."""
     errors: list[DeviceError] = []
 
-    def spoilt() -> Reader:
+    def corrupted() -> Reader:
         raise MemoryError("no room for a picture")
 
     def tell(error: DeviceError) -> None:
@@ -274,7 +274,7 @@ def test_all_errors_of_a_reader_are_reported() -> None:
             thread.stop()
 
     thread = ReaderThread(
-        spoilt,
+        corrupted,
         camera=load_scene().camera,
         name="cam",
         now=lambda: 0,

@@ -96,13 +96,13 @@ class Launched:
             text=True,
         )
         assert self.process.stderr is not None
-        said = ""
+        printed = ""
         for line in self.process.stderr:
-            said += line
+            printed += line
             if "are ready" in line:
                 break
         else:
-            pytest.fail(f"the graph did not come up: {said}")
+            pytest.fail(f"the graph did not come up: {printed}")
         # Nobody reads on: the pipe must not fill.
         self._drain = threading.Thread(target=self.process.stderr.read)
         self._drain.start()
@@ -157,10 +157,10 @@ def recorded(running: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_help_names_every_command(flexsheet: Command) -> None:
-    said = flexsheet("--help")
-    assert said.code == 0
+    printed = flexsheet("--help")
+    assert printed.code == 0
     for name in ("launch", "node", "topic", "bag", "calibrate", "doctor"):
-        assert name in said.out
+        assert name in printed.out
 
 
 def test_help_and_the_table_of_topics_load_no_heavy_library() -> None:
@@ -192,12 +192,12 @@ def test_node_types_and_info(flexsheet: Command) -> None:
         "ports"
     ]
     assert "prediction_horizon_s" in [row["parameter"] for row in described["parameters"]]
-    said = flexsheet("node", "info", "tests.launch_nodes:Beacon")
-    assert "twin__finger" in said.out
-    assert "rate_hz" in said.out
-    said = flexsheet("node", "info", "planer")
-    assert (said.code, said.out) == (2, "")
-    assert 'did you mean "planner"?' in said.err
+    printed = flexsheet("node", "info", "tests.launch_nodes:Beacon")
+    assert "twin__finger" in printed.out
+    assert "rate_hz" in printed.out
+    printed = flexsheet("node", "info", "planer")
+    assert (printed.code, printed.out) == (2, "")
+    assert 'did you mean "planner"?' in printed.err
 
 
 def test_dry_run_prints_the_plan_and_starts_nothing(
@@ -207,19 +207,19 @@ def test_dry_run_prints_the_plan_and_starts_nothing(
     path = write(tmp_path, GRAPH)
     plan = flexsheet("launch", path, "--dry-run", "--json").json()
     assert plan["nodes"]["listener"]["inputs"][0]["topic"] == "twin/finger"
-    said = flexsheet("launch", path, "--dry-run", "--set", "beacon.rate_hz=12")
-    assert said.code == 0
-    assert "rate_hz=12.0" in said.out
-    assert "ipc://@run/beacon.twin.finger" in said.out
+    printed = flexsheet("launch", path, "--dry-run", "--set", "beacon.rate_hz=12")
+    assert printed.code == 0
+    assert "rate_hz=12.0" in printed.out
+    assert "ipc://@run/beacon.twin.finger" in printed.out
     assert list(runs_root.iterdir()) == before
 
 
 def test_a_bad_launch_file_is_exit_code_two(flexsheet: Command, tmp_path: Path) -> None:
     (tmp_path / "graph.yaml").write_text("nodes:\n  a:\n    typ: camera\n")
-    said = flexsheet("launch", tmp_path / "graph.yaml")
-    assert (said.code, said.out) == (2, "")
-    assert 'graph.yaml:3: nodes.a.typ: unknown key "typ"; did you mean "type"?' in said.err
-    assert "Traceback" not in said.err
+    printed = flexsheet("launch", tmp_path / "graph.yaml")
+    assert (printed.code, printed.out) == (2, "")
+    assert 'graph.yaml:3: nodes.a.typ: unknown key "typ"; did you mean "type"?' in printed.err
+    assert "Traceback" not in printed.err
 
 
 def test_a_node_that_fails_for_good_is_exit_code_one(tmp_path: Path, runs_root: Path) -> None:
@@ -234,14 +234,14 @@ def test_a_node_that_fails_for_good_is_exit_code_one(tmp_path: Path, runs_root: 
 
 
 def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> None:
-    said = flexsheet("topic", "echo", "twin/finger", "--once", "--timeout", DEADLINE_S)
-    assert said.code == 0
-    assert said.out.startswith("--- beacon #")
-    assert "path_label: count" in said.out
-    said = flexsheet(
+    printed = flexsheet("topic", "echo", "twin/finger", "--once", "--timeout", DEADLINE_S)
+    assert printed.code == 0
+    assert printed.out.startswith("--- beacon #")
+    assert "path_label: count" in printed.out
+    printed = flexsheet(
         "topic", "echo", "twin/finger", "--count", "2", "--field", "path_time_s", "--json"
     )
-    one, two = (json.loads(line) for line in said.out.splitlines())
+    one, two = (json.loads(line) for line in printed.out.splitlines())
     assert two["message"] > one["message"] > 0
     assert one["header"]["writer"] == "beacon"
 
@@ -263,9 +263,9 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
 def test_wrong_arguments_of_topic_commands(
     flexsheet: Command, running: Path, arguments: tuple[str, ...], code: int, word: str
 ) -> None:
-    said = flexsheet("topic", *arguments)
-    assert said.code == code
-    assert word in said.err
+    printed = flexsheet("topic", *arguments)
+    assert printed.code == code
+    assert word in printed.err
 
 
 def test_a_message_of_any_size_is_taken_as_json(
@@ -278,16 +278,16 @@ def test_a_message_of_any_size_is_taken_as_json(
     }
     file = tmp_path / "skin.json"
     file.write_text(json.dumps(skin))
-    said = flexsheet("topic", "pub", "skin", f"@{file}")
-    assert 'topic "skin" is not part of the graph' in said.err, "it was read, and whole"
+    printed = flexsheet("topic", "pub", "skin", f"@{file}")
+    assert 'topic "skin" is not part of the graph' in printed.err, "it was read, and whole"
     for text, word in (
         ('{"engaged": true, "engaged": false, "reason": ""}', "duplicate key"),
         ('{"engaged": NaN, "reason": ""}', "MESSAGE (EStop): engaged"),
         ("[" * 100_000, "lists or mappings are nested"),
     ):
-        said = flexsheet("topic", "pub", "estop", text)
-        assert said.code == 2
-        assert word in said.err
+        printed = flexsheet("topic", "pub", "estop", text)
+        assert printed.code == 2
+        assert word in printed.err
 
 
 def test_a_tool_cannot_publish_for_a_node(flexsheet: Command, running: Path) -> None:
@@ -295,9 +295,9 @@ def test_a_tool_cannot_publish_for_a_node(flexsheet: Command, running: Path) -> 
         "{path_label: '', path_done: true, path_time_s: 0, position_world_m: [0, 0, 0], "
         "velocity_world_m_per_s: [0, 0, 0]}"
     )
-    said = flexsheet("topic", "pub", "twin/finger", finger)
-    assert said.code == 2
-    assert "is written by beacon" in said.err
+    printed = flexsheet("topic", "pub", "twin/finger", finger)
+    assert printed.code == 2
+    assert "is written by beacon" in printed.err
 
 
 def test_hz_goes_by_the_writers_stamps(flexsheet: Command, running: Path) -> None:
@@ -334,12 +334,12 @@ def test_nodes_of_the_running_graph_are_listed(flexsheet: Command, running: Path
 
 
 def test_status_shows_rates_of_all_nodes(flexsheet: Command, running: Path) -> None:
-    said = flexsheet("status", "--json")
-    rows = {row["node"]: row for row in said.json()["nodes"]}
-    assert said.code == 0, said.out
+    printed = flexsheet("status", "--json")
+    rows = {row["node"]: row for row in printed.json()["nodes"]}
+    assert printed.code == 0, printed.out
     assert set(rows) >= {"beacon", "listener", "recorder"}
     assert {port["topic"] for port in rows["beacon"]["outputs"]} >= {"twin/finger", "status"}
-    assert said.json()["self_checks"] == []
+    assert printed.json()["self_checks"] == []
     assert "twin/finger" in flexsheet("status").out
 
 
@@ -347,8 +347,8 @@ def test_logs_print_the_log_of_a_node(flexsheet: Command, running: Path) -> None
     lines = flexsheet("logs", "recorder", "--json").out.splitlines()
     assert any(json.loads(line)["event"] == "recording" for line in lines)
     assert len(flexsheet("logs", "recorder", "-n", "1").out.splitlines()) == 1
-    said = flexsheet("logs", "recordr")
-    assert (said.code, 'did you mean "recorder"?' in said.err) == (2, True)
+    printed = flexsheet("logs", "recordr")
+    assert (printed.code, 'did you mean "recorder"?' in printed.err) == (2, True)
 
 
 def test_a_parameter_is_read_and_changed_in_the_running_graph(
@@ -371,10 +371,10 @@ def test_a_parameter_is_read_and_changed_in_the_running_graph(
     ],
 )
 def test_a_parameter_that_cannot_be_changed_is_explained(
-    flexsheet: Command, running: Path, arguments: tuple[str, ...], code: int, said: str
+    flexsheet: Command, running: Path, arguments: tuple[str, ...], code: int, printed: str
 ) -> None:
     result = flexsheet("param", *arguments)
-    assert (result.code, said in result.err) == (code, True), result.err
+    assert (result.code, printed in result.err) == (code, True), result.err
 
 
 def test_the_running_graph_is_printed_and_drawn(
@@ -390,8 +390,8 @@ def test_the_running_graph_is_printed_and_drawn(
 
 
 def test_a_node_that_runs_is_not_started_again(flexsheet: Command, running: Path) -> None:
-    said = flexsheet("run", "beacon")
-    assert (said.code, "--without beacon" in said.err) == (1, True)
+    printed = flexsheet("run", "beacon")
+    assert (printed.code, "--without beacon" in printed.err) == (1, True)
     assert 'did you mean "beacon"?' in flexsheet("run", "becon").err
 
 
@@ -403,8 +403,8 @@ def test_fields_of_a_bag_are_plotted(flexsheet: Command, recorded: Path, tmp_pat
     assert np.all(np.diff(time_s["times_s"]) > 0)
     assert "<svg" in image.read_text()
     assert "fingertip" in flexsheet("bag", "plot", recorded, "fingertip.position_m").err
-    said = flexsheet("bag", "plot", recorded, "twin/finger.position_wrld_m")
-    assert (said.code, 'did you mean "position_world_m"?' in said.err) == (2, True)
+    printed = flexsheet("bag", "plot", recorded, "twin/finger.position_wrld_m")
+    assert (printed.code, 'did you mean "position_world_m"?' in printed.err) == (2, True)
 
 
 def test_a_node_runs_alone_and_a_graph_is_stopped(tmp_path: Path, runs_root: Path) -> None:
@@ -421,8 +421,8 @@ def test_a_node_runs_alone_and_a_graph_is_stopped(tmp_path: Path, runs_root: Pat
         run = json.loads(graph.stdout.readline())["run"]
         node = subprocess.Popen([*command, "run", "beacon", "--run", run], cwd=ROOT)
         echo = [*command, "topic", "echo", "twin/finger", "-1", "--json", "--run", run]
-        heard = subprocess.check_output(echo, cwd=ROOT, timeout=DEADLINE_S)
-        assert json.loads(heard)["header"]["writer"] == "beacon"
+        inbox = subprocess.check_output(echo, cwd=ROOT, timeout=DEADLINE_S)
+        assert json.loads(inbox)["header"]["writer"] == "beacon"
         node.send_signal(signal.SIGINT)
         assert node.wait(DEADLINE_S) == 0
         subprocess.run([*command, "stop", "--run", run], cwd=ROOT, check=True, timeout=DEADLINE_S)
@@ -436,24 +436,26 @@ def test_a_node_runs_alone_and_a_graph_is_stopped(tmp_path: Path, runs_root: Pat
 
 
 def test_pub_reaches_the_graph(flexsheet: Command, running: Path) -> None:
-    said = flexsheet("topic", "pub", "display", "{correction: none, stereo: mono}", "--count", "2")
-    assert said.code == 0
-    assert 'sent 2 on "display"' in said.err
+    printed = flexsheet(
+        "topic", "pub", "display", "{correction: none, stereo: mono}", "--count", "2"
+    )
+    assert printed.code == 0
+    assert 'sent 2 on "display"' in printed.err
     live = flexsheet("bag", "info", running, "--json")
     assert live.code == 0
 
 
 def test_a_running_graph_can_be_recorded(flexsheet: Command, running: Path, tmp_path: Path) -> None:
     bag = tmp_path / "b.mcap"
-    said = flexsheet("bag", "record", bag, "--topic", "twin/finger", "--duration", "0.5")
-    assert said.code == 0
+    printed = flexsheet("bag", "record", bag, "--topic", "twin/finger", "--duration", "0.5")
+    assert printed.code == 0
     info = flexsheet("bag", "info", bag, "--json").json()
     assert info["complete"]
     assert [topic["name"] for topic in info["topics"]] == ["twin/finger"]
-    said = flexsheet("bag", "record", bag)
-    assert (said.code, "the file exists" in said.err) == (2, True)
-    said = flexsheet("bag", "record", tmp_path / "c.mcap", "--topic", "stereo")
-    assert (said.code, "has no writer" in said.err) == (2, True)
+    printed = flexsheet("bag", "record", bag)
+    assert (printed.code, "the file exists" in printed.err) == (2, True)
+    printed = flexsheet("bag", "record", tmp_path / "c.mcap", "--topic", "stereo")
+    assert (printed.code, "has no writer" in printed.err) == (2, True)
 
 
 def test_verify_steps_a_node_and_compares(
@@ -479,9 +481,9 @@ def test_verify_sees_another_output(flexsheet: Command, recorded: Path, tmp_path
         for topic, message, header, log_ns in reader:
             other = EStop(engaged=True, reason="eleven") if topic == "estop" else message
             writer.write(TOPICS[topic], other, header, log_ns)
-    said = flexsheet("bag", "verify", forged, "listener", "--json")
-    assert said.code == 3
-    assert said.json()["topics"]["estop"]["worst"] == {"reason": 1.0}
+    printed = flexsheet("bag", "verify", forged, "listener", "--json")
+    assert printed.code == 3
+    assert printed.json()["topics"]["estop"]["worst"] == {"reason": 1.0}
 
 
 def test_a_node_that_fails_for_good_ends_an_experiment_in_a_sentence(
@@ -495,25 +497,25 @@ def test_a_node_that_fails_for_good_ends_an_experiment_in_a_sentence(
         "  broken: {type: 'launch_nodes:Beacon', parameters: {exit_code: 3},\n"
         "           restart: {policy: never}}\n"
     )
-    said = flexsheet("experiment", "stroke", "--launch", launch_file, "--output", tmp_path / "o")
-    assert said.code == 1
-    assert "broken ended with exit code" in said.err
-    assert "Traceback" not in said.err
+    printed = flexsheet("experiment", "stroke", "--launch", launch_file, "--output", tmp_path / "o")
+    assert printed.code == 1
+    assert "broken ended with exit code" in printed.err
+    assert "Traceback" not in printed.err
 
 
 def test_a_setting_that_is_no_yaml_is_named(flexsheet: Command) -> None:
     setting = "planner.prediction_horizon_s=[1,"
-    said = flexsheet("launch", "launch/demo.yaml", "--dry-run", "--set", setting)
-    assert said.code == 2
-    assert setting in said.err
-    assert "Traceback" not in said.err
+    printed = flexsheet("launch", "launch/demo.yaml", "--dry-run", "--set", setting)
+    assert printed.code == 2
+    assert setting in printed.err
+    assert "Traceback" not in printed.err
 
 
 def test_verify_reports_missing_inputs(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
-    said = flexsheet("bag", "verify", recorded, "listner")
-    assert (said.code, 'did you mean "listener"?' in said.err) == (1, True)
-    said = flexsheet("bag", "verify", recorded, "recorder")
-    assert (said.code, "it recorded this bag" in said.err) == (1, True)
+    printed = flexsheet("bag", "verify", recorded, "listner")
+    assert (printed.code, 'did you mean "listener"?' in printed.err) == (1, True)
+    printed = flexsheet("bag", "verify", recorded, "recorder")
+    assert (printed.code, "it recorded this bag" in printed.err) == (1, True)
     bare = tmp_path / "bare.mcap"
     with BagWriter(bare):
         pass
@@ -528,11 +530,11 @@ def test_a_bag_plays_into_a_graph(
     flexsheet: Command, recorded: Path, runs_root: Path, tmp_path: Path
 ) -> None:
     launched = Launched(write(tmp_path, LISTENING), "--record", tmp_path / "b.mcap")
-    said = flexsheet("bag", "play", recorded, "--rate", "4", "--topic", "twin/finger")
+    printed = flexsheet("bag", "play", recorded, "--rate", "4", "--topic", "twin/finger")
     newest = runs.list_live_runs()[0]
     refused = flexsheet("bag", "play", recorded, "--topic", "stereo", "--run", newest.directory)
     assert launched.stop() == 0
-    assert said.code == 0, said.err
+    assert printed.code == 0, printed.err
     assert (refused.code, "not in the bag" in refused.err) == (1, True)
     sent = list(BagReader(recorded, ["twin/finger"]))
     got = list(BagReader(tmp_path / "b.mcap", ["twin/finger"]))
@@ -563,32 +565,32 @@ def test_play_can_bring_its_graph_and_restores_latched_topics_first(
             reset = EStop(engaged=False, reason="then all was clear")
             writer.write(TOPICS["estop"], reset, header, 10**9 + i * 10**8)
     values = {**GRAPH, "external_topics": ["display"], "record": {"bag": "played.mcap"}}
-    said = flexsheet("bag", "play", bag, "--start", "0.25", "--launch", write(tmp_path, values))
-    assert said.code == 0, said.err
-    assert "played 3 messages on display" in said.err
+    printed = flexsheet("bag", "play", bag, "--start", "0.25", "--launch", write(tmp_path, values))
+    assert printed.code == 0, printed.err
+    assert "played 3 messages on display" in printed.err
     entries = list(BagReader(tmp_path / "played.mcap", ["display", "estop"]))
     shown = [message.label for _, message, _, _ in entries if isinstance(message, Display)]
     assert shown == ["number 2", "number 3", "number 4"]
     # What a person said of an e-stop then, he does not say now.
     assert "tools" not in {header.writer for name, _, header, _ in entries if name == "estop"}
-    assert "an e-stop or its reset is not repeated" in said.err
+    assert "an e-stop or its reset is not repeated" in printed.err
 
 
 def test_a_missing_graph_is_reported(
     flexsheet: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(runs.ROOT_VARIABLE, str(tmp_path))
-    said = flexsheet("topic", "echo", "twin/finger")
-    assert said.code == 1
-    assert "no graph is running" in said.err
+    printed = flexsheet("topic", "echo", "twin/finger")
+    assert printed.code == 1
+    assert "no graph is running" in printed.err
 
 
 def test_doctor_examines_the_machine(flexsheet: Command, runs_root: Path) -> None:
-    said = flexsheet("doctor", "--json")
-    findings = {finding["check"]: finding for finding in said.json()}
+    printed = flexsheet("doctor", "--json")
+    findings = {finding["check"]: finding for finding in printed.json()}
     assert findings["python"]["state"] == "ok"
     assert findings["leftovers"]["state"] == "ok"
-    assert said.code == int(any(one["state"] == "failed" for one in findings.values()))
+    assert printed.code == int(any(one["state"] == "failed" for one in findings.values()))
 
 
 @pytest.mark.parametrize(
@@ -611,9 +613,9 @@ def test_wrong_arguments_of_calibrate(
         "-o": str(tmp_path / "c.yaml"),
         **options,
     }
-    said = flexsheet("calibrate", "stereo", *(word for pair in given.items() for word in pair))
-    assert said.code == 2
-    assert word in said.err
+    printed = flexsheet("calibrate", "stereo", *(word for pair in given.items() for word in pair))
+    assert printed.code == 2
+    assert word in printed.err
 
 
 def test_calibrating_with_real_images(flexsheet: Command, tmp_path: Path) -> None:
@@ -622,9 +624,9 @@ def test_calibrating_with_real_images(flexsheet: Command, tmp_path: Path) -> Non
         pytest.skip("the real stereo pairs are not here")
     given = ("--left", pictures / "left0[1-8].jpg", "--right", pictures / "right0[1-8].jpg",
              "--board", "9x6", "--square-mm", "24.23")  # fmt: skip
-    said = flexsheet("calibrate", "stereo", *given, "-o", tmp_path / "c.yaml", "--json")
-    assert said.code == 0, said.err
-    assert said.json()["pairs"] >= 5
+    printed = flexsheet("calibrate", "stereo", *given, "-o", tmp_path / "c.yaml", "--json")
+    assert printed.code == 0, printed.err
+    assert printed.json()["pairs"] >= 5
     given = ("--left", pictures / "left1[0-4].jpg", "--right", pictures / "right1[0-4].jpg",
              "--board", "9x6", "--square-mm", "24.23")  # fmt: skip
     checked = flexsheet(
@@ -638,9 +640,9 @@ def test_calibrating_with_real_images(flexsheet: Command, tmp_path: Path) -> Non
 
 def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
     """The test measures, draws, writes and prints the fastest family."""
-    said = flexsheet("chart", "triangulation", "--output", tmp_path)
-    assert said.code == 0
-    assert [line.split()[0] for line in said.out.splitlines()][:2] == ["method", "dlt"]
+    printed = flexsheet("chart", "triangulation", "--output", tmp_path)
+    assert printed.code == 0
+    assert [line.split()[0] for line in printed.out.splitlines()][:2] == ["method", "dlt"]
     assert {one.name for one in tmp_path.iterdir()} == {
         "triangulation.svg", "triangulation.json", "README.md"
     }  # fmt: skip
@@ -649,5 +651,5 @@ def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
 
 
 def test_a_command_of_ros_2_names_its_replacement(flexsheet: Command) -> None:
-    said = flexsheet("interface", "show", "Fingertip")
-    assert (said.code, "topic info TOPIC" in said.err) == (2, True)
+    printed = flexsheet("interface", "show", "Fingertip")
+    assert (printed.code, "topic info TOPIC" in printed.err) == (2, True)

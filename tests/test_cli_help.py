@@ -245,7 +245,7 @@ def test_files_are_offered_by_their_suffix(tmp_path: Path) -> None:
 )
 def test_a_slip_is_answered_with_what_was_meant(
     arguments: list[str],
-    said: str,
+    printed: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -254,7 +254,7 @@ def test_a_slip_is_answered_with_what_was_meant(
         cli.main()
     out, err = capsys.readouterr()
     assert (end.value.code, out) == (2, "")
-    assert said in err
+    assert printed in err
 
 
 def test_colours_are_for_terminals_and_no_color_disables_them() -> None:
@@ -263,7 +263,7 @@ def test_colours_are_for_terminals_and_no_color_disables_them() -> None:
         "from flexsheet.launch.commands.output import words; words.print('[red]so[/]', markup=True)"
     )
 
-    def said(terminal: bool, **more: str) -> bytes:
+    def printed(terminal: bool, **more: str) -> bytes:
         ours, theirs = os.openpty() if terminal else os.pipe()
         environment = {**os.environ, "TERM": "xterm", **more}
         environment.pop("NO_COLOR", None) if "NO_COLOR" not in more else None
@@ -275,9 +275,9 @@ def test_colours_are_for_terminals_and_no_color_disables_them() -> None:
         os.close(ours)
         return text
 
-    assert b"\x1b[31m" in said(True)
-    assert b"\x1b" not in said(True, NO_COLOR="1")
-    assert b"\x1b" not in said(False)
+    assert b"\x1b[31m" in printed(True)
+    assert b"\x1b" not in printed(True, NO_COLOR="1")
+    assert b"\x1b" not in printed(False)
 
 
 def test_an_error_points_to_its_explanation_but_not_for_scripts(

@@ -180,12 +180,12 @@ def test_stamps_in_header_and_message_become_ours() -> None:
     table = ClockTable("here")
     table.update(clocks(a=offset(drift_ratio=0.0)))
     header = replace(SOME_HEADER, clock_id="there", source_ns=50_099 * S, publish_ns=50_100 * S)
-    message, local, trouble = table.localize(
+    message, local, problem = table.localize(
         target().model_copy(update={"valid_at_ns": 50_101 * S}), header, 100 * S
     )
     assert (local.clock_id, local.source_ns, local.publish_ns) == ("here", 99 * S, 100 * S)
     assert message.valid_at_ns == 101 * S
-    assert trouble == ""
+    assert problem == ""
     same = replace(header, clock_id="here")
     assert table.localize(message, same, 0) == (message, same, "")
 
@@ -193,9 +193,9 @@ def test_stamps_in_header_and_message_become_ours() -> None:
 def test_an_unknown_clock_s_message_counts_from_its_arrival_and_is_not_trusted() -> None:
     table = ClockTable("here")
     header = replace(SOME_HEADER, clock_id="there", source_ns=1 * S, publish_ns=3 * S)
-    _, local, trouble = table.localize(target(), header, 500 * S)
+    _, local, problem = table.localize(target(), header, 500 * S)
     assert (local.source_ns, local.publish_ns) == (498 * S, 500 * S)
-    assert trouble == "clock there is not measured"
+    assert problem == "clock there is not measured"
     table.update(clocks(a=offset(uncertainty_s=0.0049)))
     assert table.find_problem("there", 100 * S) == ""
     assert "uncertainty of 5.4 ms, 5 ms are allowed" in table.find_problem("there", 101 * S)

@@ -271,10 +271,10 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
     command = ["doctor", "compliance", str(SCENE_FILE)]
     result = CliRunner().invoke(app, [*command, "--json"])
     assert result.exit_code == code, result.output
-    told = json.loads(result.stdout)
-    assert words in told["note"]
-    assert (told["worst_error_ratio"] <= TARGET_ERROR_RATIO) == (code == 0)
-    assert told["rows"][-1]["depth_mm"] == pytest.approx(50.0)
+    reported = json.loads(result.stdout)
+    assert words in reported["note"]
+    assert (reported["worst_error_ratio"] <= TARGET_ERROR_RATIO) == (code == 0)
+    assert reported["rows"][-1]["depth_mm"] == pytest.approx(50.0)
     shown = CliRunner().invoke(app, command)
     assert shown.exit_code == code
     assert "stretch" in shown.stdout

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.methods import tune_system
 from flexsheet.launch.methods.composition import (
     P95_OVER_RMS,
@@ -212,11 +213,12 @@ def test_the_largest_95_percent_value_of_all_runs_counts(
     from flexsheet.launch.experiments import sweep
     from flexsheet.launch.methods.configurations import NODE_DEFAULTS, Configuration
 
-    values = iter([0.3, 0.5, 0.4])
+    latencies_ms = iter([3.0, 5.0, 4.0])
 
     def execute(trial: Mapping[str, Any]) -> dict[str, Any]:
-        value = next(values)
-        return {"sheet_mm": {"p95": value}, "exposure_to_arm_ms": {"p95": 10 * value}}
+        if trial["kind"] == "system":
+            return {"exposure_to_arm_ms": {"p95": next(latencies_ms)}}
+        return {"proposal": {"sheet_mm": {"p95": 0.5}}}
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
     monkeypatch.setattr(Configuration, "prepare", lambda *_: None)
@@ -256,16 +258,25 @@ def test_a_shipped_scene_keeps_its_choice_and_an_interrupted_tuning_continues(
         ran.append(trial)
         if len(ran) == 2:
             raise TrialError("interrupted")
-        return {one.value: {"p95": 0.5 * limit} for one, limit in limits.items()}
+        figures = {one.value: {"p95": 0.5 * limit} for one, limit in limits.items()}
+        return figures if trial["kind"] == "system" else {"proposal": figures}
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
     monkeypatch.setattr(Configuration, "prepare", lambda *_: None)
-    for runs_so_far in (3, 4, 4):
+
+    def tune() -> tuple[Any, tuple[Choice, ...]]:
         composition, chosen = tune_system.tune_system(
             scene_file, choices, tmp_path, lambda text: None, margin=0.2, runs=3,
             measure=lambda *_: choices[2].evaluations,
         )  # fmt: skip
-        assert len(ran) == runs_so_far
+        return composition, tuple(chosen)
+
+    with pytest.raises(ExperimentError, match="the error: interrupted"):
+        tune()
+    assert len(ran) == 4
+    for _ in range(2):
+        composition, chosen = tune()
+        assert len(ran) == 5
         assert composition.accepted
         for one in chosen:
             assert one.chosen.setting == getattr(scene.methods, one.key)

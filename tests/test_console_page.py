@@ -70,18 +70,18 @@ class ReceivedMessages:
 
 @contextlib.asynccontextmanager
 async def hearing(graph: RunningGraph, *names: str) -> AsyncIterator[ReceivedMessages]:
-    heard, subscribers = ReceivedMessages(), []
+    inbox, subscribers = ReceivedMessages(), []
     for name in names:
         subscriber = Subscriber(
             find_topic(name),
             local_endpoints(graph.run, graph.plan.endpoints_to_read(name)),
-            lambda message, header, name=name: heard.take(name, message, header),
+            lambda message, header, name=name: inbox.take(name, message, header),
             PortCounts(),
         )
         subscriber.start()
         subscribers.append(subscriber)
     try:
-        yield heard
+        yield inbox
     finally:
         for subscriber in subscribers:
             subscriber.close()
@@ -97,7 +97,7 @@ def free_port() -> int:
 class PageVisit:
     """Results of one visit to the page."""
 
-    heard: ReceivedMessages
+    inbox: ReceivedMessages
     bag: Path
     exit_codes: dict[str, int]
     restarts: dict[str, int]
@@ -133,17 +133,17 @@ async def visit(page: Page, session: PageVisit, port: int) -> None:
     await notice.get_by_role("button").evaluate("button => button.click()")
     await expect(notice).to_have_count(0)
     session.notes["unnamed"] = await page.evaluate(UNNAMED)
-    await begin_recording(page, session.heard)
-    await touch(page, session.heard)
-    await change_the_scene(page, session.heard)
-    await stop_and_release(page, session.heard)
+    await begin_recording(page, session.inbox)
+    await touch(page, session.inbox)
+    await change_the_scene(page, session.inbox)
+    await stop_and_release(page, session.inbox)
     await page.get_by_role("tab", name="Graph").click()
     await expect(page.get_by_role("table", name="Topics")).to_contain_text("twin/finger_path")
     session.notes["nodes"] = await page.get_by_role("table", name="Nodes").inner_text()
-    await end_recording(page, session.heard)
+    await end_recording(page, session.inbox)
 
 
-async def begin_recording(page: Page, heard: ReceivedMessages) -> None:
+async def begin_recording(page: Page, inbox: ReceivedMessages) -> None:
     await page.get_by_role("tab", name="Record").click()
     await page.get_by_role("textbox", name="Name").fill("before anything")
     await expect(page.get_by_role("button", name="Add a bookmark")).to_be_visible()
@@ -151,15 +151,15 @@ async def begin_recording(page: Page, heard: ReceivedMessages) -> None:
     await expect(page.get_by_role("alert").last).to_contain_text("start recording")
     await expect(page.get_by_role("combobox", name="Bag")).to_have_value("older.mcap")
     await page.get_by_role("button", name="Start recording").click()
-    await heard.until(lambda: heard.last("recording") == Recording(running=True), "recording")
+    await inbox.until(lambda: inbox.last("recording") == Recording(running=True), "recording")
     await page.get_by_role("textbox", name="Name").fill("first touch")
     await page.get_by_role("button", name="Add a bookmark").click()
-    await heard.until(lambda: heard.last("bookmark") is not None, "the moment")
+    await inbox.until(lambda: inbox.last("bookmark") is not None, "the moment")
 
 
-async def touch(page: Page, heard: ReceivedMessages) -> None:
+async def touch(page: Page, inbox: ReceivedMessages) -> None:
     await page.get_by_role("tab", name="Touch").click()
-    assert "twin/finger_path" not in heard.messages
+    assert "twin/finger_path" not in inbox.messages
     x, y = OBJECT_PX
     await page.mouse.move(x, y)
     await page.evaluate(TWO_FRAMES)
@@ -167,67 +167,67 @@ async def touch(page: Page, heard: ReceivedMessages) -> None:
     for step in range(1, 9):
         await page.evaluate(TWO_FRAMES)
         await page.mouse.move(x - 2 * step, y)
-    await heard.until(
-        lambda: len(heard.messages.get("twin/finger_path", [])) > 2, "a dragged finger"
+    await inbox.until(
+        lambda: len(inbox.messages.get("twin/finger_path", [])) > 2, "a dragged finger"
     )
     await page.mouse.up()
-    await heard.until(lambda: height_m(heard) < -0.002, "a finger at the object")
+    await inbox.until(lambda: height_m(inbox) < -0.002, "a finger at the object")
     await page.keyboard.press("l")
-    await heard.until(lambda: height_m(heard) > 0.025, "a lifted finger")
+    await inbox.until(lambda: height_m(inbox) > 0.025, "a lifted finger")
     await slide(page, "Across, mm", "30")
-    await heard.until(lambda: across_m(heard.last("twin/finger")) > 0.029, "a finger that is led")
-    assert height_m(heard) > 0.02, "it is still lifted"
-    await push(page, heard, 8.0)
-    assert across_m(heard.last("twin/finger")) == pytest.approx(0.03, abs=2e-3)
+    await inbox.until(lambda: across_m(inbox.last("twin/finger")) > 0.029, "a finger that is led")
+    assert height_m(inbox) > 0.02, "it is still lifted"
+    await push(page, inbox, 8.0)
+    assert across_m(inbox.last("twin/finger")) == pytest.approx(0.03, abs=2e-3)
 
 
-async def push(page: Page, heard: ReceivedMessages, depth_mm: float) -> None:
+async def push(page: Page, inbox: ReceivedMessages, depth_mm: float) -> None:
     """Push by slider, and wait until the finger has that depth."""
     await slide(page, "Push, mm", f"{depth_mm:g}")
-    await heard.until(
-        lambda: abs(1e3 * height_m(heard) + depth_mm) < 0.5, f"a finger {depth_mm:g} mm deep"
+    await inbox.until(
+        lambda: abs(1e3 * height_m(inbox) + depth_mm) < 0.5, f"a finger {depth_mm:g} mm deep"
     )
 
 
-async def change_the_scene(page: Page, heard: ReceivedMessages) -> None:
-    scenes = len(heard.messages["scene"])
+async def change_the_scene(page: Page, inbox: ReceivedMessages) -> None:
+    scenes = len(inbox.messages["scene"])
     await slide(page, "Stiffness, kPa", "9")
-    await heard.until(lambda: len(heard.messages["scene"]) > scenes, "a stiffer object")
-    await push(page, heard, 12.0)
+    await inbox.until(lambda: len(inbox.messages["scene"]) > scenes, "a stiffer object")
+    await push(page, inbox, 12.0)
     await page.reload()
     await expect(page.get_by_role("textbox", name="Push, mm")).to_have_value("12")
-    await push(page, heard, 6.0)
+    await push(page, inbox, 6.0)
     await page.get_by_role("button", name="Lift the finger").click()
-    await heard.until(lambda: height_m(heard) > 0.025, "a lifted finger")
-    await push(page, heard, 7.0)
-    heard.fingers_on_first_object = len(heard.messages["twin/finger"])
+    await inbox.until(lambda: height_m(inbox) > 0.025, "a lifted finger")
+    await push(page, inbox, 7.0)
+    inbox.fingers_on_first_object = len(inbox.messages["twin/finger"])
     tension = page.get_by_role("slider", name="Tension")
     await expect(tension).to_have_attribute("aria-valuemax", "8")
     await page.get_by_role("combobox", name="Scene").click()
     await page.get_by_role("option", name="sphere").click()
-    await heard.until(lambda: heard.last("scene").name == "sphere", "another scene")
+    await inbox.until(lambda: inbox.last("scene").name == "sphere", "another scene")
 
 
-async def stop_and_release(page: Page, heard: ReceivedMessages) -> None:
+async def stop_and_release(page: Page, inbox: ReceivedMessages) -> None:
     await page.get_by_role("button", name="E-STOP").click()
-    await heard.until(lambda: engaged(heard) == "pressed at the console", "an e-stop")
+    await inbox.until(lambda: engaged(inbox) == "pressed at the console", "an e-stop")
     await expect(page.get_by_role("status")).to_contain_text("E-STOP is engaged")
     release = page.get_by_role("button", name="Release")
     await expect(release).to_be_enabled()
     await release.press("Enter")
-    await heard.until(lambda: engaged(heard) is None, "a release")
+    await inbox.until(lambda: engaged(inbox) is None, "a release")
     # viser heeds no hotkey while a text box has the focus.
     await page.get_by_role("textbox", name="Push, mm").press("Escape")
-    await heard.until(lambda: engaged(heard) is not None, "an e-stop from within a text box")
+    await inbox.until(lambda: engaged(inbox) is not None, "an e-stop from within a text box")
     await page.evaluate("() => document.activeElement.blur()")
     await page.keyboard.press("Escape")
-    await heard.until(lambda: engaged(heard) == "Escape at the console", "an e-stop by its key")
+    await inbox.until(lambda: engaged(inbox) == "Escape at the console", "an e-stop by its key")
 
 
-async def end_recording(page: Page, heard: ReceivedMessages) -> None:
+async def end_recording(page: Page, inbox: ReceivedMessages) -> None:
     await page.get_by_role("tab", name="Record").click()
     await page.get_by_role("button", name="Stop recording").click()
-    await heard.until(lambda: heard.last("recording") == Recording(running=False), "its end")
+    await inbox.until(lambda: inbox.last("recording") == Recording(running=False), "its end")
     await expect(page.get_by_role("combobox", name="Bag")).to_have_value("a.mcap")
     await page.get_by_role("button", name="Show the bag").click()
     await expect(page.get_by_role("alert").last).to_contain_text(
@@ -235,9 +235,9 @@ async def end_recording(page: Page, heard: ReceivedMessages) -> None:
     )
 
 
-def height_m(heard: ReceivedMessages) -> float:
+def height_m(inbox: ReceivedMessages) -> float:
     """Return the height of the fingertip over the side of the first scene's cylinder, m."""
-    finger, solid = heard.last("twin/finger"), heard.messages["scene"][0].object
+    finger, solid = inbox.last("twin/finger"), inbox.messages["scene"][0].object
     across = finger.position_world_m[1:] - solid.world_from_object.position_m[1:]
     return float(np.linalg.norm(across)) - solid.geometry.radius_m
 
@@ -246,8 +246,8 @@ def across_m(finger: TwinFinger) -> float:
     return float(finger.position_world_m[0])
 
 
-def engaged(heard: ReceivedMessages) -> str | None:
-    estop = heard.last("estop")
+def engaged(inbox: ReceivedMessages) -> str | None:
+    estop = inbox.last("estop")
     return estop.reason if isinstance(estop, EStop) and estop.engaged else None
 
 
@@ -286,8 +286,8 @@ async def run_session(folder: Path) -> PageVisit:
     async with async_playwright() as play:
         async with RunningGraph(plan) as graph:
             await graph.wait_ready(DEADLINE_S)
-            async with hearing(graph, *names) as heard:
-                session = PageVisit(heard, folder / "bags" / "a.mcap", {}, {})
+            async with hearing(graph, *names) as inbox:
+                session = PageVisit(inbox, folder / "bags" / "a.mcap", {}, {})
                 session.notes["foreign"] = await refused(port, Origin="http://evil.example")
                 browser = await play.chromium.launch(
                     executable_path=str(CHROMIUM),
@@ -353,15 +353,15 @@ def test_the_bag_holds_what_was_done_to_the_page(session: PageVisit) -> None:
 
 def test_the_finger_was_led_over_the_object_and_no_faster_than_it_may(session: PageVisit) -> None:
     paths = [
-        one for one in session.heard.messages["twin/finger_path"] if isinstance(one, FingerPath)
+        one for one in session.inbox.messages["twin/finger_path"] if isinstance(one, FingerPath)
     ]
     ways = np.array([path.positions_world_m[0] for path in paths])
     steps = np.linalg.norm(np.diff(ways, axis=0), axis=1)
     assert steps.max() < 0.15 * 0.2 + 0.01
-    heard = session.heard
-    recorded = heard.messages["twin/finger"][: heard.fingers_on_first_object]
+    inbox = session.inbox
+    recorded = inbox.messages["twin/finger"][: inbox.fingers_on_first_object]
     fingers = [one for one in recorded if isinstance(one, TwinFinger)]
-    solid = session.heard.messages["scene"][0].object
+    solid = session.inbox.messages["scene"][0].object
     places = np.array([finger.position_world_m for finger in fingers if finger.path_label])
     away = np.linalg.norm((places - solid.world_from_object.position_m)[:, 1:], axis=1)
     # Between the points of its path the twin's finger takes the chord.

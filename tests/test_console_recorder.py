@@ -45,12 +45,12 @@ async def test_a_recorder_that_waits_begins_a_bag_for_each_start(tmp_path: Path)
     await node.close()
     assert node.inputs["in/estop"].counts.dropped == 0
     found = [list(BagReader(path)) for path in names_in(tmp_path)]
-    said = [
+    printed = [
         [message.reason for _, message, _, _ in entries if isinstance(message, EStop)]
         for entries in found
     ]
     # The e-stop is latched: whoever reads the bag must know it from its beginning.
-    assert sorted(said) == [["before", "first"], ["first", "second"]]
+    assert sorted(printed) == [["before", "first"], ["first", "second"]]
     assert all(any(entry[0] == "display" for entry in entries) for entries in found)
     node.deliver("in/recording", *frames_of(Recording(running=False)))
     assert node.errors == 0

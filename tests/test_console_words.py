@@ -190,9 +190,9 @@ def test_texts_of_the_tabs() -> None:
     assert "No fingertip" in panels.finger(None)
     lost = fingertip(np.zeros(3)).model_copy(update={"valid": False, "reason": "no_marker"})
     assert "not tracked: no mark" in panels.finger(lost)
-    told = panels.finger(fingertip(np.array([-0.012, 0.003, -0.0041])))
-    assert "12 mm left and 3 mm above the screen" in told
-    assert "4 mm behind" in told
+    reported = panels.finger(fingertip(np.array([-0.012, 0.003, -0.0041])))
+    assert "12 mm left and 3 mm above the screen" in reported
+    assert "4 mm behind" in reported
     resting: dict[str, Any] = {"state": EyeViewState.RESTING, "waited_s": 1.0, "ago_s": None}
     assert "twin_eye" in panels.eye(enabled=True, possible=False, **resting)
     assert "Tick" in panels.eye(enabled=False, possible=True, **resting)
@@ -253,9 +253,9 @@ def test_latencies_are_from_the_exposure_on() -> None:
     assert last["finger found"] == pytest.approx(3.0)
     assert last["arm commanded"] == pytest.approx(8.0)
     assert np.isnan(last["frame drawn"])
-    told = history.latest_and_max()
-    assert told["finger found"] == pytest.approx((3.0, 3.0))
-    legend = panels.make_latency_table(told)
+    reported = history.latest_and_max()
+    assert reported["finger found"] == pytest.approx((3.0, 3.0))
+    legend = panels.make_latency_table(reported)
     assert ">8<" in legend
     assert "–" in legend, "nothing was drawn"
 

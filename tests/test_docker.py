@@ -86,8 +86,8 @@ def test_packages_in_the_json_output_are_installed_too(tmp_path: Path) -> None:
          "--root", str(tmp_path), "--json"],
     )  # fmt: skip
     assert done.exit_code == 0, done.output
-    told = {Path(one["path"]): one["text"] for one in json.loads(done.stdout)}
-    assert {path.name for path in told} == {
+    reported = {Path(one["path"]): one["text"] for one in json.loads(done.stdout)}
+    assert {path.name for path in reported} == {
         "flexsheet@.service", "90-flexsheet.conf", "left.env"
     }  # fmt: skip
-    assert {path: path.read_text() for path in told} == told
+    assert {path: path.read_text() for path in reported} == reported

@@ -120,7 +120,7 @@ def test_all_pages_are_linked_from_a_page_of_the_site() -> None:
 @pytest.mark.parametrize(("drawing", "file"), [(LAB, "lab.yaml"), (TWIN, "demo.yaml")])
 def test_drawings_of_the_graph_agree_with_launch_files(drawing: GraphDrawing, file: str) -> None:
     plan = load_graph(ROOT / "launch" / file, record=Path("bag.mcap"), needed=["twin/eye"])
-    said = {
+    printed = {
         (writer.name, port.topic, node.name)
         for node in plan.nodes.values()
         for port in node.inputs
@@ -128,10 +128,10 @@ def test_drawings_of_the_graph_agree_with_launch_files(drawing: GraphDrawing, fi
         for writer in plan.writers.get(port.topic, ())
     }
     drawn = {(a.writer, topic, a.reader) for a in drawing.arrows for topic in a.topics}
-    assert drawn <= said
+    assert drawn <= printed
     left_out = {
         (writer, topic, reader)
-        for writer, topic, reader in said - drawn
+        for writer, topic, reader in printed - drawn
         if {writer, reader} <= set(drawing.boxes) - {"recorder"} and writer != reader
     }
     if drawing is TWIN:  # it shows the twin's part only

@@ -63,13 +63,13 @@ def tokens(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_a_hostile_file_is_rejected_with_little_work(
     tmp_path: Path, tokens: list[int], name: str
 ) -> None:
-    text, said = HOSTILE[name]
+    text, printed = HOSTILE[name]
     file = tmp_path / "graph.yaml"
     file.write_text(text)
     with pytest.raises(BadInputError) as refused:
         load_graph(file)
     assert str(file) in str(refused.value)
-    assert said in str(refused.value)
+    assert printed in str(refused.value)
     assert "Commented" not in str(refused.value)
     assert len(str(refused.value)) < 1000
     assert tokens[0] < MAX_TOKENS

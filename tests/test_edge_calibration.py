@@ -142,8 +142,8 @@ def test_one_wrong_mark_hardly_matters() -> None:
     wrong = replace(
         first.marks[0], position_world_m=first.marks[0].position_world_m + np.array([0, 8e-3, 0])
     )
-    spoiled = [replace(first, marks=(wrong, *first.marks[1:])), *poses[1:]]
-    clean, other = fit_edges(poses, SCENE)["left"].arm, fit_edges(spoiled, SCENE)["left"].arm
+    corrupted = [replace(first, marks=(wrong, *first.marks[1:])), *poses[1:]]
+    clean, other = fit_edges(poses, SCENE)["left"].arm, fit_edges(corrupted, SCENE)["left"].arm
     arms = [ArmGeometry(with_arms(SCENE, left=arm), "left") for arm in (clean, other)]
     joints = poses[3].left_rad
     one, two = (arm.world_from_edge(joints)[:3, 3] for arm in arms)

@@ -69,7 +69,7 @@ class Launchers:
 
     folder: Path
     plan: ResolvedGraph
-    said: list[str] = field(default_factory=list)
+    printed: list[str] = field(default_factory=list)
     agents: dict[str, HostAgent] = field(default_factory=dict)
 
     async def __aenter__(self) -> Self:
@@ -82,7 +82,7 @@ class Launchers:
                 sources=lambda ones: tuple(
                     Source(self._near(one.endpoint), one.writer, one.host) for one in ones
                 ),
-                keys=None, on_problem=self.said.append,
+                keys=None, on_problem=self.printed.append,
             )  # fmt: skip
             self.agents[host].start()
         writer = self.plan.writer("estop", "tools")
@@ -163,7 +163,7 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(
     async with Launchers(folder, plan) as first:
         # The topic is latched: who connects later gets it, too.
         first.say(STOP)
-        await until(lambda: len(files(folder)) == 2, first.said)
+        await until(lambda: len(files(folder)) == 2, first.printed)
     async with Launchers(folder, plan) as second:
         assert await second.heard_late(STOP.reason) == {STOP.reason}
         # What a console said last before all this is no answer to it.
@@ -174,12 +174,14 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(
         arms = asyncio.create_task(second.arms(modes))
         second.say(RESET)
         # The left bridge refuses while its arm moves: a stop that it holds is not forgotten.
-        await until(lambda: sum("arm_left did not confirm it" in line for line in second.said) == 2)
+        await until(
+            lambda: sum("arm_left did not confirm it" in line for line in second.printed) == 2
+        )
         assert len(files(folder)) == 2
         modes["left"] = "idle"
         monkeypatch.setattr("flexsheet.launch.running.host.RESET_WITHIN_S", DEADLINE_S)
         second.say(RESET)
-        await until(lambda: files(folder) == [], second.said)
+        await until(lambda: files(folder) == [], second.printed)
         assert await second.heard_late(None) == set()
         arms.cancel()
     async with Launchers(folder, plan) as third:
@@ -189,10 +191,10 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(
 async def test_a_reset_from_the_future_is_rejected(folder: Path) -> None:
     async with Launchers(folder, plan_of(folder)) as launchers:
         launchers.say(STOP)
-        await until(lambda: len(files(folder)) == 2, launchers.said)
+        await until(lambda: len(files(folder)) == 2, launchers.printed)
         launchers.say(RESET, before_ns=-(10**10))
         refused = "e-stop not reset by tools: its timestamp is in the future"
-        await until(lambda: launchers.said.count(refused) == 2, launchers.said)
+        await until(lambda: launchers.printed.count(refused) == 2, launchers.printed)
         assert len(files(folder)) == 2
 
 
@@ -215,7 +217,7 @@ async def test_what_cannot_be_read_counts_as_a_stop(folder: Path) -> None:
     file.path.write_text("[" * 100_000)
     async with Launchers(folder, plan) as launchers:
         await launchers.heard_late("cannot be read")
-        assert any("arms reset" in line for line in launchers.said)
+        assert any("arms reset" in line for line in launchers.printed)
 
 
 async def test_failed_writes_are_reported_and_retried(folder: Path) -> None:
@@ -223,7 +225,7 @@ async def test_failed_writes_are_reported_and_retried(folder: Path) -> None:
     (folder / "state").write_text("no folder")
     async with Launchers(folder, plan) as launchers:
         launchers.say(STOP)
-        await until(lambda: any("cannot be written" in line for line in launchers.said))
+        await until(lambda: any("cannot be written" in line for line in launchers.printed))
         await launchers.heard_late(STOP.reason)
         (folder / "state").unlink()
         await until(lambda: len(files(folder)) == 2)
@@ -232,7 +234,7 @@ async def test_failed_writes_are_reported_and_retried(folder: Path) -> None:
 async def test_a_reason_without_end_is_cut(folder: Path) -> None:
     async with Launchers(folder, plan_of(folder)) as launchers:
         launchers.say(EStop(engaged=True, reason="a" * 1_000_000))
-        await until(lambda: len(files(folder)) == 2, launchers.said)
+        await until(lambda: len(files(folder)) == 2, launchers.printed)
         assert await launchers.heard_late("a") == {"a" * REASON_LENGTH}
 
 

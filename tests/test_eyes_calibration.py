@@ -63,8 +63,8 @@ def test_one_wrong_alignment_hardly_moves_the_eyes() -> None:
     given = align(1e-3)
     clean = fit_eyes(given, SCENE.eyes).eyes.centre_world_m
     given[4] = Alignment("left", given[4].bead_m, given[4].cross_m + np.array([0.02, 0.0, 0.0]))
-    spoiled = fit_eyes(given, SCENE.eyes).eyes.centre_world_m
-    assert np.linalg.norm((spoiled - clean)[:2]) < 1e-3
+    corrupted = fit_eyes(given, SCENE.eyes).eyes.centre_world_m
+    assert np.linalg.norm((corrupted - clean)[:2]) < 1e-3
 
 
 def test_a_simulated_viewer_is_measured_through_the_stereo_camera() -> None:

@@ -26,22 +26,24 @@ __all__ = ["connections"]
 async def test_a_stuck_reader_slows_no_other_and_fills_no_memory(connections: Connections) -> None:
     """The reader never reads; the publisher does not block, and another reader loses nothing."""
     topic = TOPICS["twin/stereo"]
-    publisher, ear = connections.mouth(topic), connections.ear(topic)
-    ear.extra = lambda _: ear.heard.append((None, ear.heard.pop()[1]))  # pictures are not kept
+    publisher, receiver = connections.sender(topic), connections.receiver(topic)
+    receiver.extra = lambda _: receiver.inbox.append(
+        (None, receiver.inbox.pop()[1])
+    )  # pictures are not kept
     stuck: Any = zmq.Context.instance().socket(zmq.SUB)
     stuck.setsockopt(zmq.SUBSCRIBE, b"")
     stuck.setsockopt(zmq.RCVHWM, compute_queue_length(topic))
     stuck.connect(connections.endpoint())
-    connections.closers.append(lambda: stuck.close(linger=0))
-    last = await connected(publisher, ear, large_pictures)
+    connections.cleanups.append(lambda: stuck.close(linger=0))
+    last = await connected(publisher, receiver, large_pictures)
     process = psutil.Process()
     before = process.memory_info().rss
     for number in range(last + 1, last + 2001):
         publisher.send(large_pictures(number), header(number))
         if (number - last) % 10 == 0:
-            await until(lambda: ear.heard and ear.sequences[-1] == number)  # noqa: B023
-    assert len(ear.heard) + ear.counts.dropped == 2000
-    assert ear.counts.gaps == 0
+            await until(lambda: receiver.inbox and receiver.sequences[-1] == number)  # noqa: B023
+    assert len(receiver.inbox) + receiver.counts.dropped == 2000
+    assert receiver.counts.gaps == 0
     # All have 200 MB; the queues of publisher and reader hold 65 each.
     assert process.memory_info().rss - before < 60 << 20
 
@@ -58,22 +60,22 @@ async def test_a_storm_is_dropped_on_latest_topics_and_reported_on_others(
 ) -> None:
     """The storm has a hundred times the topic's rate, more than can be handled."""
     topic = replace(TOPICS["twin/finger"], delivery=TOPICS[name].delivery, rate_hz=(30, 150))
-    publisher, ear = connections.mouth(topic), connections.ear(topic)
-    start = await connected(publisher, ear, finger) + 1
+    publisher, receiver = connections.sender(topic), connections.receiver(topic)
+    start = await connected(publisher, receiver, finger) + 1
     count = 15_000
     for number in range(start, start + count):
         publisher.send(finger(0.0), header(number))
     number = start + count
-    while not ear.heard or ear.sequences[-1] < start + count:
+    while not receiver.inbox or receiver.sequences[-1] < start + count:
         publisher.send(finger(1.0), header(number))
         number += 1
         await asyncio.sleep(0.002)
-    handled, lost = len(ear.heard), ear.counts.dropped + ear.counts.gaps
-    assert handled + lost == ear.sequences[-1] - start + 1
+    handled, lost = len(receiver.inbox), receiver.counts.dropped + receiver.counts.gaps
+    assert handled + lost == receiver.sequences[-1] - start + 1
     assert lost > 0
-    assert ear.sequences == sorted(ear.sequences)
-    told = any("lost" in problem for problem in ear.problems)
-    assert told == (topic.delivery is Delivery.EVERY and ear.counts.gaps > 0)
+    assert receiver.sequences == sorted(receiver.sequences)
+    reported = any("lost" in problem for problem in receiver.problems)
+    assert reported == (topic.delivery is Delivery.EVERY and receiver.counts.gaps > 0)
 
 
 async def test_of_thousands_of_forgeries_over_a_socket_none_is_accepted(
@@ -83,7 +85,7 @@ async def test_of_thousands_of_forgeries_over_a_socket_none_is_accepted(
     topic = TOPICS["fingertip"]
     endpoint = connections.endpoint("forger")
     forger = connections.raw(zmq.PUB, endpoint)
-    ear = connections.ear(topic, endpoint)
+    receiver = connections.receiver(topic, endpoint)
     seeds = [seed for seed in wire_seeds() if wire_frames(seed)[0] == "fingertip"]
     message = wire_message(seeds[0])
 
@@ -91,7 +93,7 @@ async def test_of_thousands_of_forgeries_over_a_socket_none_is_accepted(
         forger.send_multipart([bytes(one) for one in frames])
 
     number = 1 << 40
-    while not ear.heard:
+    while not receiver.inbox:
         number += 1
         send(encode(message, header(number, epoch=5)))
         await asyncio.sleep(0.001)
@@ -109,14 +111,14 @@ async def test_of_thousands_of_forgeries_over_a_socket_none_is_accepted(
         sent += 3
         if sent % 60 == 0:
             await asyncio.sleep(0.001)
-    heard = {(one.writer, one.epoch, one.sequence) for _, one in ear.heard}
+    inbox = {(one.writer, one.epoch, one.sequence) for _, one in receiver.inbox}
     number += 1
-    while ("writer", 5, number) not in heard:
+    while ("writer", 5, number) not in inbox:
         send(encode(message, header(number, epoch=5)))
         await asyncio.sleep(0.001)
-        heard = {(one.writer, one.epoch, one.sequence) for _, one in ear.heard}
-    assert ear.counts.rejected > sent // 3
-    ours = [one for _, one in ear.heard if one.writer == "writer"]
+        inbox = {(one.writer, one.epoch, one.sequence) for _, one in receiver.inbox}
+    assert receiver.counts.rejected > sent // 3
+    ours = [one for _, one in receiver.inbox if one.writer == "writer"]
     assert [one.sequence for one in ours] == sorted({one.sequence for one in ours})
     assert {one.epoch for one in ours} == {5}
 

@@ -113,11 +113,11 @@ async def test_a_reader_that_vanished_is_hung_up_on_and_costs_its_publisher_noth
     connections: Connections,
 ) -> None:
     topic = TOPICS["twin/stereo"]
-    publisher = connections.mouth(topic, connections.endpoint(), "tcp://127.0.0.1:*")
+    publisher = connections.sender(topic, connections.endpoint(), "tcp://127.0.0.1:*")
     async with relay_to(publisher) as (relay, endpoint):
-        present, vanished = connections.ear(topic), connections.ear(topic, endpoint)
+        present, vanished = connections.receiver(topic), connections.receiver(topic, endpoint)
         await connected(publisher, vanished, pictures)
-        await until(lambda: present.heard)
+        await until(lambda: present.inbox)
         await relay.vanish()
         number = present.sequences[-1]
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -126,7 +126,7 @@ async def test_a_reader_that_vanished_is_hung_up_on_and_costs_its_publisher_noth
                 number += 1
                 publisher.send(pictures(number % 250), header(number))
             await until(lambda: present.sequences[-1] == number)  # noqa: B023
-            present.heard[:-1] = []
+            present.inbox[:-1] = []
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
         # 3000 of 6 KB were sent; the queue for who does not read holds 65.
         assert grown < 3000 * 6e3 / 2
@@ -136,7 +136,7 @@ async def test_a_reader_that_vanished_is_hung_up_on_and_costs_its_publisher_noth
             while await reader.read(1 << 16):
                 pass
         relay.wake()
-        while not vanished.heard:
+        while not vanished.inbox:
             number += 1
             publisher.send(pictures(number % 250), header(number))
             await asyncio.sleep(0.002)
@@ -149,23 +149,23 @@ async def test_a_quiet_topics_publisher_that_vanished_is_hung_up_on_for_the_next
 ) -> None:
     """Heartbeats cover rare messages; the latched message of the new process is received."""
     topic = TOPICS["estop"]
-    publisher = connections.mouth(topic, "tcp://127.0.0.1:*")
+    publisher = connections.sender(topic, "tcp://127.0.0.1:*")
     async with relay_to(publisher) as (relay, endpoint):
-        ear = connections.ear(topic, endpoint)
-        await connected(publisher, ear, lambda number: stop(str(number)))
+        receiver = connections.receiver(topic, endpoint)
+        await connected(publisher, receiver, lambda number: stop(str(number)))
         before = relay.passed_bytes
         await until(lambda: relay.passed_bytes > before, "a heartbeat")
         await relay.vanish()
         publisher.send(stop("said into the void"), header(1000))
         publisher.close()
-        again = connections.mouth(topic, f"tcp://127.0.0.1:{relay.port}")
+        again = connections.sender(topic, f"tcp://127.0.0.1:{relay.port}")
         again.send(stop("said by the next"), header(1, epoch=2))
-        await until(lambda: ear.heard)
+        await until(lambda: receiver.inbox)
         relay.wake()
         again.send(stop("and more"), header(2, epoch=2))
-        await until(lambda: len(ear.heard) == 2)
-    assert [message.reason for message, _ in ear.heard] == ["said by the next", "and more"]
-    assert ear.counts.rejected == 0
+        await until(lambda: len(receiver.inbox) == 2)
+    assert [message.reason for message, _ in receiver.inbox] == ["said by the next", "and more"]
+    assert receiver.counts.rejected == 0
 
 
 def established(pid: int, port: int) -> int:
@@ -185,23 +185,23 @@ async def test_a_power_cut_in_mid_stream_is_detected_and_recovered() -> None:
         rings = {name: known.write_ring(name) for name in known.names}
         program = ("-m", "tests.test_faults_half_open")
 
-        def heard(epoch: int) -> list[int]:
+        def inbox(epoch: int) -> list[int]:
             lines = record.read_text().split("\n")[:-1] if record.exists() else []
-            told = [tuple(map(int, line.split())) for line in lines]
-            assert [one for one, _ in told] == sorted(one for one, _ in told)
-            return [sequence for one, sequence in told if one == epoch]
+            reported = [tuple(map(int, line.split())) for line in lines]
+            assert [one for one, _ in reported] == sorted(one for one, _ in reported)
+            return [sequence for one, sequence in reported if one == epoch]
 
         listen = (*program, "listen", str(rings["left"]), endpoint, str(record))
-        speak = (*program, "speak", str(rings["main"]), endpoint)
+        publish_until = (*program, "speak", str(rings["main"]), endpoint)
         listener = computers.start("left", *listen)
-        speaker = computers.start("main", *speak, "1")
+        speaker = computers.start("main", *publish_until, "1")
         try:
-            await until(lambda: len(heard(1)) > 10, "the first to be heard")
+            await until(lambda: len(inbox(1)) > 10, "the first to be heard")
             computers.power_cut("main", speaker)
             computers.boot("main")
-            speaker = computers.start("main", *speak, "2")
-            await until(lambda: len(heard(2)) > 10, "the next one to be heard")
-            assert heard(2) == sorted(set(heard(2)))
+            speaker = computers.start("main", *publish_until, "2")
+            await until(lambda: len(inbox(2)) > 10, "the next one to be heard")
+            assert inbox(2) == sorted(set(inbox(2)))
             assert established(listener.pid, PORT) == 1
             computers.plug("main", into_switch=False)
             await until(lambda: not established(listener.pid, PORT), "the listener to hang up")
@@ -217,15 +217,15 @@ async def listen(ring: Path, endpoint: str, record: Path) -> None:
     bus.TCP_KEEPALIVE_OPTIONS[zmq.TCP_MAXRT] = 2000
     with record.open("a", buffering=1) as file:
 
-        def hear(_: TwinFinger, header: Header) -> None:
+        def receive(_: TwinFinger, header: Header) -> None:
             file.write(f"{header.epoch} {header.sequence}\n")
 
         source = Source(endpoint, "writer", "main")
-        Subscriber(FINGER, [source], hear, PortCounts(), keys=KeyRing(ring)).start()
+        Subscriber(FINGER, [source], receive, PortCounts(), keys=KeyRing(ring)).start()
         await asyncio.Event().wait()
 
 
-async def speak(ring: Path, endpoint: str, epoch: int) -> None:
+async def publish_until(ring: Path, endpoint: str, epoch: int) -> None:
     """Publish at 100 Hz."""
     publisher, number = Publisher(FINGER, [endpoint], keys=KeyRing(ring)), 0
     while True:
@@ -239,4 +239,4 @@ if __name__ == "__main__":
     if what == "listen":
         asyncio.run(listen(Path(ring), endpoint, Path(last)))
     else:
-        asyncio.run(speak(Path(ring), endpoint, int(last)))
+        asyncio.run(publish_until(Path(ring), endpoint, int(last)))

@@ -127,10 +127,10 @@ class Bench:
 
     async def run(self, seconds: float, targets: Iterator[SheetTarget], *, rate_hz: float) -> None:
         """Let time pass while the planner sends these targets at a rate."""
-        begin_ns, told = self.clock.now_ns(), 0
+        begin_ns, reported = self.clock.now_ns(), 0
         while (passed_s := (self.clock.now_ns() - begin_ns) * 1e-9) < seconds:
-            if passed_s * rate_hz >= told:
-                told += 1
+            if passed_s * rate_hz >= reported:
+                reported += 1
                 self.tell(next(targets))
             await self.pass_tick()
 
@@ -220,11 +220,11 @@ async def test_a_storm_of_targets_breaks_no_limit_and_stops_no_cycle(
     try:
         await bench.run(1.5, steady(bench.clock), rate_hz=TARGET_HZ)
         assert bench.modes() == {"follow"}
-        begun_s, told = bench.clock.now_ns() * 1e-9, bench.targets
+        begun_s, reported = bench.clock.now_ns() * 1e-9, bench.targets
         assert [port.counts.dropped for port in ports] == [0, 0]
         await bench.run(1.0, mad(bench.clock), rate_hz=STORM * TARGET_HZ)
         ended_s = bench.clock.now_ns() * 1e-9
-        assert bench.targets - told > 5900
+        assert bench.targets - reported > 5900
         await bench.run(1.0, steady(bench.clock), rate_hz=TARGET_HZ)
         # Who writes sense again is followed again.
         assert bench.modes() == {"follow"}

@@ -89,7 +89,7 @@ class ForgedBench(Bench):
     """Harness with a planner, and with a replacement of the other arm's states."""
 
     forge_state: Callable[[ArmState, Header], tuple[ArmState, Header]] | None = None
-    targets_told: list[SheetTarget] = field(default_factory=list)
+    targets_published: list[SheetTarget] = field(default_factory=list)
     _points: dict[str, Floats] = field(default_factory=dict)
     max_tool_speed: float = 0.0
     max_joint_ratio: float = 0.0
@@ -111,7 +111,7 @@ class ForgedBench(Bench):
 
     def take(self, topic: Topic, message: Message, header: Header) -> None:
         if isinstance(message, SheetTarget):
-            self.targets_told.append(message)
+            self.targets_published.append(message)
             for bridge in self.bridges.values():
                 bridge.deliver("sheet_target", message, header)
         elif isinstance(message, ArmState):
@@ -146,12 +146,12 @@ class ForgedBench(Bench):
         at_most_until: Callable[[], bool] = lambda: False,
     ) -> None:
         """Let time pass while the planner receives these fingertips."""
-        begin_ns, told = self.clock.now_ns(), 0
+        begin_ns, reported = self.clock.now_ns(), 0
         while (passed_s := (self.clock.now_ns() - begin_ns) * 1e-9) < seconds:
             if at_most_until():
                 return
-            if passed_s * FINGER_HZ >= told:
-                told += 1
+            if passed_s * FINGER_HZ >= reported:
+                reported += 1
                 await self.planner.step("fingertip", *tip())
             await self.pass_tick()
 
@@ -260,7 +260,7 @@ def test_forged_fingertips_move_no_arm_beyond_a_limit(kinds: list[str], seed: in
 
         await bench.point(0.8, tip)
         bench.assert_within_limits()
-        for target in bench.targets_told:
+        for target in bench.targets_published:
             assert np.isfinite(target.world_from_sheet).all()
             assert np.isfinite(target.twist_world).all()
             assert target.phase in ("approach", "contact") or target.reason != "ok"
@@ -273,10 +273,10 @@ def test_a_fingertip_that_cannot_be_holds_the_sheet_and_the_target_reports_why(k
     async def test(bench: ForgedBench) -> None:
         random = np.random.default_rng(len(kind))
         await bench.point(0.4, bench.honest)
-        before = bench.targets_told[-1].world_from_sheet
-        told = len(bench.targets_told)
+        before = bench.targets_published[-1].world_from_sheet
+        reported = len(bench.targets_published)
         await bench.point(0.3, lambda: forged_tip(bench, kind, random))
-        for target in bench.targets_told[told:]:
+        for target in bench.targets_published[reported:]:
             assert target.phase == "hold"
             assert target.reason != "ok"
             assert target.world_from_sheet == pytest.approx(before, abs=1e-3)

@@ -265,12 +265,12 @@ def test_tags_of_python_are_nothing_but_text(tmp_path: Path, tag: str) -> None:
     ],
 )
 def test_an_impossible_mesh_is_rejected_with_an_error_text(
-    tmp_path: Path, text: str, said: str
+    tmp_path: Path, text: str, printed: str
 ) -> None:
     """Numbers beyond the range of integers overflowed in the library."""
     file = tmp_path / "a.obj"
     file.write_text(text)
-    with pytest.raises(MeshError, match=said), np.errstate(all="ignore"):
+    with pytest.raises(MeshError, match=printed), np.errstate(all="ignore"):
         read_mesh(file, 0.1, None)
 
 

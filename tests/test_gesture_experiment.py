@@ -66,14 +66,14 @@ class Tracked:
         """(topic, message, exposure) from the easing on until a while after the path."""
         ease_s = -self.motion.at(0.0).path_time_s
         count = int((ease_s + self.path.times_s[-1] + 0.5) * 1e9 / PERIOD_NS)
-        said: list[tuple[str, Message, int]] = []
+        printed: list[tuple[str, Message, int]] = []
         for i in range(count):
             at_ns = BEGIN_NS + i * PERIOD_NS
             if not self.unseen(i):
-                said.append(("twin/finger", self._truth(i), at_ns))
+                printed.append(("twin/finger", self._truth(i), at_ns))
             if not self.absent(i):
-                said.append(("fingertip", self._fingertip(i), at_ns))
-        return said
+                printed.append(("fingertip", self._fingertip(i), at_ns))
+        return printed
 
     def _truth(self, i: int) -> TwinFinger:
         state = self.motion.at(i * PERIOD_NS * 1e-9)

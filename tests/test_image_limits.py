@@ -134,11 +134,11 @@ def test_what_pushes_the_sheet(tip: tuple[float, float, float], pushes: bool) ->
     ],
 )
 def test_a_push_out_of_range_is_drawn_and_reported(
-    stage: SceneRenderer, tip: tuple[float, float, float], said: str
+    stage: SceneRenderer, tip: tuple[float, float, float], printed: str
 ) -> None:
     picture, _ = draw_coordinate_ramps(stage, "two_pass", sheet_at(np.eye(4), np.array(tip)))
     assert picture.max() > 150
-    assert stage.note == "" if not said else said in stage.note
+    assert stage.note == "" if not printed else printed in stage.note
 
 
 def test_a_fold_that_keeps_the_light_away_is_dark_and_the_rest_is_right(

@@ -99,7 +99,7 @@ def test_a_lag_beyond_the_range_is_not_given_as_its_edge() -> None:
     ],
 )
 def test_a_missing_lag_is_reported(
-    times: Floats, follower: Floats, leader: Floats, said: str
+    times: Floats, follower: Floats, leader: Floats, printed: str
 ) -> None:
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=printed):
         estimate_lag_s(times, follower, leader)

@@ -51,32 +51,32 @@ async def heard_late(
 
     Wait for the expected ones; without any, wait NOTHING_COMES_S.
     """
-    heard: dict[str, EStop] = {}
+    inbox: dict[str, EStop] = {}
     subscriber = make_subscriber(
         "estop", plan, graph.run,
-        lambda message, header: heard.update({header.writer: message}),
+        lambda message, header: inbox.update({header.writer: message}),
         on_problem=pytest.fail,
     )  # fmt: skip
     subscriber.start()
     if expected:
-        await until(lambda: heard.keys() >= expected.keys(), "the e-stops that are kept")
+        await until(lambda: inbox.keys() >= expected.keys(), "the e-stops that are kept")
     else:
         await asyncio.sleep(NOTHING_COMES_S)
     subscriber.close()
-    return heard
+    return inbox
 
 
 async def test_an_estop_outlives_its_sender_until_it_is_reset(tmp_path: Path) -> None:
     plan = plan_of(tmp_path, {"beacon": BEACON})
-    said: list[str] = []
-    async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
+    printed: list[str] = []
+    async with RunningGraph(plan, report=lambda node, line: printed.append(line)) as graph:
         await graph.wait_ready(DEADLINE_S)
 
         async def say(estop: EStop, answer: str) -> None:
             # The topic is latched: a launcher that connects later gets it, too.
             writer = GraphWriter(plan, graph.run, ["estop"])
             writer.publish("estop", estop)
-            await until(lambda: sum(answer in line for line in said) == 2, answer)
+            await until(lambda: sum(answer in line for line in printed) == 2, answer)
             writer.close()
 
         await say(STOP, "latched until it is reset")

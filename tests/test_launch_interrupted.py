@@ -79,9 +79,9 @@ def test_interrupted_at_any_moment_the_command_leaves_nothing(
         # The moment of the interrupt is what varies: there is no condition to wait for.
         time.sleep(fraction * start_up_s)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=DEADLINE_S)
+    _, printed = process.communicate(timeout=DEADLINE_S)
     # Before the loop runs there is nothing to stop, and the default action ends the process.
-    assert process.returncode in ((0,) if fraction is None else (0, -signal.SIGINT)), said
-    assert "Traceback" not in said
-    assert "Exception ignored" not in said
+    assert process.returncode in ((0,) if fraction is None else (0, -signal.SIGINT)), printed
+    assert "Traceback" not in printed
+    assert "Exception ignored" not in printed
     assert_nothing_left(runs_root)

@@ -180,8 +180,8 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
     ],
 )
-def test_an_error_is_reported(tmp_path: Path, text: str, said: str) -> None:
-    assert said in complaint(tmp_path, text)
+def test_an_error_is_reported(tmp_path: Path, text: str, printed: str) -> None:
+    assert printed in complaint(tmp_path, text)
 
 
 def test_all_errors_are_reported_at_once(tmp_path: Path) -> None:
@@ -200,10 +200,10 @@ def test_a_wrong_key_in_a_scene_names_file_and_line(tmp_path: Path) -> None:
     scene = (ROOT / "launch/scenes/cylinder.yaml").read_text()
     line = next(i for i, text in enumerate(scene.splitlines(), 1) if "interocular_m" in text)
     (tmp_path / "scene.yaml").write_text(scene.replace("interocular_m", "interocular"))
-    said = complaint(tmp_path, GRAPH + "scene: scene.yaml\n")
-    assert f'scene.yaml:{line}: eyes.interocular: unknown key "interocular"' in said
-    assert 'did you mean "interocular_m"?' in said
-    assert '"interocular_m" is missing' in said
+    printed = complaint(tmp_path, GRAPH + "scene: scene.yaml\n")
+    assert f'scene.yaml:{line}: eyes.interocular: unknown key "interocular"' in printed
+    assert 'did you mean "interocular_m"?' in printed
+    assert '"interocular_m" is missing' in printed
 
 
 @pytest.mark.parametrize(
@@ -216,8 +216,8 @@ def test_a_wrong_key_in_a_scene_names_file_and_line(tmp_path: Path) -> None:
         ("beacon.rate_hz.deep=3", "is not a mapping"),
     ],
 )
-def test_wrong_settings_are_named(tmp_path: Path, setting: str, said: str) -> None:
-    assert said in complaint(tmp_path, GRAPH, settings=[setting])
+def test_wrong_settings_are_named(tmp_path: Path, setting: str, printed: str) -> None:
+    assert printed in complaint(tmp_path, GRAPH, settings=[setting])
 
 
 def test_settings_and_record_win_over_the_file(tmp_path: Path) -> None:
@@ -337,9 +337,9 @@ nodes:
         ((ROOT / "launch/scenes/plane.yaml").read_text(), "is a scene, not a launch file"),
     ],
 )
-def test_an_error_of_an_extension_is_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_an_error_of_an_extension_is_one_line(tmp_path: Path, text: str, printed: str) -> None:
     errors = complaint(tmp_path, text)
-    assert said in errors
+    assert printed in errors
     assert len(errors.splitlines()) == 1
 
 
@@ -409,9 +409,9 @@ def test_a_bridge_shares_its_process_with_its_own_simulator(tmp_path: Path) -> N
     ],
 )
 def test_a_process_that_cannot_be_shared_is_rejected(
-    tmp_path: Path, old: str, new: str, said: str
+    tmp_path: Path, old: str, new: str, printed: str
 ) -> None:
-    assert said in complaint(tmp_path, IN_ONE_PROCESS.replace(old, new))
+    assert printed in complaint(tmp_path, IN_ONE_PROCESS.replace(old, new))
 
 
 def test_the_launch_file_can_let_others_into_the_process_of_a_bridge(tmp_path: Path) -> None:

@@ -51,13 +51,13 @@ async def test_timers_come_due_between_messages_on_the_recorded_clock(tmp_path: 
     bag = bag_of(tmp_path, log_ms=[1000, 1120, 1310], rate_hz=10)
     plan = load_graph(tmp_path / "graph.yaml")
     result = await replay(bag, plan.nodes["relay"])
-    said = [decode(one.data, TOPICS["estop"]) for one in result.sent]
+    printed = [decode(one.data, TOPICS["estop"]) for one in result.sent]
     # Due at 1000 (before the first finger), 1100, 1200 and 1300.
-    assert [header.source_ns // MS for _, header in said] == [1000, 1100, 1200, 1300]
-    ages = [message.reason for message, _ in said if isinstance(message, EStop)]
+    assert [header.source_ns // MS for _, header in printed] == [1000, 1100, 1200, 1300]
+    ages = [message.reason for message, _ in printed if isinstance(message, EStop)]
     assert ages == ["inf ms ", "105 ms ", "85 ms ", "185 ms "]
     assert result.messages_in == 3
-    assert all(header.epoch == 0 for _, header in said)
+    assert all(header.epoch == 0 for _, header in printed)
 
 
 def test_the_same_bag_gives_the_same_bytes(tmp_path: Path) -> None:

@@ -200,11 +200,11 @@ async def test_a_killed_node_comes_back_and_the_others_stay(tmp_path: Path) -> N
 async def test_crashes_are_answered_with_growing_delays_and_then_an_end(tmp_path: Path) -> None:
     restart = {"delay_s": 0.02, "max_delay_s": 0.05, "max_restarts": 4}
     plan = plan_of(tmp_path, beacon=beacon(parameters={"crash_after": 2}, restart=restart))
-    said: list[str] = []
-    async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
+    printed: list[str] = []
+    async with RunningGraph(plan, report=lambda node, line: printed.append(line)) as graph:
         with pytest.raises(NodeFailedError, match="beacon ended with exit code 3, after 4 restart"):
             await asyncio.wait_for(graph.wait(), DEADLINE_S)
-    delays = [line.split("next start in ")[1] for line in said if "next start in" in line]
+    delays = [line.split("next start in ")[1] for line in printed if "next start in" in line]
     assert delays == ["0 s", "0.02 s", "0.04 s", "0.05 s"]
     assert graph.exit_codes == {"beacon": 3}
 
@@ -262,8 +262,8 @@ async def test_a_hung_node_is_killed_with_a_stack_trace_and_restarted(
         stuck=beacon(**quiet, parameters={"deaf": True}),
         beacon=beacon(liveness_s=2.0),
     )
-    said: list[str] = []
-    async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
+    printed: list[str] = []
+    async with RunningGraph(plan, report=lambda node, line: printed.append(line)) as graph:
         await graph.wait_ready(DEADLINE_S)
         graph.kill("stopped", signal.SIGSTOP)
         async with asyncio.timeout(DEADLINE_S):
@@ -272,9 +272,9 @@ async def test_a_hung_node_is_killed_with_a_stack_trace_and_restarted(
         assert graph.hangs["stopped"] == graph.hangs["stuck"] == 1
         assert graph.restarts["beacon"] == graph.hangs["beacon"] == 0
         assert "launch_nodes.py" in (graph.run.logs / "stuck.log").read_text()
-    told = "hung: no heartbeat for 2 s; its log contains the call stacks; next start in 0 s"
-    assert f"stuck {told}" in said
-    assert not any("launch_nodes.py" in line for line in said)
+    reported = "hung: no heartbeat for 2 s; its log contains the call stacks; next start in 0 s"
+    assert f"stuck {reported}" in printed
+    assert not any("launch_nodes.py" in line for line in printed)
 
 
 def any_has(lines: list[str], words: str) -> bool:
@@ -289,17 +289,17 @@ async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(
     starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
     monkeypatch.setattr(ProcessorTime, "read", lambda process: starved)
     plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
-    said: list[str] = []
-    async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
+    printed: list[str] = []
+    async with RunningGraph(plan, report=lambda node, line: printed.append(line)) as graph:
         await graph.wait_ready(DEADLINE_S)
         graph.kill("beacon", signal.SIGSTOP)
-        starved_once = partial(any_has, said, "beacon sends no heartbeat but does not hang")
+        starved_once = partial(any_has, printed, "beacon sends no heartbeat but does not hang")
         await asyncio.to_thread(wait_until, starved_once, "it to be reported")
         # As long again: it is reported once.
         await asyncio.sleep(2.5)
         graph.kill("beacon", signal.SIGCONT)
         assert graph.restarts == graph.hangs == {"beacon": 0}
-    assert sum("sends no heartbeat" in line for line in said) == 1
+    assert sum("sends no heartbeat" in line for line in printed) == 1
 
 
 def test_the_kernel_counts_how_long_processes_wait_for_a_processor() -> None:
@@ -430,8 +430,8 @@ async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None
             await left.wait_ready(DEADLINE_S)
             assert main.pids.keys() == {"listener", "recorder", "clock_main"}
             assert left.pids.keys() == {"beacon", "clock_left"}
-            heard = partial(contains_estop, tmp_path / "a.mcap")
-            await asyncio.to_thread(wait_until, heard, "the listener to hear the beacon")
+            inbox = partial(contains_estop, tmp_path / "a.mcap")
+            await asyncio.to_thread(wait_until, inbox, "the listener to hear the beacon")
 
 
 async def test_addresses_beyond_loopback_are_rejected_without_keys(tmp_path: Path) -> None:
@@ -512,8 +512,8 @@ def test_an_interrupt_from_before_the_first_statement_ends_commands_and_nodes(
 ) -> None:
     process = start_command(started, *arguments, blocked=True)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=DEADLINE_S)
-    assert (process.returncode, said) == (-signal.SIGINT, "")
+    _, printed = process.communicate(timeout=DEADLINE_S)
+    assert (process.returncode, printed) == (-signal.SIGINT, "")
 
 
 def ignores_sigint(pid: int) -> bool:

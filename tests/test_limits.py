@@ -138,7 +138,7 @@ def test_a_tiny_number_is_rejected_or_is_a_coordinate(where: tuple[str, Key], va
         (("camera", "right_from_left", 0, 0), -1.0, "reflection"),
     ],
 )
-def test_what_was_accepted_once(tmp_path: Path, key: Key, value: float, said: str) -> None:
+def test_what_was_accepted_once(tmp_path: Path, key: Key, value: float, printed: str) -> None:
     scene = tmp_path / "scene.yaml"
     with scene.open("w") as out:
         YAML().dump(replaced(SCENE_VALUES["cylinder"], key, value), out)
@@ -146,14 +146,16 @@ def test_what_was_accepted_once(tmp_path: Path, key: Key, value: float, said: st
     (tmp_path / "graph.yaml").write_text(json.dumps(graph))
     with pytest.raises(BadInputError, match=r"scene\.yaml:[0-9]+: ") as refused:
         load_graph(tmp_path / "graph.yaml")
-    assert said in str(refused.value)
+    assert printed in str(refused.value)
 
 
 def test_an_absurd_rate_in_a_launch_file_is_rejected(tmp_path: Path) -> None:
     file = tmp_path / "graph.yaml"
     file.write_text("nodes:\n  arms:\n    type: twin_arms\n    parameters: {rate_hz: 1.0e+308}\n")
-    said = r"graph.yaml:4: nodes.arms.parameters.rate_hz: 1e\+308 is invalid; give at most 10000 hz"
-    with pytest.raises(BadInputError, match=said):
+    printed = (
+        r"graph.yaml:4: nodes.arms.parameters.rate_hz: 1e\+308 is invalid; give at most 10000 hz"
+    )
+    with pytest.raises(BadInputError, match=printed):
         load_graph(file)
     file.write_text("nodes:\n  arms:\n    type: twin_arms\n    start_deadline_s: 1.0e+300\n")
     with pytest.raises(BadInputError, match=r"start_deadline_s: 1e\+300 is invalid"):

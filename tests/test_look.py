@@ -185,10 +185,12 @@ def test_a_scene_file_names_its_image(tmp_path: Path) -> None:
         ("texture: image", "needs an image"),
     ],
 )
-def test_a_file_that_is_no_texture_is_reported(tmp_path: Path, appearance: str, told: str) -> None:
+def test_a_file_that_is_no_texture_is_reported(
+    tmp_path: Path, appearance: str, reported: str
+) -> None:
     (tmp_path / "bad.png").write_bytes(b"no picture")
     cv2.imwrite(str(tmp_path / "huge.png"), np.zeros((1, 2050, 3), np.uint8))
-    with pytest.raises(BadInputError, match=f"(?s){told}"):
+    with pytest.raises(BadInputError, match=f"(?s){reported}"):
         load_scene(scene_with(tmp_path, appearance))
 
 

@@ -62,22 +62,22 @@ class RecordingSubscriber:
     """Subscriber that records its messages."""
 
     def __init__(self, topic: Topic, endpoints: list[str]) -> None:
-        self.heard: list[tuple[Any, Header]] = []
+        self.inbox: list[tuple[Any, Header]] = []
         self.problems: list[str] = []
         self.counts = Counts()
         self.extra: Callable[[Message], None] = lambda message: None
         self.subscriber = Subscriber(
-            topic, endpoints, self.hear, self.counts, on_problem=self.problems.append
+            topic, endpoints, self.receive, self.counts, on_problem=self.problems.append
         )
         self.subscriber.start()
 
-    def hear(self, message: Message, header: Header) -> None:
-        self.heard.append((message, header))
+    def receive(self, message: Message, header: Header) -> None:
+        self.inbox.append((message, header))
         self.extra(message)
 
     @property
     def sequences(self) -> list[int]:
-        return [header.sequence for _, header in self.heard]
+        return [header.sequence for _, header in self.inbox]
 
 
 class ForeignPublisher:
@@ -99,27 +99,27 @@ class Connections:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.closers: list[Callable[[], None]] = []
+        self.cleanups: list[Callable[[], None]] = []
 
     def endpoint(self, name: str = "a") -> str:
         return f"ipc://{self.folder}/{name}"
 
-    def mouth(self, topic: Topic, *endpoints: str) -> Publisher:
+    def sender(self, topic: Topic, *endpoints: str) -> Publisher:
         publisher = Publisher(topic, endpoints or (self.endpoint(),))
-        self.closers.append(publisher.close)
+        self.cleanups.append(publisher.close)
         return publisher
 
-    def ear(self, topic: Topic, *endpoints: str) -> RecordingSubscriber:
-        ear = RecordingSubscriber(topic, list(endpoints or (self.endpoint(),)))
-        self.closers.append(ear.subscriber.close)
-        return ear
+    def receiver(self, topic: Topic, *endpoints: str) -> RecordingSubscriber:
+        receiver = RecordingSubscriber(topic, list(endpoints or (self.endpoint(),)))
+        self.cleanups.append(receiver.subscriber.close)
+        return receiver
 
     def raw(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
         """Open a socket without flexsheet's protocol."""
         opened: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
         opened.setsockopt(zmq.LINGER, 0)
         opened.bind(endpoint)
-        self.closers.append(lambda: opened.close(linger=0))
+        self.cleanups.append(lambda: opened.close(linger=0))
         return opened
 
 
@@ -127,22 +127,22 @@ class Connections:
 async def connections(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Connections]:
     connections = Connections(tmp_path_factory.mktemp("s"))
     yield connections
-    for close in reversed(connections.closers):
+    for close in reversed(connections.cleanups):
         close()
 
 
 async def connected(
-    publisher: Publisher, ear: RecordingSubscriber, make: Callable[[int], Message]
+    publisher: Publisher, receiver: RecordingSubscriber, make: Callable[[int], Message]
 ) -> int:
     """Send numbered messages until the first is received; return the number of the last one."""
     number = 0
-    while not ear.heard:
+    while not receiver.inbox:
         number += 1
         publisher.send(make(number), header(number))
         await asyncio.sleep(0.002)
-    await until(lambda: ear.sequences[-1] == number)
-    ear.heard.clear()
-    ear.counts.gaps = ear.counts.dropped = 0
+    await until(lambda: receiver.sequences[-1] == number)
+    receiver.inbox.clear()
+    receiver.counts.gaps = receiver.counts.dropped = 0
     return number
 
 
@@ -150,69 +150,71 @@ async def connected(
 async def test_every_delivers_all_in_order(connections: Connections, transport: str) -> None:
     topic = TOPICS["twin/finger"]
     where = connections.endpoint() if transport == "ipc" else "tcp://127.0.0.1:*"
-    publisher = connections.mouth(topic, where)
-    ear = connections.ear(topic, *publisher.endpoints)
-    start = await connected(publisher, ear, finger) + 1
+    publisher = connections.sender(topic, where)
+    receiver = connections.receiver(topic, *publisher.endpoints)
+    start = await connected(publisher, receiver, finger) + 1
     for number in range(start, start + 700):
         publisher.send(finger(number), header(number))
-    await until(lambda: len(ear.heard) == 700)
-    assert ear.sequences == list(range(start, start + 700))
-    assert ear.heard[3][0].path_time_s == start + 3
-    assert ear.counts == Counts()
-    assert ear.problems == []
+    await until(lambda: len(receiver.inbox) == 700)
+    assert receiver.sequences == list(range(start, start + 700))
+    assert receiver.inbox[3][0].path_time_s == start + 3
+    assert receiver.counts == Counts()
+    assert receiver.problems == []
 
 
 async def test_every_counts_and_reports_an_overflow(connections: Connections) -> None:
     topic = replace(TOPICS["twin/finger"], max_bytes=1 << 28)  # a queue of 16
     assert compute_queue_length(topic) == 16
-    publisher = connections.mouth(topic)
-    ear = connections.ear(topic)
-    start = await connected(publisher, ear, finger) + 1
+    publisher = connections.sender(topic)
+    receiver = connections.receiver(topic)
+    start = await connected(publisher, receiver, finger) + 1
     total = 20_000
     for number in range(start, start + total):  # the loop is not run meanwhile: nobody reads
         publisher.send(finger(number), header(number))
-    await until(lambda: len(ear.heard) > 0)
+    await until(lambda: len(receiver.inbox) > 0)
     last = start + total
-    while not ear.heard or ear.sequences[-1] < start + total:  # a last one that gets through
+    while (
+        not receiver.inbox or receiver.sequences[-1] < start + total
+    ):  # a last one that gets through
         publisher.send(finger(0.0), header(last))
         last += 1
         await asyncio.sleep(0.002)
-    first_loss = ear.counts.gaps
+    first_loss = receiver.counts.gaps
     assert first_loss > 0
-    assert len(ear.heard) + ear.counts.gaps == ear.sequences[-1] - start + 1
-    assert ear.sequences == sorted(ear.sequences)
-    assert "messages of writer lost" in ear.problems[0]
+    assert len(receiver.inbox) + receiver.counts.gaps == receiver.sequences[-1] - start + 1
+    assert receiver.sequences == sorted(receiver.sequences)
+    assert "messages of writer lost" in receiver.problems[0]
 
 
 async def test_what_has_just_left_its_writer_waits_for_no_newer(
     connections: Connections, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     topic = TOPICS["stereo"]
-    publisher = connections.mouth(topic)
-    ear = connections.ear(topic)
-    start = await connected(publisher, ear, pictures) + 1
+    publisher = connections.sender(topic)
+    receiver = connections.receiver(topic)
+    start = await connected(publisher, receiver, pictures) + 1
     now = SimpleNamespace(monotonic_ns=lambda: header(start).publish_ns)
     monkeypatch.setattr("flexsheet.messages.bus.time", now)
     for number in range(start, start + 40):
         publisher.send(pictures(number % 250), header(number))
-    await until(lambda: ear.heard and ear.sequences[-1] == start + 39)
-    assert ear.sequences[0] == start
-    assert ear.sequences == sorted(ear.sequences)
-    assert len(ear.heard) + ear.counts.dropped == 40
+    await until(lambda: receiver.inbox and receiver.sequences[-1] == start + 39)
+    assert receiver.sequences[0] == start
+    assert receiver.sequences == sorted(receiver.sequences)
+    assert len(receiver.inbox) + receiver.counts.dropped == 40
 
 
 async def test_latest_hands_over_the_newest_and_counts_the_rest(connections: Connections) -> None:
     topic = TOPICS["stereo"]
-    publisher = connections.mouth(topic)
-    ear = connections.ear(topic)
-    start = await connected(publisher, ear, pictures) + 1
+    publisher = connections.sender(topic)
+    receiver = connections.receiver(topic)
+    start = await connected(publisher, receiver, pictures) + 1
     for number in range(start, start + 40):
         publisher.send(pictures(number % 250), header(number))
-    await until(lambda: ear.heard and ear.sequences[-1] == start + 39)
-    assert len(ear.heard) + ear.counts.dropped == 40
-    assert ear.counts.dropped > 0
-    assert ear.counts.gaps == 0
-    message, _ = ear.heard[-1]
+    await until(lambda: receiver.inbox and receiver.sequences[-1] == start + 39)
+    assert len(receiver.inbox) + receiver.counts.dropped == 40
+    assert receiver.counts.dropped > 0
+    assert receiver.counts.gaps == 0
+    message, _ = receiver.inbox[-1]
     assert (message.left == (start + 39) % 250).all()
     assert not message.left.flags.writeable
 
@@ -220,35 +222,38 @@ async def test_latest_hands_over_the_newest_and_counts_the_rest(connections: Con
 async def test_latest_keeps_the_newest_of_each_writer(connections: Connections) -> None:
     topic = replace(TOPICS["estop"], delivery=Delivery.LATEST)
     one, two = (
-        connections.mouth(topic, connections.endpoint("1")),
-        connections.mouth(topic, connections.endpoint("2")),
+        connections.sender(topic, connections.endpoint("1")),
+        connections.sender(topic, connections.endpoint("2")),
     )
-    ear = connections.ear(topic, connections.endpoint("1"), connections.endpoint("2"))
+    receiver = connections.receiver(topic, connections.endpoint("1"), connections.endpoint("2"))
     number = 0
-    while {h.writer for _, h in ear.heard} != {"one", "two"}:
+    while {h.writer for _, h in receiver.inbox} != {"one", "two"}:
         number += 1
         one.send(stop("1"), header(number, "one"))
         two.send(stop("2"), header(number, "two"))
         await asyncio.sleep(0.002)
-    ear.heard.clear()
+    receiver.inbox.clear()
     for _ in range(10):
         number += 1
         one.send(stop("1"), header(number, "one"))
         two.send(stop("2"), header(number, "two"))
     await until(
-        lambda: {(h.writer, h.sequence) for _, h in ear.heard} >= {("one", number), ("two", number)}
+        lambda: (
+            {(h.writer, h.sequence) for _, h in receiver.inbox}
+            >= {("one", number), ("two", number)}
+        )
     )
 
 
 async def test_latched_reaches_late_subscribers_once(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    publisher = connections.mouth(topic)
+    publisher = connections.sender(topic)
     publisher.send(stop("first"), header(1))
     publisher.send(stop("second"), header(2))
-    early = connections.ear(topic)
-    await until(lambda: early.heard)
-    late = connections.ear(topic)
-    await until(lambda: late.heard)
+    early = connections.receiver(topic)
+    await until(lambda: early.inbox)
+    late = connections.receiver(topic)
+    await until(lambda: late.inbox)
     publisher.send(stop("third"), header(3))
     await until(lambda: early.sequences[-1] == 3 and late.sequences[-1] == 3)
     assert early.sequences == late.sequences == [2, 3]
@@ -259,94 +264,94 @@ async def test_latched_reaches_late_subscribers_once(connections: Connections) -
 async def test_latched_over_many_late_subscribers(connections: Connections) -> None:
     topic = TOPICS["scene"]
     topic = replace(topic, message=EStop)
-    publisher = connections.mouth(topic)
+    publisher = connections.sender(topic)
     publisher.send(stop("x"), header(1))
-    ears = [connections.ear(topic) for _ in range(20)]
-    await until(lambda: all(ear.heard for ear in ears))
-    assert [ear.sequences for ear in ears] == [[1]] * 20
+    receivers = [connections.receiver(topic) for _ in range(20)]
+    await until(lambda: all(receiver.inbox for receiver in receivers))
+    assert [receiver.sequences for receiver in receivers] == [[1]] * 20
 
 
 async def test_subscriber_before_publisher_and_restart_is_no_gap(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    ear = connections.ear(topic)
-    first = connections.mouth(topic)
+    receiver = connections.receiver(topic)
+    first = connections.sender(topic)
     first.send(stop("a"), header(7, epoch=1))
-    await until(lambda: len(ear.heard) == 1)
+    await until(lambda: len(receiver.inbox) == 1)
     first.close()
-    second = connections.mouth(topic)
+    second = connections.sender(topic)
     second.send(stop("b"), header(1, epoch=2))
-    await until(lambda: len(ear.heard) == 2)
-    assert [message.reason for message, _ in ear.heard] == ["a", "b"]
-    assert ear.counts == Counts()
+    await until(lambda: len(receiver.inbox) == 2)
+    assert [message.reason for message, _ in receiver.inbox] == ["a", "b"]
+    assert receiver.counts == Counts()
 
 
 async def test_many_restarts_in_a_row(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    ear = connections.ear(topic)
+    receiver = connections.receiver(topic)
     for epoch in range(1, 16):
-        publisher = connections.mouth(topic)
+        publisher = connections.sender(topic)
         publisher.send(stop("a"), header(1, epoch=epoch))
-        await until(partial(has_epoch, ear, epoch), f"start {epoch}")
+        await until(partial(has_epoch, receiver, epoch), f"start {epoch}")
         publisher.close()
-    assert len(ear.heard) == 15
-    assert ear.counts == Counts()
+    assert len(receiver.inbox) == 15
+    assert receiver.counts == Counts()
 
 
-def has_epoch(ear: RecordingSubscriber, epoch: int) -> bool:
-    return bool(ear.heard) and ear.heard[-1][1].epoch == epoch
+def has_epoch(receiver: RecordingSubscriber, epoch: int) -> bool:
+    return bool(receiver.inbox) and receiver.inbox[-1][1].epoch == epoch
 
 
 async def test_gap_is_counted(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    publisher = connections.mouth(topic)
+    publisher = connections.sender(topic)
     publisher.send(stop("a"), header(1))
-    ear = connections.ear(topic)
-    await until(lambda: ear.heard)
+    receiver = connections.receiver(topic)
+    await until(lambda: receiver.inbox)
     publisher.send(stop("b"), header(5))
-    await until(lambda: len(ear.heard) == 2)
-    assert ear.counts.gaps == 3
-    assert len(ear.problems) == 1
-    assert '"estop"' in ear.problems[0]
+    await until(lambda: len(receiver.inbox) == 2)
+    assert receiver.counts.gaps == 3
+    assert len(receiver.problems) == 1
+    assert '"estop"' in receiver.problems[0]
 
 
 async def test_failing_handler_does_not_stop_the_reader(connections: Connections) -> None:
     topic = TOPICS["estop"]
-    publisher = connections.mouth(topic)
+    publisher = connections.sender(topic)
     publisher.send(stop("a"), header(1))
-    ear = connections.ear(topic)
+    receiver = connections.receiver(topic)
 
     def fail(message: Message) -> None:
         raise ZeroDivisionError("handler's own fault")
 
-    ear.extra = fail
-    await until(lambda: ear.heard)
+    receiver.extra = fail
+    await until(lambda: receiver.inbox)
     publisher.send(stop("b"), header(2))
-    await until(lambda: len(ear.heard) == 2)
-    assert "handler's own fault" in ear.problems[0]
+    await until(lambda: len(receiver.inbox) == 2)
+    assert "handler's own fault" in receiver.problems[0]
 
 
 async def test_close_within_the_handler(connections: Connections) -> None:
     topic = TOPICS["twin/finger"]
-    publisher = connections.mouth(topic)
-    ear = connections.ear(topic)
-    start = await connected(publisher, ear, finger) + 1
-    ear.extra = lambda message: ear.subscriber.close()
+    publisher = connections.sender(topic)
+    receiver = connections.receiver(topic)
+    start = await connected(publisher, receiver, finger) + 1
+    receiver.extra = lambda message: receiver.subscriber.close()
     for number in range(start, start + 20):
         publisher.send(finger(number), header(number))
-    await until(lambda: ear.heard)
+    await until(lambda: receiver.inbox)
     for _ in range(20):
         await asyncio.sleep(0)
-    assert len(ear.heard) == 1
-    ear.subscriber.close()
+    assert len(receiver.inbox) == 1
+    receiver.subscriber.close()
 
 
 async def test_bad_messages_are_rejected_and_good_ones_pass(connections: Connections) -> None:
     topic = TOPICS["estop"]
     foreign = connections.raw(zmq.PUB, connections.endpoint())
-    ear = connections.ear(topic)
+    receiver = connections.receiver(topic)
     good = encode(stop("fine"), header(1))
     number = 1
-    while not ear.heard:
+    while not receiver.inbox:
         foreign.send_multipart(encode(stop("fine"), header(number)))
         number += 1
         await asyncio.sleep(0.002)
@@ -362,10 +367,10 @@ async def test_bad_messages_are_rejected_and_good_ones_pass(connections: Connect
     for frames in bad:
         foreign.send_multipart(frames)
     foreign.send_multipart(encode(stop("still fine"), header(number)))
-    await until(lambda: ear.heard[-1][0].reason == "still fine")
-    assert ear.counts.rejected == len(bad)
-    assert len(ear.problems) == 4  # malformed, frames, type, size: each once
-    assert all('topic "estop": message refused' in problem for problem in ear.problems)
+    await until(lambda: receiver.inbox[-1][0].reason == "still fine")
+    assert receiver.counts.rejected == len(bad)
+    assert len(receiver.problems) == 4  # malformed, frames, type, size: each once
+    assert all('topic "estop": message refused' in problem for problem in receiver.problems)
 
 
 async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(
@@ -373,42 +378,42 @@ async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(
 ) -> None:
     topic = TOPICS["estop"]
     foreign = connections.raw(zmq.PUB, connections.endpoint())
-    ear = connections.ear(topic)
+    receiver = connections.receiver(topic)
     number = 0
-    while not ear.heard:
+    while not receiver.inbox:
         number += 1
         foreign.send_multipart(encode(stop("fine"), header(number)))
         await asyncio.sleep(0.002)
     foreign.send(bytes(10 * topic.max_bytes))
     foreign.send_multipart(encode(stop("after"), header(number + 1)))
-    await until(lambda: ear.heard[-1][0].reason == "after")
-    assert ear.counts.rejected == 1
-    assert "at most" in ear.problems[0]
+    await until(lambda: receiver.inbox[-1][0].reason == "after")
+    assert receiver.counts.rejected == 1
+    assert "at most" in receiver.problems[0]
 
 
 async def test_too_large_a_message_is_rejected_at_the_sender(connections: Connections) -> None:
-    publisher = connections.mouth(replace(TOPICS["stereo"], max_bytes=5000))
+    publisher = connections.sender(replace(TOPICS["stereo"], max_bytes=5000))
     with pytest.raises(WireError, match=r"StereoPair.*at most 5000"):
         publisher.send(pictures(1), header(1))
 
 
 async def test_endpoint_in_use(connections: Connections) -> None:
     topic = TOPICS["twin/arms"]
-    connections.mouth(topic)
+    connections.sender(topic)
     with pytest.raises(BusError, match=r'topic "twin/arms": ipc://.* is in use'):
-        connections.mouth(topic)
+        connections.sender(topic)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         with pytest.raises(BusError, match=r'topic "twin/arms": tcp://.* is in use'):
-            connections.mouth(topic, f"tcp://127.0.0.1:{taken.getsockname()[1]}")
+            connections.sender(topic, f"tcp://127.0.0.1:{taken.getsockname()[1]}")
 
 
 async def test_stale_ipc_file_of_a_killed_writer_is_replaced(connections: Connections) -> None:
     dead = socket.socket(socket.AF_UNIX)
     dead.bind(connections.endpoint().removeprefix("ipc://"))
     dead.close()
-    connections.mouth(TOPICS["estop"])
+    connections.sender(TOPICS["estop"])
 
 
 @pytest.mark.parametrize(
@@ -423,28 +428,28 @@ async def test_stale_ipc_file_of_a_killed_writer_is_replaced(connections: Connec
 )
 async def test_impossible_endpoints(connections: Connections, endpoint: str, words: str) -> None:
     with pytest.raises(BusError, match=words) as caught:
-        connections.mouth(TOPICS["estop"], endpoint)
+        connections.sender(TOPICS["estop"], endpoint)
     assert '"estop"' in str(caught.value)
 
 
 async def test_impossible_connections(connections: Connections) -> None:
     for endpoint in ("ipc:///" + "x" * 200, "nonsense", "tcp://127.0.0.1:x"):
         with pytest.raises(BusError, match=r'topic "estop"'):
-            connections.ear(TOPICS["estop"], endpoint)
+            connections.receiver(TOPICS["estop"], endpoint)
 
 
 async def test_zero_copy_frames_outlive_the_socket(connections: Connections) -> None:
     topic = TOPICS["stereo"]
-    publisher = connections.mouth(topic)
-    ear = connections.ear(topic)
-    number = await connected(publisher, ear, pictures)
+    publisher = connections.sender(topic)
+    receiver = connections.receiver(topic)
+    number = await connected(publisher, receiver, pictures)
     image = np.random.default_rng(1).integers(0, 255, (480, 640), np.uint8)
     pair = StereoPair(device="t", exposure_s=0.0, dropped_frames=0, left=image, right=image)
     publisher.send(pair, header(number + 1))
-    await until(lambda: ear.heard)
+    await until(lambda: receiver.inbox)
     publisher.close()
-    ear.subscriber.close()
-    message: StereoPair = ear.heard[-1][0]
+    receiver.subscriber.close()
+    message: StereoPair = receiver.inbox[-1][0]
     assert np.array_equal(message.left, image)
     with pytest.raises(ValueError, match="read-only"):
         message.right[0, 0] = 1
@@ -458,13 +463,13 @@ def test_queue_lengths_are_bounded_for_every_topic() -> None:
 
 
 async def test_twice_started(connections: Connections) -> None:
-    ear = connections.ear(TOPICS["estop"])
+    receiver = connections.receiver(TOPICS["estop"])
     with pytest.raises(BusError, match="is started already"):
-        ear.subscriber.start()
+        receiver.subscriber.start()
 
 
-def has_received(ear: RecordingSubscriber, number: int) -> bool:
-    return bool(ear.heard) and ear.sequences[-1] == number
+def has_received(receiver: RecordingSubscriber, number: int) -> bool:
+    return bool(receiver.inbox) and receiver.sequences[-1] == number
 
 
 def arms() -> TwinArms:
@@ -482,9 +487,9 @@ async def test_bursts_never_leave_a_message_lying(
 ) -> None:
     """With edge-triggered wake-ups no message waits for the next one at any rate."""
     topic = replace(TOPICS["twin/arms"], delivery=delivery)
-    publisher = connections.mouth(topic)
-    ear = connections.ear(topic)
-    number = await connected(publisher, ear, lambda _: arms())
+    publisher = connections.sender(topic)
+    receiver = connections.receiver(topic)
+    number = await connected(publisher, receiver, lambda _: arms())
     first = number + 1
     random = np.random.default_rng(3)
     for _ in range(300):
@@ -493,41 +498,41 @@ async def test_bursts_never_leave_a_message_lying(
             publisher.send(arms(), header(number))
             if random.random() < 0.5:
                 await asyncio.sleep(0)
-        await until(partial(has_received, ear, number), "delivery")
-    assert ear.counts.gaps == ear.counts.rejected == 0
-    assert len(ear.heard) + ear.counts.dropped == number - first + 1
-    assert ear.counts.dropped == 0 or delivery is Delivery.LATEST
+        await until(partial(has_received, receiver, number), "delivery")
+    assert receiver.counts.gaps == receiver.counts.rejected == 0
+    assert len(receiver.inbox) + receiver.counts.dropped == number - first + 1
+    assert receiver.counts.dropped == 0 or delivery is Delivery.LATEST
 
 
 async def test_unopened_frames_of_every_message_for_the_recorder(
     connections: Connections, tmp_path: Path
 ) -> None:
     topic = TOPICS["stereo"]
-    publisher = connections.mouth(topic)
+    publisher = connections.sender(topic)
     bag = BagWriter(tmp_path / "a.mcap")
-    connections.closers.append(bag.close)
-    heard: list[int] = []
+    connections.cleanups.append(bag.close)
+    inbox: list[int] = []
 
     def record(frames: list[Any], header: Header) -> None:
         bag.write_frames(topic, frames, header, header.publish_ns)
-        heard.append(header.sequence)
+        inbox.append(header.sequence)
 
     problems: list[str] = []
-    ear = Subscriber(
+    receiver = Subscriber(
         topic, [connections.endpoint()], record, Counts(), on_problem=problems.append, raw=True
     )
-    ear.start()
-    connections.closers.append(ear.close)
+    receiver.start()
+    connections.cleanups.append(receiver.close)
     number = 0
-    while not heard:
+    while not inbox:
         number += 1
         publisher.send(pictures(number), header(number))
         await asyncio.sleep(0.002)
     for _ in range(40):  # on a latest topic, and yet none is left out
         number += 1
         publisher.send(pictures(number), header(number))
-    await until(lambda: heard[-1] == number)
-    assert heard == list(range(heard[0], number + 1))
+    await until(lambda: inbox[-1] == number)
+    assert inbox == list(range(inbox[0], number + 1))
     assert problems == []
     bag.close()
     for _, message, head, _ in BagReader(tmp_path / "a.mcap"):
@@ -550,7 +555,7 @@ def make_ending_subscriber(
         local=local,
     )
     subscriber.start()
-    connections.closers.append(subscriber.close)
+    connections.cleanups.append(subscriber.close)
     return seen, counts
 
 
@@ -583,7 +588,7 @@ async def test_the_end_of_a_killed_writer_is_reported_after_its_last_message(
         writer.kill()
         await writer.wait()
     await until(lambda: len(seen) > 1)
-    restarted = connections.mouth(TOPICS["estop"], endpoint)
+    restarted = connections.sender(TOPICS["estop"], endpoint)
     restarted.send(stop("b"), header(1, epoch=2))
     await until(lambda: "b" in seen)
     assert seen == ["a", "end", "b"]
@@ -597,7 +602,7 @@ async def test_an_interrupted_publisher_disconnects_its_readers_and_goes_on(
     endpoint = "tcp://127.0.0.1:*" if transport == "tcp" else connections.endpoint()
     local = LocalBus([endpoint]) if transport == "local" else None
     publisher = Publisher(TOPICS["estop"], [endpoint], local=local)
-    connections.closers.append(publisher.close)
+    connections.cleanups.append(publisher.close)
     seen, counts = make_ending_subscriber(connections, publisher.endpoints[0], local)
     for number in range(1, 4):
         reason = f"stop {number}"

@@ -69,8 +69,8 @@ def run_with_checks(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> No
             control = arm.control
             command = control.step(arm.geometry, on_time(goal), other.as_other(), STEP_S)
             if control.pending_check is not None:
-                trouble = find_violation(arm.geometry, other.geometry, control.pending_check)
-                control.on_path_result(control.pending_check, trouble)
+                problem = find_violation(arm.geometry, other.geometry, control.pending_check)
+                control.on_path_result(control.pending_check, problem)
             if command.mode == "move":
                 arm.joints = command.joints_rad
             control.on_measurement(arm.joints, ())
@@ -224,10 +224,10 @@ def test_a_clear_path_is_followed_without_a_fault_and_both_bridges_agree(
 ) -> None:
     goal = SheetMotion(transform_from_rpy(shift, lean), np.zeros(6), stretch, 0.0)
     way = make_request(HOME, goal)
-    trouble = find_violation(LEFT, RIGHT, way)
-    assert trouble == find_violation(RIGHT, LEFT, mirrored(way))
-    if trouble is not None:
-        assert trouble.startswith(("no path: left arm", "no path: right arm"))
+    problem = find_violation(LEFT, RIGHT, way)
+    assert problem == find_violation(RIGHT, LEFT, mirrored(way))
+    if problem is not None:
+        assert problem.startswith(("no path: left arm", "no path: right arm"))
         return
     arms = pair()
     for _ in range(60):

@@ -69,15 +69,15 @@ def test_the_table_is_computed_once_in_the_nodes_cache(
     flexsheet: Callable[..., tuple[int, str]],
 ) -> None:
     arguments = ("prepare", scene_file, "--cache", tmp_path / "cache", "--skin-spacing", SPACING_M)
-    code, said = flexsheet(*arguments)
+    code, printed = flexsheet(*arguments)
     assert code == 0
-    assert ": 0 % (" in said.split("snapshots for")[0]  # what it will take, before it is begun
-    assert "100 % (" in said
+    assert ": 0 % (" in printed.split("snapshots for")[0]  # what it will take, before it is begun
+    assert "100 % (" in printed
     scene = load_scene(scene_file)
     spec = body.make_table_spec(scene, body.make_soft_body_spec(scene, SPACING_M))
     path = precompute_table.make_table_cache(spec).path(tmp_path / "cache")
     assert path.exists()
-    assert path.name in said.replace(" ", "")
+    assert path.name in printed.replace(" ", "")
     made = path.stat().st_mtime_ns
     monkeypatch.setattr(precompute_table, "local_processes", pytest.fail)
     assert flexsheet(*arguments)[0] == 0
@@ -102,7 +102,7 @@ def test_impossible_requests_are_rejected_with_an_error_text(
     options: tuple[str, ...],
     named: str,
 ) -> None:
-    code, said = flexsheet("prepare", scene_file, "--cache", tmp_path, *options)
+    code, printed = flexsheet("prepare", scene_file, "--cache", tmp_path, *options)
     assert code == 2
-    assert named in said.replace("│ ", "").replace(" │", "")
-    assert "Traceback" not in said
+    assert named in printed.replace("│ ", "").replace(" │", "")
+    assert "Traceback" not in printed

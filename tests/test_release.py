@@ -145,11 +145,11 @@ def test_try_runs_from_the_wheel_with_each_supported_python(
     subprocess.run([python, "-m", "venv", tmp_path / "venv"], check=True)
     environment = Environment(tmp_path / "venv")
     environment.run("pip", "install", "--quiet", f"{wheel}[view]", cwd=tmp_path, timeout_s=1200)
-    said = environment.run(
+    printed = environment.run(
         "flexsheet", "try", "--no-browser", "--json", "--port", "8093", "--duration", "5",
         cwd=tmp_path,
     )  # fmt: skip
-    assert json.loads(said.splitlines()[0])["page"] == "http://127.0.0.1:8093/"
+    assert json.loads(printed.splitlines()[0])["page"] == "http://127.0.0.1:8093/"
     assert environment.run("flexsheet", "topic", "list", cwd=tmp_path)
 
 

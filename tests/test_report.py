@@ -246,7 +246,7 @@ def test_an_arm_that_starts_is_no_event_and_no_fault(tmp_path: Path) -> None:
 
 def test_errors_are_listed_with_the_worst_first(numbers: dict[str, Any]) -> None:
     found = find_problems(numbers)
-    said = " ".join(one.text for one in found)
+    printed = " ".join(one.text for one in found)
     for part in (
         "has changes after its commit",
         "E-stop, once; first at 2.10 s: e-stop engaged by console: a person.",
@@ -258,7 +258,7 @@ def test_errors_are_listed_with_the_worst_first(numbers: dict[str, Any]) -> None
         "fingertip stopped once",
         "outside its valid range in 10.0% of its results",
     ):
-        assert part in said, part
+        assert part in printed, part
     gravities = [one.gravity for one in found]
     assert gravities == sorted(gravities)
     assert {one.section for one in found} <= SECTIONS.keys()

@@ -141,7 +141,7 @@ FOLLOWED = {
     ("circle", "plane"), ("circle", "sphere"), ("circle", "organ"), ("stroke-push", "box"),
     ("stroke-push", "cylinder"), ("stroke-push", "ellipsoid"), ("stroke-push", "organ"),
 }  # fmt: skip
-"""What `make test` tries for a third of the gesture: each shape, and each gesture on a mesh."""
+"""Cases that `make test` runs for a third of the gesture: each shape, each gesture on a mesh."""
 
 
 @pytest.mark.parametrize(

@@ -46,16 +46,16 @@ def free_port() -> int:
 class RecordingSubscriber:
     """Record of a subscriber."""
 
-    heard: list[tuple[Any, Header]] = field(default_factory=list)
+    inbox: list[tuple[Any, Header]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     counts: PortCounts = field(default_factory=PortCounts)
 
     def record(self, message: Any, header: Header) -> None:
-        self.heard.append((message, header))
+        self.inbox.append((message, header))
 
     @property
     def sequences(self) -> list[int]:
-        return [header.sequence for _, header in self.heard]
+        return [header.sequence for _, header in self.inbox]
 
 
 class SecuredPublisher:
@@ -65,35 +65,35 @@ class SecuredPublisher:
         self.known = known
         self.port = free_port()
         self.refused: list[str] = []
-        self.closers: list[Callable[[], None]] = []
+        self.cleanups: list[Callable[[], None]] = []
         self.rings = {name: known.ring(name) for name in (*known.names, "stranger")}
         self.sent = 0
 
-    def mouth(self, topic: Topic = ESTOP, host: str = "main") -> Publisher:
+    def sender(self, topic: Topic = ESTOP, host: str = "main") -> Publisher:
         publisher = Publisher(
             topic,
             [f"tcp://127.0.0.1:{self.port}"],
             keys=self.rings[host],
             on_refused=self.refused.append,
         )
-        self.closers.append(publisher.close)
+        self.cleanups.append(publisher.close)
         return publisher
 
-    def ear(
+    def receiver(
         self, ring: KeyRing | None, topic: Topic = ESTOP, *, port: int = 0, host: str = "main"
     ) -> RecordingSubscriber:
-        ear = RecordingSubscriber()
+        receiver = RecordingSubscriber()
         source = Source(f"tcp://127.0.0.1:{port or self.port}", "planner", host)
         subscriber = Subscriber(
-            topic, [source], ear.record, ear.counts, keys=ring, plan=PLAN,
-            on_problem=ear.problems.append,
+            topic, [source], receiver.record, receiver.counts, keys=ring, plan=PLAN,
+            on_problem=receiver.problems.append,
         )  # fmt: skip
         subscriber.start()
-        self.closers.append(subscriber.close)
-        ear.subscriber = subscriber  # type: ignore[attr-defined]  # for renewing its keys
-        return ear
+        self.cleanups.append(subscriber.close)
+        receiver.subscriber = subscriber  # type: ignore[attr-defined]  # for renewing its keys
+        return receiver
 
-    async def speak(self, publisher: Publisher, until_: Callable[[], object]) -> None:
+    async def publish_until(self, publisher: Publisher, until_: Callable[[], object]) -> None:
         """Publish numbered e-stops until a condition holds."""
         while not until_():
             self.sent += 1
@@ -107,18 +107,23 @@ async def secured() -> AsyncIterator[SecuredPublisher]:
     with hosts("main", "left") as known:
         secured = SecuredPublisher(known)
         yield secured
-        for close in reversed(secured.closers):
+        for close in reversed(secured.cleanups):
             close()
 
 
 async def test_an_unknown_key_receives_nothing_and_is_reported(secured: SecuredPublisher) -> None:
-    mouth = secured.mouth()
-    friend, stranger = secured.ear(secured.rings["left"]), secured.ear(secured.rings["stranger"])
-    without = secured.ear(None)
-    await secured.speak(mouth, lambda: friend.heard and stranger.problems and secured.refused)
-    await secured.speak(mouth, lambda: len(friend.heard) > 100)
-    assert (stranger.heard, without.heard) == ([], [])
-    assert "rejects the key of this host" in stranger.problems[0]
+    sender = secured.sender()
+    friend, outsider = (
+        secured.receiver(secured.rings["left"]),
+        secured.receiver(secured.rings["stranger"]),
+    )
+    without = secured.receiver(None)
+    await secured.publish_until(
+        sender, lambda: friend.inbox and outsider.problems and secured.refused
+    )
+    await secured.publish_until(sender, lambda: len(friend.inbox) > 100)
+    assert (outsider.inbox, without.inbox) == ([], [])
+    assert "rejects the key of this host" in outsider.problems[0]
     assert secured.known.derive_public_key("stranger") in secured.refused[0]
 
 
@@ -128,81 +133,81 @@ async def test_only_the_host_of_the_plan_is_accepted(
 ) -> None:
     """Another host, even one of the plan, uses main's endpoint: it lacks main's key."""
     if impostor == "without":
-        mouth: Publisher = Publisher(ESTOP, [f"tcp://127.0.0.1:{secured.port}"])
-        secured.closers.append(mouth.close)
+        sender: Publisher = Publisher(ESTOP, [f"tcp://127.0.0.1:{secured.port}"])
+        secured.cleanups.append(sender.close)
     else:
-        mouth = secured.mouth(host=impostor)
-    ear = secured.ear(secured.rings["left"])
-    await secured.speak(mouth, lambda: ear.problems)
-    await secured.speak(mouth, partial(next, iter([False] * 50 + [True])))
-    assert ear.heard == []
-    mouth.close()
-    right = secured.mouth()
-    await secured.speak(right, lambda: ear.heard)
+        sender = secured.sender(host=impostor)
+    receiver = secured.receiver(secured.rings["left"])
+    await secured.publish_until(sender, lambda: receiver.problems)
+    await secured.publish_until(sender, partial(next, iter([False] * 50 + [True])))
+    assert receiver.inbox == []
+    sender.close()
+    right = secured.sender()
+    await secured.publish_until(right, lambda: receiver.inbox)
 
 
 async def test_a_new_key_of_ours_or_of_the_other_end_without_a_restart(
     secured: SecuredPublisher,
 ) -> None:
-    mouth, ear = secured.mouth(), secured.ear(secured.rings["left"])
-    subscriber: Subscriber = ear.subscriber  # type: ignore[attr-defined]  # see SecuredPublisher.ear
-    await secured.speak(mouth, lambda: ear.heard)
+    sender, receiver = secured.sender(), secured.receiver(secured.rings["left"])
+    subscriber: Subscriber = receiver.subscriber  # type: ignore[attr-defined]  # see SecuredPublisher.ear
+    await secured.publish_until(sender, lambda: receiver.inbox)
     secured.known.public["left"] = secured.known.make_key("left")
     for name in ("main", "left"):
         secured.known.write_ring(name)
     change = secured.rings["main"].reload()
     assert change == KeyChange(own=False, hosts=frozenset({"left"}))
-    mouth.renew_keys(change)
-    ear.heard.clear()
-    await secured.speak(mouth, lambda: ear.problems)
-    assert ear.heard == [], "the old key is refused, also on the connection that was there"
+    sender.renew_keys(change)
+    receiver.inbox.clear()
+    await secured.publish_until(sender, lambda: receiver.problems)
+    assert receiver.inbox == [], "the old key is refused, also on the connection that was there"
     change = secured.rings["left"].reload()
     assert change == KeyChange(own=True, hosts=frozenset({"left"}))
     subscriber.renew_keys(change)
-    await secured.speak(mouth, lambda: ear.heard)
+    await secured.publish_until(sender, lambda: receiver.inbox)
     secured.known.public["main"] = secured.known.make_key("main")
     for name in ("main", "left"):
         secured.known.write_ring(name)
         changed = secured.rings[name].reload()
         assert changed is not None
-        (mouth if name == "main" else subscriber).renew_keys(changed)
-    ear.heard.clear()
-    await secured.speak(mouth, lambda: ear.heard)
+        (sender if name == "main" else subscriber).renew_keys(changed)
+    receiver.inbox.clear()
+    await secured.publish_until(sender, lambda: receiver.inbox)
     assert secured.rings["main"].reload() is None
 
 
 async def test_an_added_host_disturbs_no_connection(secured: SecuredPublisher) -> None:
-    mouth, ear = secured.mouth(), secured.ear(secured.rings["left"])
-    await secured.speak(mouth, lambda: ear.heard)
+    sender, receiver = secured.sender(), secured.receiver(secured.rings["left"])
+    await secured.publish_until(sender, lambda: receiver.inbox)
     secured.known.public["right"] = secured.known.derive_public_key("stranger")
     secured.known.write_ring("main")
     change = secured.rings["main"].reload()
     assert change == KeyChange(own=False, hosts=frozenset())
-    mouth.renew_keys(change)
-    late = secured.ear(secured.rings["stranger"])
-    await secured.speak(mouth, lambda: late.heard)
-    assert ear.sequences == list(range(ear.sequences[0], ear.sequences[-1] + 1))
+    sender.renew_keys(change)
+    late = secured.receiver(secured.rings["stranger"])
+    await secured.publish_until(sender, lambda: late.inbox)
+    assert receiver.sequences == list(range(receiver.sequences[0], receiver.sequences[-1] + 1))
 
 
 async def test_a_flood_from_strangers_does_not_keep_the_friend_from_hearing(
     secured: SecuredPublisher,
 ) -> None:
-    mouth, ear = secured.mouth(), secured.ear(secured.rings["left"])
-    await secured.speak(mouth, lambda: ear.heard)
+    sender, receiver = secured.sender(), secured.receiver(secured.rings["left"])
+    await secured.publish_until(sender, lambda: receiver.inbox)
     chance = random.Random(1)
     greeting = b"\xff" + bytes(8) + b"\x7f\x03\x01"
     openers = [b"", b"GET / HTTP/1.1\r\n\r\n", greeting, greeting + b"CURVE".ljust(20, b"\0")]
     openers.append(greeting + b"NULL".ljust(20, b"\0") + bytes(32))
     for number in range(400):
-        with socket.create_connection(("127.0.0.1", secured.port)) as stranger:
-            said = openers[number % len(openers)] + chance.randbytes(chance.randrange(2000))
-            stranger.sendall(said)
+        with socket.create_connection(("127.0.0.1", secured.port)) as outsider:
+            printed = openers[number % len(openers)] + chance.randbytes(chance.randrange(2000))
+            outsider.sendall(printed)
         if number % 20 == 0:
-            await secured.speak(mouth, partial(next, iter([False, True])))
-    ear.heard.clear()
-    await secured.speak(mouth, lambda: len(ear.heard) > 20)
-    assert ear.counts.rejected == 0
-    assert {header.writer for _, header in ear.heard} == {"planner"}
+            await secured.publish_until(sender, partial(next, iter([False, True])))
+    receiver.inbox.clear()
+    await secured.publish_until(sender, lambda: len(receiver.inbox) > 20)
+    assert receiver.counts.rejected == 0
+    assert {header.writer for _, header in receiver.inbox} == {"planner"}
 
 
 class TamperingProxy(TcpRelay):
@@ -210,7 +215,7 @@ class TamperingProxy(TcpRelay):
 
     def __init__(self, target_port: int) -> None:
         super().__init__(target_port)
-        self.meddle: Callable[[bytes], bytes] = lambda data: data
+        self.tamper: Callable[[bytes], bytes] = lambda data: data
         self.kept: list[bytes] = []
         self.connections = 0
 
@@ -224,7 +229,7 @@ class TamperingProxy(TcpRelay):
             while data := await reader.read(1 << 16):
                 if to_subscriber:
                     self.kept.append(data)
-                    data = self.meddle(data)
+                    data = self.tamper(data)
                 writer.write(data)
         writer.transport.abort()
 
@@ -233,7 +238,7 @@ async def test_changed_repeated_or_replayed_data_are_rejected(
     secured: SecuredPublisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bus, "REOPEN_DELAY_S", 0.02)
-    mouth = secured.mouth()
+    sender = secured.sender()
     chance = random.Random(2)
 
     def flip(data: bytes) -> bytes:
@@ -242,8 +247,8 @@ async def test_changed_repeated_or_replayed_data_are_rejected(
         return data[:place] + bytes([data[place] ^ 1 << chance.randrange(8)]) + data[place + 1 :]
 
     async with TamperingProxy(secured.port) as meddler:
-        ear = secured.ear(secured.rings["left"], port=meddler.port)
-        await secured.speak(mouth, lambda: len(ear.heard) > 20)
+        receiver = secured.receiver(secured.rings["left"], port=meddler.port)
+        await secured.publish_until(sender, lambda: len(receiver.inbox) > 20)
         earlier = list(meddler.kept)
         tricks: tuple[Callable[[bytes], bytes], ...] = (
             flip,
@@ -251,22 +256,22 @@ async def test_changed_repeated_or_replayed_data_are_rejected(
             lambda data: chance.choice(earlier),
         )
         for trick in tricks:
-            meddler.meddle = trick
+            meddler.tamper = trick
             before = meddler.connections
-            await secured.speak(mouth, lambda: meddler.connections >= before + 3)  # noqa: B023
-        meddler.meddle = lambda data: data
-        done = len(ear.heard)
-        await secured.speak(mouth, lambda: len(ear.heard) > done + 5)
-    for message, header in ear.heard:
+            await secured.publish_until(sender, lambda: meddler.connections >= before + 3)  # noqa: B023
+        meddler.tamper = lambda data: data
+        done = len(receiver.inbox)
+        await secured.publish_until(sender, lambda: len(receiver.inbox) > done + 5)
+    for message, header in receiver.inbox:
         assert message == stop(str(header.sequence))
-    assert ear.sequences == sorted(set(ear.sequences)), "each at most once, in order"
-    assert ear.counts.rejected == 0, "ZeroMQ's own seal catches it, before any message is made"
+    assert receiver.sequences == sorted(set(receiver.sequences)), "each at most once, in order"
+    assert receiver.counts.rejected == 0, "ZeroMQ's own seal catches it, before any message is made"
 
 
 async def test_a_recorded_connection_cannot_be_replayed(secured: SecuredPublisher) -> None:
     """All bytes that a subscriber sent open no connection again: both ends create the session's
     keys."""
-    mouth = secured.mouth()
+    sender = secured.sender()
     sent: list[bytes] = []
 
     class Recorder(TcpRelay):
@@ -282,8 +287,8 @@ async def test_a_recorded_connection_cannot_be_replayed(secured: SecuredPublishe
             writer.transport.abort()
 
     async with Recorder(secured.port) as wire:
-        ear = secured.ear(secured.rings["left"], port=wire.port)
-        await secured.speak(mouth, lambda: len(ear.heard) > 5)
+        receiver = secured.receiver(secured.rings["left"], port=wire.port)
+        await secured.publish_until(sender, lambda: len(receiver.inbox) > 5)
     reader, writer = await asyncio.open_connection("127.0.0.1", secured.port)
     writer.write(b"".join(sent))
     answer = bytearray()
@@ -295,7 +300,7 @@ async def test_a_recorded_connection_cannot_be_replayed(secured: SecuredPublishe
 
     # ZeroMQ hangs up; until then the publisher goes on.
     listening = asyncio.create_task(listen())
-    await secured.speak(mouth, listening.done)
+    await secured.publish_until(sender, listening.done)
     writer.close()
     # Greeting (64 bytes) and WELCOME (170 bytes in a frame) at most: no message.
     assert len(answer) < 300
@@ -306,32 +311,32 @@ async def test_messages_of_250_mib_are_counted_and_others_continue(
 ) -> None:
     """Each topic has its limit; longer messages are rejected, and their memory is freed."""
     foreign = ForeignPublisher(f"tcp://127.0.0.1:{secured.port}")
-    secured.closers.append(foreign.close)
-    ear = RecordingSubscriber()
+    secured.cleanups.append(foreign.close)
+    receiver = RecordingSubscriber()
     subscriber = Subscriber(
-        ESTOP, [f"tcp://127.0.0.1:{secured.port}"], ear.record, ear.counts,
-        on_problem=ear.problems.append,
+        ESTOP, [f"tcp://127.0.0.1:{secured.port}"], receiver.record, receiver.counts,
+        on_problem=receiver.problems.append,
     )  # fmt: skip
     subscriber.start()
-    secured.closers.append(subscriber.close)
+    secured.cleanups.append(subscriber.close)
     number = 0
 
-    async def speak(until_: Callable[[], object]) -> None:
+    async def publish_until(until_: Callable[[], object]) -> None:
         nonlocal number
         while not until_():
             number += 1
             foreign.send(*plain(encode(stop("good"), replace(HEADER, sequence=number))))
             await asyncio.sleep(0.002)
 
-    await speak(lambda: ear.heard)
+    await publish_until(lambda: receiver.inbox)
     process = psutil.Process()
     before = process.memory_info().rss
     for count in range(1, 4):
         foreign.send(bytes(250 << 20))
-        await speak(lambda: ear.counts.rejected == count)  # noqa: B023
-        heard = len(ear.heard)
-        await speak(lambda: len(ear.heard) > heard)  # noqa: B023
-    assert "at most 1048576 are allowed" in ear.problems[0]
+        await publish_until(lambda: receiver.counts.rejected == count)  # noqa: B023
+        inbox = len(receiver.inbox)
+        await publish_until(lambda: len(receiver.inbox) > inbox)  # noqa: B023
+    assert "at most 1048576 are allowed" in receiver.problems[0]
     assert process.memory_info().rss - before < 300 << 20
 
 
@@ -348,7 +353,7 @@ async def test_a_host_without_a_key_in_the_plan_is_not_connected_to(
     secured: SecuredPublisher,
 ) -> None:
     with pytest.raises(SecurityError, match='host "right" has no key'):
-        secured.ear(secured.rings["left"], host="right")
+        secured.receiver(secured.rings["left"], host="right")
 
 
 # In bulk, where sockets would only take time: all that a host with a good key could try.
@@ -421,9 +426,14 @@ def forgeries(message: Message, chance: random.Random) -> Iterator[tuple[str, li
 @pytest.mark.parametrize("topic", ["estop", "sheet_target", "stereo"])
 def test_of_a_hundred_thousand_forgeries_none_is_accepted(topic: str) -> None:
     message = {"estop": stop("good"), "sheet_target": target(), "stereo": pictures(3)}[topic]
-    ear = RecordingSubscriber()
+    receiver = RecordingSubscriber()
     subscriber = Subscriber(
-        TOPICS[topic], [], ear.record, ear.counts, plan=PLAN, on_problem=ear.problems.append
+        TOPICS[topic],
+        [],
+        receiver.record,
+        receiver.counts,
+        plan=PLAN,
+        on_problem=receiver.problems.append,
     )
     writers = frozenset({"planner"})
 
@@ -434,35 +444,39 @@ def test_of_a_hundred_thousand_forgeries_none_is_accepted(topic: str) -> None:
 
     offer(plain(encode(message, replace(HEADER, clock_id="main-0000", sequence=1))))
     offer(plain(encode(message, HEADER)))
-    assert len(ear.heard) == 2
+    assert len(receiver.inbox) == 2
     tried: Counter[str] = Counter()
     accepted: Counter[str] = Counter()
     for kind, frames in itertools.islice(forgeries(message, random.Random(topic)), 34_000):
         tried[kind] += 1
         offer(frames)
-        accepted[kind] += len(ear.heard) - 2
-        del ear.heard[2:]
+        accepted[kind] += len(receiver.inbox) - 2
+        del receiver.inbox[2:]
     assert accepted.total() == 0, {kind: n for kind, n in accepted.items() if n}
-    assert ear.counts.rejected == tried.total() == 34_000
-    assert len(ear.problems) <= 12, "each cause is told once"
+    assert receiver.counts.rejected == tried.total() == 34_000
+    assert len(receiver.problems) <= 12, "each cause is told once"
     assert len(subscriber._writers_seen) == 1, "nobody makes it remember more"
     offer(plain(encode(message, replace(HEADER, sequence=2**63 - 1))))
-    assert len(ear.heard) == 3, "the true writer is heard on"
+    assert len(receiver.inbox) == 3, "the true writer is heard on"
 
 
 def test_the_newest_again_is_silent_where_it_is_latched_and_a_replay_where_not() -> None:
     for topic, message, rejected in ((ESTOP, stop("a"), 0), (FINGER, finger(1.0), 1)):
-        ear = RecordingSubscriber()
-        subscriber = Subscriber(topic, [], ear.record, ear.counts, on_problem=ear.problems.append)
+        receiver = RecordingSubscriber()
+        subscriber = Subscriber(
+            topic, [], receiver.record, receiver.counts, on_problem=receiver.problems.append
+        )
         frames = plain(encode(message, HEADER))
         assert subscriber.accept(frames, None) is not None
         assert subscriber.accept(frames, None) is None
-        assert ear.counts.rejected == rejected
+        assert receiver.counts.rejected == rejected
 
 
 def test_a_restart_and_a_reboot_are_followed() -> None:
-    ear = RecordingSubscriber()
-    subscriber = Subscriber(FINGER, [], ear.record, ear.counts, on_problem=ear.problems.append)
+    receiver = RecordingSubscriber()
+    subscriber = Subscriber(
+        FINGER, [], receiver.record, receiver.counts, on_problem=receiver.problems.append
+    )
 
     def takes(clock_id: str, epoch: int, sequence: int) -> bool:
         header = replace(HEADER, clock_id=clock_id, epoch=epoch, sequence=sequence)
@@ -474,7 +488,7 @@ def test_a_restart_and_a_reboot_are_followed() -> None:
     assert takes("boot-2", 3, 1)
     assert not takes("boot-1", 902, 1)
     assert takes("boot-2", 4, 1)
-    assert ear.counts.gaps == 0
+    assert receiver.counts.gaps == 0
 
 
 def node_config(**keys: Any) -> NodeConfig:
@@ -498,9 +512,9 @@ def test_who_may_reset_an_estop() -> None:
 
 
 def test_a_forbidden_message_is_counted_and_not_handed_over() -> None:
-    ear = RecordingSubscriber()
+    receiver = RecordingSubscriber()
     subscriber = Subscriber(
-        ESTOP, [], ear.record, ear.counts, on_problem=ear.problems.append,
+        ESTOP, [], receiver.record, receiver.counts, on_problem=receiver.problems.append,
         message_filter=lambda message, header: None if message.engaged else "not so",
     )  # fmt: skip
     for number, engaged in enumerate((True, False, True), start=8):
@@ -508,5 +522,8 @@ def test_a_forbidden_message_is_counted_and_not_handed_over() -> None:
         envelope = subscriber.accept(plain(encode(message, replace(HEADER, sequence=number))), None)
         assert envelope is not None
         subscriber.deliver(envelope)
-    assert [message.engaged for message, _ in ear.heard] == [True, True]
-    assert (ear.counts.rejected, ear.problems) == (1, ['topic "estop": message refused: not so'])
+    assert [message.engaged for message, _ in receiver.inbox] == [True, True]
+    assert (receiver.counts.rejected, receiver.problems) == (
+        1,
+        ['topic "estop": message refused: not so'],
+    )

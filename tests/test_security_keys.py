@@ -165,11 +165,11 @@ def test_install_changes_one_key_and_nothing_else(tmp_path: Path) -> None:
     text = file.read_text()
     assert "# the lab" in text
     assert "# upstairs" in text
-    for host, key, said in (
+    for host, key, printed in (
         ("lft", keys_tried[0], 'no host "lft"; did you mean "left"'),
         ("left", "nonsense", '"nonsense" is not a public key'),
     ):
-        with pytest.raises(BadInputError, match=said):
+        with pytest.raises(BadInputError, match=printed):
             install(file, host, key)
 
 
@@ -205,9 +205,9 @@ ONE, TWO = make_key_pair()[0], make_key_pair()[0]
     ],
     ids=["one without", "two alike", "no key"],  # keys are redrawn; names of tests must not be
 )
-def test_keys_that_do_not_do(tmp_path: Path, main: str, left: str | None, said: str) -> None:
+def test_keys_that_do_not_do(tmp_path: Path, main: str, left: str | None, printed: str) -> None:
     given = {"main": {**HOSTS["main"], "key": main}, "left": {**HOSTS["left"], "key": left}}
-    with pytest.raises(BadInputError, match=said):
+    with pytest.raises(BadInputError, match=printed):
         load_graph(write(tmp_path, {"beacon": beacon()}, hosts=given))
 
 
@@ -248,13 +248,13 @@ def test_the_command_makes_shows_and_installs(command: Command, keys: Path, tmp_
     assert command("keys", "new", "Left Arm").code == 2
 
 
-async def heard(plan: ResolvedGraph, graph: RunningGraph) -> None:
+async def inbox(plan: ResolvedGraph, graph: RunningGraph) -> None:
     """Wait until a tool on main has received the beacon on left."""
     fingers: list[TwinFinger] = []
-    said: list[str] = []
+    printed: list[str] = []
     subscriber = make_subscriber(
         "twin/finger", plan, graph.run, lambda message, _: fingers.append(message),
-        on_problem=said.append,
+        on_problem=printed.append,
     )  # fmt: skip
     subscriber.start()
     try:
@@ -272,10 +272,10 @@ def plan_with_keys(folder: Path, public: dict[str, str], **more: Any) -> Resolve
 async def test_a_graph_with_keys_and_a_new_key_while_it_runs(tmp_path: Path, keys: Path) -> None:
     public = {name: make(keys, name) for name in HOSTS}
     plan = plan_with_keys(tmp_path, public)
-    said: list[str] = []
+    printed: list[str] = []
 
     def report(_: str, line: str) -> None:
-        said.append(line)
+        printed.append(line)
 
     async with (
         RunningGraph(plan, host="main", report=report) as main,
@@ -283,14 +283,14 @@ async def test_a_graph_with_keys_and_a_new_key_while_it_runs(tmp_path: Path, key
     ):
         await main.wait_ready(DEADLINE_S)
         await left.wait_ready(DEADLINE_S)
-        await heard(plan, main)
+        await inbox(plan, main)
         pids = main.pids | left.pids
         new = make(keys, "left", replace=True)
-        await until(lambda: any("does not match the key" in line for line in said))
+        await until(lambda: any("does not match the key" in line for line in printed))
         install(Path(plan.launch_file), "left", new)
-        await until(lambda: sum("keys of" in line for line in said) >= 2)
+        await until(lambda: sum("keys of" in line for line in printed) >= 2)
         plan = load_graph(Path(plan.launch_file))
-        await heard(plan, main)
+        await inbox(plan, main)
         assert main.pids | left.pids == pids, "nothing was restarted"
 
 

@@ -114,17 +114,17 @@ class SecuredBridge:
             topics={port.port: port.topic for port in (*config.inputs, *config.outputs)},
             plan_hash=config.plan_hash,
         )
-        self.heard: list[tuple[str, str]] = []
+        self.inbox: list[tuple[str, str]] = []
         self.sequence = 0
 
     def record(self, port: str, message: Message, header: Header) -> None:
-        self.heard.append((header.writer, repr(message)))
+        self.inbox.append((header.writer, repr(message)))
 
     def rejected(self, port: str) -> int:
         return self.bridge.inputs[port].counts.rejected
 
     @contextmanager
-    def mouth(self, topic: str, *, at: tuple[str, str], key: str) -> Iterator[Publisher]:
+    def sender(self, topic: str, *, at: tuple[str, str], key: str) -> Iterator[Publisher]:
         """Open a publisher of `topic` at the endpoint `at` (topic, writer), with the key of a
         host."""
         writer = self.plan.writer(*at)
@@ -137,29 +137,29 @@ class SecuredBridge:
             publisher.close()
 
     async def say(
-        self, mouth: Publisher, writer: str, message: Message, enough: Callable[[], object]
+        self, sender: Publisher, writer: str, message: Message, enough: Callable[[], object]
     ) -> None:
         """Publish repeatedly until a condition holds."""
 
-        def said() -> bool:
+        def printed() -> bool:
             self.sequence += 1
             now_ns = self.bridge.clock.now_ns()
             clock_id, plan = f"{writer}-1", self.plan.hash
-            mouth.send(message, Header(self.sequence, now_ns, now_ns, clock_id, writer, 1, plan))
+            sender.send(message, Header(self.sequence, now_ns, now_ns, clock_id, writer, 1, plan))
             return bool(enough())
 
-        await until(said)
+        await until(printed)
 
-    async def is_taken(self, mouth: Publisher, writer: str, message: Message) -> None:
-        self.heard.clear()
-        await self.say(mouth, writer, message, lambda: (writer, repr(message)) in self.heard)
+    async def is_taken(self, sender: Publisher, writer: str, message: Message) -> None:
+        self.inbox.clear()
+        await self.say(sender, writer, message, lambda: (writer, repr(message)) in self.inbox)
 
-    async def is_refused(self, mouth: Publisher, writer: str, message: Message, port: str) -> None:
+    async def is_refused(self, sender: Publisher, writer: str, message: Message, port: str) -> None:
         """Assert that a message is rejected and counted."""
         first = self.rejected(port)
-        self.heard.clear()
-        await self.say(mouth, writer, message, lambda: self.rejected(port) >= first + 10)
-        assert (writer, repr(message)) not in self.heard
+        self.inbox.clear()
+        await self.say(sender, writer, message, lambda: self.rejected(port) >= first + 10)
+        assert (writer, repr(message)) not in self.inbox
 
 
 @contextmanager
@@ -181,19 +181,19 @@ async def test_an_arm_s_computer_cannot_command_the_other_arm(
     mine, main_s = ("arm_left", "arm_left_bridge"), ("sheet_target", "planner")
     left, forged = arm_state("left"), target()
     with make_secured(lab(folder), monkeypatch) as secured:
-        with secured.mouth("arm_left", at=mine, key="left") as mouth:
-            await secured.is_taken(mouth, "arm_left_bridge", left)
+        with secured.sender("arm_left", at=mine, key="left") as sender:
+            await secured.is_taken(sender, "arm_left_bridge", left)
             for other in ("planner", BRIDGE, "tools"):
-                await secured.is_refused(mouth, other, left, "other_arm")
-        with secured.mouth("sheet_target", at=mine, key="left") as mouth:
-            await secured.is_refused(mouth, "planner", forged, "other_arm")
-        with secured.mouth("sheet_target", at=main_s, key="left") as mouth:
+                await secured.is_refused(sender, other, left, "other_arm")
+        with secured.sender("sheet_target", at=mine, key="left") as sender:
+            await secured.is_refused(sender, "planner", forged, "other_arm")
+        with secured.sender("sheet_target", at=main_s, key="left") as sender:
             secured.bridge.last_error = ""
-            await secured.say(mouth, "planner", forged, lambda: secured.bridge.last_error)
+            await secured.say(sender, "planner", forged, lambda: secured.bridge.last_error)
             assert 'topic "sheet_target": host main did not prove' in secured.bridge.last_error
-            assert {writer for writer, _ in secured.heard} <= {"arm_left_bridge"}
-        with secured.mouth("sheet_target", at=main_s, key="main") as mouth:
-            await secured.is_taken(mouth, "planner", forged)
+            assert {writer for writer, _ in secured.inbox} <= {"arm_left_bridge"}
+        with secured.sender("sheet_target", at=main_s, key="main") as sender:
+            await secured.is_taken(sender, "planner", forged)
 
 
 @pytest.mark.parametrize("may", [None, False, True], ids=["as it comes", "may not", "may"])
@@ -207,16 +207,16 @@ async def test_who_may_reset_a_stop_and_let_the_arms_move(
             ("arming", Arming(ready=False), Arming(ready=True)),
         )
         for topic, stops, lets in words:
-            with secured.mouth(topic, at=(topic, "hand"), key="left") as mouth:
-                await secured.is_taken(mouth, "hand", stops)
+            with secured.sender(topic, at=(topic, "hand"), key="left") as sender:
+                await secured.is_taken(sender, "hand", stops)
                 if may:
-                    await secured.is_taken(mouth, "hand", lets)
+                    await secured.is_taken(sender, "hand", lets)
                 else:
-                    await secured.is_refused(mouth, "hand", lets, topic)
+                    await secured.is_refused(sender, "hand", lets, topic)
                     assert "hand may not reset an e-stop" in secured.bridge.last_error
-                await secured.is_taken(mouth, "hand", stops)
-            with secured.mouth(topic, at=(topic, "tools"), key="main") as mouth:
-                await secured.is_taken(mouth, "tools", lets)
+                await secured.is_taken(sender, "hand", stops)
+            with secured.sender(topic, at=(topic, "tools"), key="main") as sender:
+                await secured.is_taken(sender, "tools", lets)
             assert (secured.rejected(topic) == 0) == bool(may)
 
 

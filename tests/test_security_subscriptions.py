@@ -222,27 +222,27 @@ async def test_an_address_has_a_limited_number_of_connections(
     secured: SecuredPublisher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connection_guard, "MAX_CONNECTIONS_PER_ADDRESS", 3)
-    publisher = secured.mouth()
-    ears = [secured.ear(secured.rings["left"]) for _ in range(3)]
-    await secured.speak(publisher, lambda: all(ear.heard for ear in ears))
+    publisher = secured.sender()
+    receivers = [secured.receiver(secured.rings["left"]) for _ in range(3)]
+    await secured.publish_until(publisher, lambda: all(receiver.inbox for receiver in receivers))
     with socket.create_connection(("127.0.0.1", secured.port), timeout=DEADLINE_S) as fourth:
         await until(lambda: secured.refused)
         # ZeroMQ may have sent its greeting before.
         while await asyncio.to_thread(fourth.recv, 100):
             pass
     assert "has 3 connections already" in secured.refused[0]
-    ears[0].subscriber.close()  # type: ignore[attr-defined]  # see SecuredPublisher.ear
-    successor = secured.ear(secured.rings["left"])
-    await secured.speak(publisher, lambda: successor.heard)
+    receivers[0].subscriber.close()  # type: ignore[attr-defined]  # see SecuredPublisher.ear
+    successor = secured.receiver(secured.rings["left"])
+    await secured.publish_until(publisher, lambda: successor.inbox)
 
 
 async def test_the_guard_ends_with_the_last_publisher(connections: Connections) -> None:
-    publisher = connections.mouth(ESTOP, "tcp://127.0.0.1:*")
-    successor = connections.mouth(ESTOP, "tcp://127.0.0.1:*")
+    publisher = connections.sender(ESTOP, "tcp://127.0.0.1:*")
+    successor = connections.sender(ESTOP, "tcp://127.0.0.1:*")
     publisher.close()
-    ear = connections.ear(ESTOP, successor.endpoints[0])
+    receiver = connections.receiver(ESTOP, successor.endpoints[0])
     successor.send(stop("after"), header(1))
-    await until(lambda: ear.heard)
+    await until(lambda: receiver.inbox)
     assert [one.name for one in threading.enumerate()].count(THREAD_NAME) == 1
     successor.close()
     await until(lambda: THREAD_NAME not in [one.name for one in threading.enumerate()])
@@ -251,9 +251,9 @@ async def test_the_guard_ends_with_the_last_publisher(connections: Connections) 
 async def test_latched_messages_reach_late_subscribers_by_tcp_and_ipc(
     connections: Connections,
 ) -> None:
-    publisher = connections.mouth(ESTOP, connections.endpoint(), "tcp://127.0.0.1:*")
+    publisher = connections.sender(ESTOP, connections.endpoint(), "tcp://127.0.0.1:*")
     publisher.send(stop("before"), header(1))
     for endpoint in publisher.endpoints:
-        ear = connections.ear(ESTOP, endpoint)
-        await until(lambda ear=ear: ear.heard)
-        assert ear.sequences == [1]
+        receiver = connections.receiver(ESTOP, endpoint)
+        await until(lambda receiver=receiver: receiver.inbox)
+        assert receiver.sequences == [1]

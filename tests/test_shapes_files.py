@@ -144,8 +144,8 @@ def test_repairs_are_made_and_reported(tmp_path: Path) -> None:
     twice = np.concatenate([flipped, faces[:7], np.repeat(faces[:3, :1], 3, axis=1)])
     bad = trimesh.Trimesh([*good.vertices, [9.0, 9.0, 9.0]], twice, process=False)
     mesh = read_mesh(written(tmp_path, bad), 0.001, None)
-    for told in ("3 degenerate triangles", "7 repeated triangles", "triangles flipped"):
-        assert told in mesh.origin
+    for reported in ("3 degenerate triangles", "7 repeated triangles", "triangles flipped"):
+        assert reported in mesh.origin
     assert mesh.triangles.shape == faces.shape
     assert len(mesh.vertices_m) == 162
     inside_out = trimesh.Trimesh(good.vertices, faces[:, ::-1], process=False)

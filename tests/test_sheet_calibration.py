@@ -234,12 +234,12 @@ def test_rows_are_read_with_their_lines(tmp_path: Path) -> None:
         ("stretch_ratio,depth_mm,force_n\n" + "x,5,1\n" * 25, "and 5 more"),
     ],
 )
-def test_errors_in_rows_name_the_line(tmp_path: Path, text: str, said: str) -> None:
+def test_errors_in_rows_name_the_line(tmp_path: Path, text: str, printed: str) -> None:
     file = tmp_path / "rows.csv"
     file.write_text(text)
     with pytest.raises(BadInputError) as caught:
         read_rows(file, SCENE.sheet, RADIUS)
-    assert said in str(caught.value)
+    assert printed in str(caught.value)
 
 
 def test_a_missing_or_binary_file_is_reported(tmp_path: Path) -> None:
@@ -335,9 +335,9 @@ def test_the_command_fits_rows_and_reports(tmp_path: Path) -> None:
     arguments = ["calibrate", "sheet", "--rows", str(rows), "-o", str(file)]
     result = CliRunner().invoke(app, [*arguments, "--json"])
     assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    assert told["modulus_thickness_n_per_m"]["value"] == pytest.approx(1000.0, rel=0.02)
-    assert [one["line"] for one in told["left_out"]] == [8]
+    reported = json.loads(result.stdout)
+    assert reported["modulus_thickness_n_per_m"]["value"] == pytest.approx(1000.0, rel=0.02)
+    assert [one["line"] for one in reported["left_out"]] == [8]
     assert load_sheet_calibration(file).source == str(rows)
     shown = CliRunner().invoke(app, [*arguments, "--table"])
     assert shown.exit_code == 0, shown.output

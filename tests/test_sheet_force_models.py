@@ -78,13 +78,13 @@ def true_forces() -> Floats:
 
 
 def test_within_its_range_the_scaled_law_has_the_stated_accuracy(true_forces: Floats) -> None:
-    judged = 0
+    checked = 0
     for (stretch, depth, place), true in zip(CASES, true_forces, strict=True):
         if LAW.invalid_reason(SheetPush(stretch, RADIUS, place), depth):
             continue
-        judged += 1
+        checked += 1
         assert force(LAW, stretch, depth, place) == pytest.approx(float(true), rel=0.10)
-    assert judged >= 2
+    assert checked >= 2
 
 
 @pytest.mark.parametrize(
@@ -200,7 +200,7 @@ def test_a_table_returns_its_entries_and_interpolates_by_the_law() -> None:
         result: Floats = pressed.force_n * wave
         return result
 
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     table = make_tabulated_model(
         base,
         measured,
@@ -209,9 +209,9 @@ def test_a_table_returns_its_entries_and_interpolates_by_the_law() -> None:
         xs_m=np.array([0.0, 0.03, 0.06]),
         ys_m=np.array([0.0, 0.09]),
         finger_radius_m=RADIUS,
-        progress=lambda done, total: told.append((done, total)),
+        progress=lambda done, total: reported.append((done, total)),
     )
-    assert told[-1] == (18, 18)
+    assert reported[-1] == (18, 18)
     for stretch, depth, place in ((1.05, 0.002, (0.03, 0.0)), (1.035, 0.017, (-0.04, 0.05))):
         true = measured(stretch, np.array([depth]), (abs(place[0]), abs(place[1])))[0]
         assert force(table, stretch, depth, place) == pytest.approx(true, rel=2e-3)

@@ -70,7 +70,7 @@ async def test_the_node_undoes_the_skew_that_a_pair_states() -> None:
     def place(time_s: float) -> Floats:
         return np.array([0.03 * np.sin(3.0 * time_s), 0.01, 0.0])
 
-    async def worst_m(*, told: bool) -> float:
+    async def worst_m(*, reported: bool) -> float:
         observer = await Observer(scene).start()
         errors = []
         for frame in range(1, 60):
@@ -84,7 +84,7 @@ async def test_the_node_undoes_the_skew_that_a_pair_states() -> None:
             )
             pair = StereoPair(
                 device=scene.camera.device, exposure_s=0.004, dropped_frames=0,
-                skew_s=0.008 if told else 0.0, left=left, right=right,
+                skew_s=0.008 if reported else 0.0, left=left, right=right,
             )  # fmt: skip
             fingertip = await observer.process_pair(pair, round(1e9 * time_s))
             if fingertip is not None and fingertip.valid and frame > 20:
@@ -92,5 +92,5 @@ async def test_the_node_undoes_the_skew_that_a_pair_states() -> None:
         assert len(errors) > 30
         return float(max(errors))
 
-    assert await worst_m(told=False) > 1.5e-3
-    assert await worst_m(told=True) < 4e-4
+    assert await worst_m(reported=False) > 1.5e-3
+    assert await worst_m(reported=True) < 4e-4

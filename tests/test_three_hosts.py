@@ -43,7 +43,7 @@ class FaultSpans:
     spans: dict[str, Span] = field(default_factory=dict)
 
     @contextmanager
-    def trouble(self, name: str) -> Iterator[None]:
+    def problem(self, name: str) -> Iterator[None]:
         begin_ns = time.monotonic_ns()
         yield
         self.spans[name] = begin_ns, time.monotonic_ns()
@@ -54,18 +54,18 @@ class FaultSpans:
         )
 
 
-def judge_words(lab: Lab) -> None:
+def check_messages(lab: Lab) -> None:
     """Assert that the bridges reported no violation of a limit."""
     states = [state for _, state in lab.seen]
     assert states
     assert isinstance(states[0], ArmState)
     longest = max(state.edge_distance_m or 0.0 for state in states)
     assert longest <= MAX_LENGTH_M
-    said = {fault for state in states if state.mode != "disconnected" for fault in state.faults}
-    assert {fault for fault in said if not fault.startswith("e-stop")} == set()
+    printed = {fault for state in states if state.mode != "disconnected" for fault in state.faults}
+    assert {fault for fault in printed if not fault.startswith("e-stop")} == set()
 
 
-def judge_arm(arm: Arm, stood_modes: tuple[str, ...]) -> None:
+def check_arm(arm: Arm, stood_modes: tuple[str, ...]) -> None:
     """An arm's true joints: it turned the sheet with the finger while it followed, and stood
     whenever it said so."""
     assert np.isfinite(arm.joints_rad).all()
@@ -78,22 +78,22 @@ def judge_arm(arm: Arm, stood_modes: tuple[str, ...]) -> None:
         assert all(arm.turned_rad(span) < STANDS_RAD for span in stood)
 
 
-def judge_bags(lab: Lab, troubles: FaultSpans) -> None:
+def check_bags(lab: Lab, problems: FaultSpans) -> None:
     """Assert the same for the arms' true joints, and that the strokes were followed."""
     scene = lab.plan().scene_message()
     assert scene is not None
     arms = read_arm(lab.folder, "left", scene), read_arm(lab.folder, "right", scene)
     for arm in arms:
-        judge_arm(arm, ("idle", "estop"))
-    lossy = troubles.spans["loss and jitter"]
+        check_arm(arm, ("idle", "estop"))
+    lossy = problems.spans["loss and jitter"]
     sheet = measure_hold(arms, wanted(lab.folder), lossy)
     assert sheet.followed > 0.5
     assert all(arm.turned_rad(lossy) > TURNED_RAD for arm in arms)
     assert len(sheet.errors_m) > 50
     assert np.median(sheet.errors_m) < OFF_M
     lost = gaps(lab.folder)
-    assert [gap for gap in lost if not troubles.about(gap.from_ns)] == []
-    longest_s = max(end - begin for begin, end in troubles.spans.values()) * 1e-9
+    assert [gap for gap in lost if not problems.about(gap.from_ns)] == []
+    longest_s = max(end - begin for begin, end in problems.spans.values()) * 1e-9
     assert all(gap.seconds < longest_s + 2e-9 * MARGIN_NS for gap in lost)
 
 
@@ -136,39 +136,39 @@ async def test_arms_that_stroke_stop_at_a_cut_cable_and_move_when_told_so() -> N
             "both arms to turn the sheet",
         )
         await a_cable_is_cut(lab)
-        judge_words(lab)
+        check_messages(lab)
         scene = lab.plan().scene_message()
         assert scene is not None
         await end_launchers(lab)
         for side in SIDES:
-            judge_arm(read_arm(lab.folder, side, scene), ("idle",))
+            check_arm(read_arm(lab.folder, side, scene), ("idle",))
 
 
 @pytest.mark.long
 async def test_stroking_arms_stop_at_failures_and_move_when_enabled() -> None:
-    troubles = FaultSpans()
+    problems = FaultSpans()
     async with Lab(arming="manual", watchdog_s=0.8, **PATIENT) as lab:
         await last_weeks_plan_is_refused(lab)
         lab.stroke()
         await lab.until(lambda: lab.modes() == {"idle"}, "both arms to stand")
         await told_to_move(lab)
-        with troubles.trouble("loss and jitter"):
+        with problems.problem("loss and jitter"):
             for side in SIDES:
                 await lab.cable(side, loss=0.01, delay_s=0.02, jitter_s=0.01)
             await next_states(lab, "left", 280)
             for side in SIDES:
                 await lab.cable(side)
             await lab.until(lambda: lab.modes() == {"follow"}, "both arms to follow on")
-        with troubles.trouble("cut"):
+        with problems.problem("cut"):
             await a_cable_is_cut(lab)
-        with troubles.trouble("killed"):
+        with problems.problem("killed"):
             await one_of_each_host_is_killed(lab)
-        judge_words(lab)
+        check_messages(lab)
         await the_doctor_asks_all(lab)
-        with troubles.trouble("all launchers killed"):
+        with problems.problem("all launchers killed"):
             await a_stop_outlives_all_launchers(lab)
         await end_launchers(lab)
-        judge_bags(lab, troubles)
+        check_bags(lab, problems)
 
 
 async def end_launchers(lab: Lab) -> None:

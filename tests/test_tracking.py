@@ -313,9 +313,9 @@ def test_a_late_jump_a_doubled_point_and_an_ancient_one_change_nothing() -> None
     tracker = new_tracker()
     feed(tracker, steady, range(60))
     before = tracker.estimate
-    doubled, astray = steady(58 * FRAME_NS * 1e-9), steady(1.0) + np.array([0.2, 0.0, 0.0])
+    doubled, deviation = steady(58 * FRAME_NS * 1e-9), steady(1.0) + np.array([0.2, 0.0, 0.0])
     assert tracker.update(58 * FRAME_NS, doubled, NOISE) == "unconfirmed"
-    assert tracker.update(57 * FRAME_NS + 5, astray, NOISE) == "unconfirmed"
+    assert tracker.update(57 * FRAME_NS + 5, deviation, NOISE) == "unconfirmed"
     assert tracker.update(10, steady(0.0), NOISE) == "unconfirmed"
     assert tracker.estimate is before
 
@@ -328,11 +328,11 @@ def test_a_late_point_is_gated_like_one_in_time(off_m: float) -> None:
     for frame in (59, 60):
         tracker.update(frame * FRAME_NS, still(0.0), NOISE)
     before = tracker.estimate
-    astray = still(0.0) + np.array([off_m, 0.0, 0.0])
+    deviation = still(0.0) + np.array([off_m, 0.0, 0.0])
     in_time = new_tracker()
     feed(in_time, still, range(58))
-    if in_time.update(58 * FRAME_NS, astray, NOISE) == "too_fast":
-        tracker.update(58 * FRAME_NS, astray, NOISE)
+    if in_time.update(58 * FRAME_NS, deviation, NOISE) == "too_fast":
+        tracker.update(58 * FRAME_NS, deviation, NOISE)
         assert tracker.estimate is before
     else:
         assert off_m < 0.01

@@ -476,7 +476,9 @@ async def test_a_short_interruption_makes_the_arms_neither_stop_nor_disarm() -> 
     pair.check_limits()
 
 
-def spoil(kind: str, random: np.random.Generator, targets: Iterator[SheetTarget]) -> Iterator[Any]:
+def corrupt(
+    kind: str, random: np.random.Generator, targets: Iterator[SheetTarget]
+) -> Iterator[Any]:
     """Return a stream of targets of which a third are bad."""
     seen: list[SheetTarget] = []
     for target in targets:
@@ -511,7 +513,7 @@ def spoil(kind: str, random: np.random.Generator, targets: Iterator[SheetTarget]
 async def test_no_bad_target_leads_to_a_command_beyond_a_limit(kind: str) -> None:
     random = np.random.default_rng(7)
     pair = await start_pair(make_bad_cables(3))
-    await pair.run(1.0, spoil(kind, random, pair.targets()))
+    await pair.run(1.0, corrupt(kind, random, pair.targets()))
     pair.check_limits()
     if kind in ("NaN trajectory", "too long", "reordered"):
         assert not any(state.faults for states in pair.states.values() for state in states)

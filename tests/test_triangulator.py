@@ -227,7 +227,7 @@ async def test_images_of_another_camera_are_rejected_by_name(
     bench = await Bench(camera).start(scene)
     header = Header(1, 1, 1, "virtual", "camera", 1)
     full, wide = np.zeros((480, 640), np.uint8), np.zeros((480, 752), np.uint8)
-    for device, left, origin, said in (
+    for device, left, origin, printed in (
         (
             "webcam",
             full,
@@ -246,7 +246,7 @@ async def test_images_of_another_camera_are_rejected_by_name(
             left_origin_px=origin,
         )
         await bench.node.step("stereo", pair, header)
-        assert said in bench.node.last_error
+        assert printed in bench.node.last_error
     assert bench.node.errors == 3
     assert bench.sent == []
 

@@ -53,8 +53,8 @@ SETTINGS: dict[str, tune.Setting] = {name: name for name in CHEAP_FIRST}
 def point(method: str, error: float, *, depth: int = 1, **more: Any) -> Point:
     case: Case = {"depth_mm": depth}
     took = more.pop("took", CHEAP_FIRST.get(method, 1e-3))
-    told = {"in_range": True} | more
-    return Point(method, case, case, median_s=took, p99_s=took, error=error, **told)
+    reported = {"in_range": True} | more
+    return Point(method, case, case, median_s=took, p99_s=took, error=error, **reported)
 
 
 def chosen_of(points: Sequence[Point], *, margin: float = 0.2) -> tune.MethodEvaluation:
@@ -156,8 +156,8 @@ def test_slow_methods_are_measured_only_if_no_other_is_sufficient(
 
 
 def choice_of(points: Sequence[Point], key: str = "marker") -> tune.Choice:
-    judged = evaluate_methods(points, SETTINGS, tolerance=1.0)
-    return tune.Choice("made-up", key, "mm", 1.0, choose(judged), tuple(judged))
+    checked = evaluate_methods(points, SETTINGS, tolerance=1.0)
+    return tune.Choice("made-up", key, "mm", 1.0, choose(checked), tuple(checked))
 
 
 def test_a_sentence_gives_the_reason() -> None:
@@ -247,8 +247,8 @@ def test_choices_on_one_line_are_unfolded() -> None:
 
 def scene_choice() -> tune.Choice:
     settings: dict[str, tune.Setting] = {"cheap": {"method": "linear", "skin_spacing_m": 0.006}}
-    judged = evaluate_methods([point("cheap", 0.1)], settings, tolerance=1.0)
-    return tune.Choice("soft-body", "soft_body", "mm", 1.0, judged[0], tuple(judged))
+    checked = evaluate_methods([point("cheap", 0.1)], settings, tolerance=1.0)
+    return tune.Choice("soft-body", "soft_body", "mm", 1.0, checked[0], tuple(checked))
 
 
 def test_a_scene_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -463,8 +463,8 @@ def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path:
     assert choose_method(table, "auto", "auto") == ("auto", 0.0045)
     for by_hand_m, effective in (("auto", "0.0045"), (0.003, "0.003")):
         method, spacing_m = choose_method(table, "auto", by_hand_m)
-        said = SoftBodyFactory(spacing_m, tmp_path).pending_note(table, method, [])
-        assert said.endswith(f"--skin-spacing {effective}")
+        printed = SoftBodyFactory(spacing_m, tmp_path).pending_note(table, method, [])
+        assert printed.endswith(f"--skin-spacing {effective}")
         dragging = SoftBodyFactory(spacing_m, tmp_path, friction_ratio=0.3)
         assert dragging.pending_note(table, method, []) == "", "there never is a table"
     assert SoftBodyFactory(0.006, tmp_path).pending_note(linear, "auto", []) == ""
@@ -474,9 +474,9 @@ SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})
 
 
 def test_a_missing_force_table_is_replaced_and_reported(tmp_path: Path) -> None:
-    law, told = load_force_model(SCENE, "table", tmp_path)
+    law, reported = load_force_model(SCENE, "table", tmp_path)
     assert law.name == "scaled"
-    assert "flexsheet precompute" in told
+    assert "flexsheet precompute" in reported
     assert load_force_model(SCENE, "scaled", tmp_path) == (law, "scaled")
 
 

@@ -201,13 +201,13 @@ def test_a_boards_images_come_from_the_seed(rig: StereoCamera) -> None:
 
 
 def test_boards_that_cannot_be_drawn_are_rejected(rig: StereoCamera, chessboard: TwinBoard) -> None:
-    for change, said in (
+    for change, printed in (
         ({"marker_m": None}, "needs marker_m"),
         ({"marker_m": 0.03}, "does not fit"),
         ({"dictionary": "DICT_9X9"}, "OpenCV has none"),
         ({"columns": 30}, "larger dictionary"),
     ):
-        with pytest.raises(BoardError, match=said):
+        with pytest.raises(BoardError, match=printed):
             TwinBoard(rig, CHARUCO.model_copy(update=change), seed=1)
     with pytest.raises(BoardError, match="further away"):
         chessboard.pair(transform(np.eye(3), [0.0, 0.0, -0.3]))
@@ -539,17 +539,17 @@ def test_the_bound_widens_with_defocus_speed_and_saturation(disc: TwinCamera) ->
 
 def test_a_saturated_pixel_has_no_information_and_a_dark_one_all_of_it() -> None:
     sensor = Sensor()
-    told = pixel_information(sensor, np.array([100.0, 230.0, 255.0, 300.0]))
+    reported = pixel_information(sensor, np.array([100.0, 230.0, 255.0, 300.0]))
     noise_sq = np.array([100.0, 230.0, 255.0]) / 40.0 + 2.25 + 1.0 / 12.0
-    assert told[:2] == pytest.approx(1.0 / noise_sq[:2], rel=1e-6)
+    assert reported[:2] == pytest.approx(1.0 / noise_sq[:2], rel=1e-6)
     # At its mean, a cut normal keeps 1/2 + 1/pi of the information.
-    assert told[2] * noise_sq[2] == pytest.approx(0.5 + 1.0 / np.pi, rel=1e-6)
-    assert told[3] < 1e-12
+    assert reported[2] * noise_sq[2] == pytest.approx(0.5 + 1.0 / np.pi, rel=1e-6)
+    assert reported[3] < 1e-12
 
 
 def test_there_is_no_bound_if_the_marker_is_not_visible(rig: StereoCamera) -> None:
-    for place, said in (([0.0, 0.25, 0.9], "behind"), ([0.6, 0.0, 0.0], "outside the")):
-        with pytest.raises(BoundError, match=said):
+    for place, printed in (([0.0, 0.25, 0.9], "behind"), ([0.6, 0.0, 0.0], "outside the")):
+        with pytest.raises(BoundError, match=printed):
             fingertip_bound(looking(rig), lambda _, p=place: np.array(p), exposure_s=0.004)
     with pytest.raises(BoundError, match="right view"):
         fingertip_bound(looking(rig, covered(1.0, views="right")), still, exposure_s=0.004)

@@ -127,9 +127,9 @@ def test_speed_stays_below_the_paths_own() -> None:
     ],
 )
 def test_paths_that_cannot_be_followed_are_rejected(
-    times: list[float], points: list[list[float]], said: str
+    times: list[float], points: list[list[float]], printed: str
 ) -> None:
-    with pytest.raises(FingerPathError, match=said):
+    with pytest.raises(FingerPathError, match=printed):
         motion_along(times, points)
 
 
@@ -218,8 +218,8 @@ def test_the_real_recording_is_laid_on_the_object(scene: Scene) -> None:
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n", "a path needs at least two"),
     ],
 )
-def test_a_bad_recording_is_rejected(tmp_path: Path, scene: Scene, text: str, said: str) -> None:
-    with pytest.raises(FingerPathError, match=said):
+def test_a_bad_recording_is_rejected(tmp_path: Path, scene: Scene, text: str, printed: str) -> None:
+    with pytest.raises(FingerPathError, match=printed):
         recorded_path(write_recording(tmp_path / "hand.csv", text), scene)
     with pytest.raises(FingerPathError, match="cannot be read"):
         recorded_path(tmp_path / "absent.csv", scene)

@@ -85,17 +85,17 @@ def test_the_lag_of_marker_sheet_and_indentation_is_reported(lag_s: float) -> No
     pictures = stroke.DrawnFrames([], [], [])
     for light_s in np.arange(0.1, 12.0, 1 / 15):
         pictures.add(frame(float(light_s), lag_s, 2.0 * lag_s, 0.02))
-    told = stroke.visible_lag_ms(recording(pictures), SECONDS)
-    assert told["fingertip"] == pytest.approx(1e3 * lag_s, abs=0.5)
-    assert told["sheet"] == pytest.approx(2e3 * lag_s, abs=0.5)
-    assert told["object"] == pytest.approx(20.0)
+    reported = stroke.visible_lag_ms(recording(pictures), SECONDS)
+    assert reported["fingertip"] == pytest.approx(1e3 * lag_s, abs=0.5)
+    assert reported["sheet"] == pytest.approx(2e3 * lag_s, abs=0.5)
+    assert reported["object"] == pytest.approx(20.0)
 
 
 def test_too_few_images_give_no_lag() -> None:
     pictures = stroke.DrawnFrames([], [], [])
     pictures.add(frame(3.0, 0.0, 0.0, 0.0))
     pictures.add(frame(3.1, 0.0, 0.0, 0.0).model_copy(update={"light_ns": 0}))
-    told = stroke.visible_lag_ms(recording(pictures), SECONDS)
-    assert told == {"fingertip": None, "sheet": None, "object": 0.0}
+    reported = stroke.visible_lag_ms(recording(pictures), SECONDS)
+    assert reported == {"fingertip": None, "sheet": None, "object": 0.0}
     empty = stroke.visible_lag_ms(recording(stroke.DrawnFrames([], [], [])), SECONDS)
     assert empty["object"] is None

@@ -255,9 +255,12 @@ def run_proposal(
     errors = rows[NOMINAL][configuration.name]
     figures = {
         metric: max(
-            read_value(row, f"{metric.value}.p95")
-            for row in (errors, *speeds)
-            if metric.value in row
+            (
+                read_value(row, f"{metric.value}.p95")
+                for row in (errors, *speeds)
+                if metric.value in row
+            ),
+            default=math.nan,
         )
         for metric in SystemMetric
         if metric is not SystemMetric.SKIN
