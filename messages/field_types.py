@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -18,6 +19,23 @@ def describe_field_type(field: FieldInfo) -> str:
         if isinstance(extra, ArraySpec):
             return _array(extra)
     return _type(field.annotation)
+
+
+def describe_field(field: FieldInfo) -> dict[str, str]:
+    """Return a field's type without Markdown, its default or "required", and its description."""
+    # Links keep their text only.
+    kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
+    return {
+        "type": re.sub(r"[`\\]", "", kind),
+        "default": "required" if field.is_required() else _default(field),
+        "description": field.description or "",
+    }
+
+
+def _default(field: FieldInfo) -> str:
+    if field.default_factory is not None:
+        return "empty"
+    return str(field.default)
 
 
 def get_annotation(field: FieldInfo) -> Any:

@@ -248,7 +248,7 @@ def without(key: str) -> Callable[[str], str]:
 
 
 @pytest.mark.parametrize(
-    ("corrupt", "said"),
+    ("corrupt", "printed"),
     [
         (
             lambda text: text.replace("version: 2", "version: 1", 1),

@@ -120,7 +120,7 @@ def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "printed"),
     [
         ({"marker_m": 0.04}, "markers of 40 mm do not fit into squares of 40 mm"),
         ({"dictionary": "DICT_9X9"}, "an OpenCV dictionary, such as DICT_4X4_50"),
@@ -402,7 +402,7 @@ def test_images_are_taken_from_the_camera_source(
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "printed"),
     [
         ((), "exactly one source of images"),
         (("--left", "a*.png"), "exactly one source of images"),

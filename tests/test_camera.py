@@ -193,7 +193,7 @@ async def test_the_twins_images_are_left_alone_by_a_real_camera(
 
 
 @pytest.mark.parametrize(
-    ("source", "said"),
+    ("source", "printed"),
     [
         (lambda p: VideoSource(kind="video", left=p / "absent.avi"), "absent.avi: file not found"),
         (lambda p: VideoSource(kind="video", left=p / "text.avi"), "cannot be opened"),

@@ -205,7 +205,7 @@ def test_one_looping_pair_comes_at_the_given_rate(scene: Scene, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "printed"),
     [
         ("t_ms\n1\n2\n", r"times\.csv: no column t_s"),
         ("", r"times\.csv: no column t_s"),

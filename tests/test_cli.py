@@ -312,7 +312,21 @@ def test_info_shows_the_graph(flexsheet: Command, running: Path) -> None:
     described = flexsheet("topic", "info", "twin/finger", "--json").json()
     assert described["writers"] == ["beacon"]
     assert described["readers"] == ["listener", "recorder"]
-    assert "path_time_s" in described["fields"]
+    assert described["fields"]["path_time_s"]["type"].startswith("float")
+
+
+def test_info_gives_type_default_and_description(flexsheet: Command) -> None:
+    fields = flexsheet("topic", "info", "sheet_target", "--json").json()["fields"]
+    assert fields["push_depth_m"] == {
+        "type": "float",
+        "default": "required",
+        "description": "depth of the fingertip below the surface of the undeformed object",
+    }
+    assert fields["trajectory"]["type"] == "SheetTrajectory or none"
+    assert (fields["trajectory"]["default"], fields["normal_offset_m"]["default"]) == (
+        "None",
+        "0.0",
+    )
 
 
 def test_bandwidth_and_delay_are_measured_per_writer(flexsheet: Command, running: Path) -> None:
@@ -362,7 +376,7 @@ def test_a_parameter_is_read_and_changed_in_the_running_graph(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "printed"),
     [
         (("set", "beacon.rate_hz", "9"), 2, "start the graph again with --set beacon.rate_hz=9"),
         (("set", "listener.patience_s", "soon"), 2, "listener.patience_s=soon: invalid value"),
@@ -583,6 +597,10 @@ def test_a_missing_graph_is_reported(
     printed = flexsheet("topic", "echo", "twin/finger")
     assert printed.code == 1
     assert "no graph is running" in printed.err
+    runs.create_run()
+    printed = flexsheet("topic", "echo", "twin/finger")
+    assert printed.code == 1
+    assert "the graph is starting" in printed.err
 
 
 def test_doctor_examines_the_machine(flexsheet: Command, runs_root: Path) -> None:

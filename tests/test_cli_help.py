@@ -236,7 +236,7 @@ def test_files_are_offered_by_their_suffix(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "printed"),
     [
         (["topc"], "topic"),
         (["bag", "verfy"], "verify"),

@@ -255,7 +255,7 @@ def test_tags_of_python_are_nothing_but_text(tmp_path: Path, tag: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "printed"),
     [
         ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1e300\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n", "exceeds"),
         (

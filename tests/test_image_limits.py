@@ -125,7 +125,7 @@ def test_what_pushes_the_sheet(tip: tuple[float, float, float], pushes: bool) ->
 
 
 @pytest.mark.parametrize(
-    ("tip", "said"),
+    ("tip", "printed"),
     [
         ((0.0, 0.119, -0.01), "too close to the sheet's edge"),
         ((0.125, 0.0, -0.01), "too close to the sheet's edge"),

@@ -88,7 +88,7 @@ def test_a_lag_beyond_the_range_is_not_given_as_its_edge() -> None:
 
 
 @pytest.mark.parametrize(
-    ("times", "follower", "leader", "said"),
+    ("times", "follower", "leader", "printed"),
     [
         (np.arange(100) * 0.01, np.zeros((100, 3)), np.zeros((99, 3)), "expected one row per time"),
         (np.arange(100) * 0.01, np.zeros((100, 3)), np.zeros((100, 2)), "the same axes"),

@@ -98,7 +98,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "printed"),
     [
         ("", "is empty"),
         ("- a\n", "write a mapping of keys and values"),
@@ -207,7 +207,7 @@ def test_a_wrong_key_in_a_scene_names_file_and_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("setting", "said"),
+    ("setting", "printed"),
     [
         ("beacon", "write node.parameter=value"),
         ("beacn.rate_hz=3", 'unknown node "beacn"; did you mean "beacon"?'),
@@ -328,7 +328,7 @@ nodes:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "printed"),
     [
         ("extends: demmo\n", 'graph.yaml:1: extends: "demmo" does not exist; name a file, or a'),
         ("extends: graph.yaml\n", "graph.yaml:1: extends: "),
@@ -397,7 +397,7 @@ def test_a_bridge_shares_its_process_with_its_own_simulator(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "printed"),
     [
         (f'"{BEACON}"}}', f'"{BEACON}", process: arm}}', 'fault of "beacon" would stop the arm'),
         ("port: 5020", "port: 5022", 'fault of "twin_arms" would stop the arm of "bridge"'),

@@ -128,7 +128,7 @@ def test_a_tiny_number_is_rejected_or_is_a_coordinate(where: tuple[str, Key], va
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("key", "value", "printed"),
     [
         (("object", "geometry", "radius_m"), 1e300, "object.geometry.radius_m"),
         (("projector", "width_px"), 2_000_000_000, "projector.width_px"),

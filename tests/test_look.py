@@ -174,7 +174,7 @@ def test_a_scene_file_names_its_image(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("appearance", "told"),
+    ("appearance", "reported"),
     [
         ("texture: image, image_file: gone.png", 'image_file.*"gone.png".*No such file'),
         ("texture: image, image_file: skin.tif", r"convert the file to \.png"),

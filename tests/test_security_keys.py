@@ -189,7 +189,7 @@ ONE, TWO = make_key_pair()[0], make_key_pair()[0]
 
 
 @pytest.mark.parametrize(
-    ("main", "left", "said"),
+    ("main", "left", "printed"),
     [
         (
             ONE,

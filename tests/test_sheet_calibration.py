@@ -203,7 +203,7 @@ def test_rows_are_read_with_their_lines(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "printed"),
     [
         ("", "rows.csv: is empty"),
         ("stretch_ratio,depth_mm,force_n\n", "does not contain rows"),

@@ -118,7 +118,7 @@ def test_speed_stays_below_the_paths_own() -> None:
 
 
 @pytest.mark.parametrize(
-    ("times", "points", "said"),
+    ("times", "points", "printed"),
     [
         ([], [], "at least one"),
         ([0.0, 1.0], [[0.0, 0, 0]], "one time per point"),
@@ -208,7 +208,7 @@ def test_the_real_recording_is_laid_on_the_object(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "printed"),
     [
         ("", "no column t_s"),
         ("t_s,x_mm,y_mm\n0,1,2\n", "no column z_mm"),

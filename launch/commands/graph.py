@@ -41,7 +41,10 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
                 f"--run {directory}: the folder does not contain plan.json; name a run directory"
             )
     else:
-        ready = [run for run in list_live_runs() if run.plan_file.is_file()]
+        live = list_live_runs()
+        ready = [run for run in live if run.plan_file.is_file()]
+        if live and not ready:
+            raise NoGraphError("the graph is starting; repeat the command in some seconds")
         if not ready:
             raise NoGraphError("no graph is running; start one with: flexsheet launch FILE")
         run = ready[0]

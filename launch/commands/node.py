@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -121,15 +120,7 @@ def _find_topic(node: ResolvedNode, port: str) -> str | None:
     return next((one.topic for one in ports if one.port == port and one.endpoints), None)
 
 
-def _parameter(name: str, field: Any) -> dict[str, Any]:
-    from flexsheet.messages.field_types import describe_field_type
+def _parameter(name: str, field: Any) -> dict[str, str]:
+    from flexsheet.messages.field_types import describe_field
 
-    # This is the text of docs/parameters.md without Markdown links and escapes.
-    kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
-    kind = re.sub(r"[`\\]", "", kind)
-    return {
-        "parameter": name,
-        "type": kind,
-        "default": "required" if field.is_required() else str(field.get_default()),
-        "about": field.description or "",
-    }
+    return {"parameter": name, **describe_field(field)}

@@ -71,12 +71,12 @@ def list_topics(as_json: JsonOption = False) -> None:
 @app.command(epilog=examples("flexsheet topic info fingertip"))
 def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = False) -> None:
     """Print the type and fields of a topic, and its writers and readers in the running graph."""
+    from flexsheet.messages.field_types import describe_field
+
     found = _find_topic(topic)
     description = _describe(found)
-    schema = found.message.model_json_schema()
     description["fields"] = {
-        name: field.get("description") or field.get("type") or field.get("$ref", "").split("/")[-1]
-        for name, field in schema["properties"].items()
+        name: describe_field(field) for name, field in found.message.model_fields.items()
     }
     try:
         plan, _ = running_graph(run)
@@ -99,7 +99,13 @@ def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = Fals
         for name, value in description.items()
     )
     print()
-    print_table(("field", "description"), fields.items())
+    print_table(
+        ("field", "default", "type and description"),
+        (
+            (name, field["default"], ": ".join(filter(None, (field["type"], field["description"]))))
+            for name, field in fields.items()
+        ),
+    )
 
 
 @app.command(

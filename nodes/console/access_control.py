@@ -11,11 +11,12 @@ from __future__ import annotations
 import asyncio
 import hmac
 import http
+import io
 import ipaddress
 import logging
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from functools import partial
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
@@ -233,7 +234,8 @@ def start_server(address: str, port: int, access: AccessControl, label: str) -> 
     ConsoleError, also if this version of viser starts its server in another way.
     """
     _check_port_is_free(address, port)
-    with _checking(access) as checked_servers:
+    # viser prints its address before the graph is ready; the launcher prints it afterwards.
+    with _checking(access) as checked_servers, redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=address, port=port, label=label, verbose=False)
     if not checked_servers:
         server.stop()
