@@ -623,6 +623,7 @@ def test_a_robustness_trial_commissions_its_laboratory(
     figures = {
         "stroke": errors,
         "at_rest": {"after": {"image_mm": 0.6, "force_percent": 2.0}},
+        "at_working_speed": {"fingertip_mm": 0.2},
         "flagged": [],
         "predicted": {"image_mm": PREDICTED},
         "doubts": ["the image"],

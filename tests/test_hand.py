@@ -320,23 +320,25 @@ def measure_response(
 ) -> Response:
     """Fit a decaying oscillation to the depth after the push, and return its parameters.
 
+    A cubic polynomial is fitted with it, because the sheet's offset continues to change slowly.
     depths, forces: times (n,) on the path, s, and values (n,) in m and N, until the steady state.
     """
-    times, depth_m = depths
-    after = times > PUSHED_S
+    after = depths[0] > PUSHED_S
+    times, depth_m = depths[0][after] - PUSHED_S, depths[1][after]
 
     def oscillation(t: Floats, *given: float) -> Floats:
-        rest, size, decay, hz, phase = given
-        angle = 2.0 * np.pi * hz * (t - PUSHED_S) + phase
-        return np.asarray(rest + size * np.exp(-decay * (t - PUSHED_S)) * np.cos(angle))
+        size, decay, hz, phase, *drift = given
+        wave = size * np.exp(-decay * t) * np.cos(2.0 * np.pi * hz * t + phase)
+        return np.asarray(wave + np.polyval(drift, t))
 
     pace = math.sqrt((hand.stiffness_n_per_m + STIFFNESS_N_PER_M) / hand.mass_kg)
     decay = hand.damping_ratio * math.sqrt(hand.stiffness_n_per_m / hand.mass_kg)
-    start = (float(depth_m[-1]), 1e-3, decay, pace / (2.0 * np.pi), 0.0)
-    (rest_m, _, decay, hz, _), _ = curve_fit(
-        oscillation, times[after], depth_m[after], start, x_scale=[1e-3, 1e-3, 1.0, 1.0, 1.0],
+    start = (1e-3, decay, pace / (2.0 * np.pi), 0.0, 0.0, 0.0, 0.0, float(depth_m[-1]))
+    (_, decay, hz, _, *drift), _ = curve_fit(
+        oscillation, times, depth_m, start, x_scale=[1e-3, 1.0, 1.0, 1.0, *4 * [1e-3]],
         method="trf",
     )  # fmt: skip
+    rest_m = np.polyval(drift, times[-1])
     steady = forces[0] > forces[0][-1] - 0.2
     return Response(
         float(forces[1][steady].mean()), float(rest_m), float(forces[1].max()), float(hz),

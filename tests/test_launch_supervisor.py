@@ -254,12 +254,12 @@ async def test_a_hung_node_is_killed_with_a_stack_trace_and_restarted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One process is stopped, and the loop of another hangs; the third is healthy."""
-    monkeypatch.setattr(supervisor, "STOP_GRACE_S", 0.2)  # of the deaf node, at the end
+    monkeypatch.setattr(supervisor, "STOP_GRACE_S", 0.2)  # of the unreachable node, at the end
     quiet = {"topics": {"twin__finger": None}, "liveness_s": 2.0, "restart": {"delay_s": 0.01}}
     plan = plan_of(
         tmp_path,
         stopped=beacon(**quiet),
-        stuck=beacon(**quiet, parameters={"deaf": True}),
+        stuck=beacon(**quiet, parameters={"unreachable": True}),
         beacon=beacon(liveness_s=2.0),
     )
     printed: list[str] = []
@@ -371,7 +371,7 @@ async def test_a_node_that_ignores_signals_is_killed_with_its_children(
     tmp_path: Path, runs_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor, "STOP_GRACE_S", 0.2)
-    plan = plan_of(tmp_path, beacon=beacon(parameters={"deaf": True, "with_child": True}))
+    plan = plan_of(tmp_path, beacon=beacon(parameters={"unreachable": True, "with_child": True}))
     async with RunningGraph(plan) as graph:
         await graph.wait_ready(DEADLINE_S)
         assert len(processes_of(graph.run.id)) == 2
@@ -550,9 +550,9 @@ def test_a_killed_launcher_leaves_no_node_behind(
     nodes = {
         "beacon": beacon(parameters={"with_child": True}),
         "listener": LISTENER,
-        "deaf": {
+        "unreachable": {
             "type": "tests.launch_nodes:Beacon",
-            "parameters": {"deaf": True},
+            "parameters": {"unreachable": True},
             "topics": {"twin__finger": None},
         },
     }
@@ -566,7 +566,7 @@ def test_a_killed_launcher_leaves_no_node_behind(
     # Who ends in order removes its own.
     assert not [path for path in sockets_in(runs_root) if path.name.startswith(("beac", "listen"))]
     runs.sweep()
-    wait_until(lambda: not processes_of(run.id), "the deaf node and the child to end")
+    wait_until(lambda: not processes_of(run.id), "the unreachable node and the child to end")
     assert_nothing_left(runs_root)
 
 
