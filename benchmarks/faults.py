@@ -298,7 +298,7 @@ def table(cases: list[dict[str, Any]]) -> str:
     for one in cases:
         stopped, back = one["stopped_s"], one["back_s"]
         cells = [
-            one["trouble"],
+            one["problem"],
             "went on" if stopped is None else f"{stopped:.2f} s",
             "never" if back is None else "-" if stopped is None else f"{back:.1f} s",
             f"{one['followed']:.0%}",
