@@ -120,7 +120,7 @@ class LocalChannel:
         self._last = None
 
     def interrupt(self) -> None:
-        """Notify the readers that this writer sends no more messages for now."""
+        """Report to the readers that this writer is disconnected until its next message."""
         for reader in self._readers:
             reader.report_end()
 

@@ -53,7 +53,8 @@ class Sender:
     """Sender of packets to a node, and what the node has published."""
 
     def __init__(self, **parameters: Any) -> None:
-        self.clock, self.sent = VirtualClock(), []  # type: ignore[var-annotated]
+        self.clock = VirtualClock()
+        self.sent: list[tuple[str, Any]] = []
         self.node = OscInput(
             OscInputParameters(port=0, **parameters), name="osc", clock=self.clock,
             send=lambda topic, message, header: self.sent.append((topic.name, message)),
@@ -184,6 +185,13 @@ def test_streams_need_different_addresses() -> None:
     with pytest.raises(ValidationError, match="different addresses"):
         OscInputParameters(eye=None)
     assert OscInputParameters().host == "127.0.0.1"
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "::", "tracker"])
+def test_only_this_computer_can_send_positions(host: str) -> None:
+    with pytest.raises(ValidationError, match="not a loopback address"):
+        OscInputParameters(host=host)
+    assert OscInputParameters(host="::1").host == "::1"
 
 
 @pytest.mark.parametrize("fingertip", [False, True])

@@ -49,6 +49,7 @@ class RecordingSubscriber:
     inbox: list[tuple[Any, Header]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     counts: PortCounts = field(default_factory=PortCounts)
+    subscriber: Subscriber = field(init=False)
 
     def record(self, message: Any, header: Header) -> None:
         self.inbox.append((message, header))
@@ -90,7 +91,7 @@ class SecuredPublisher:
         )  # fmt: skip
         subscriber.start()
         self.cleanups.append(subscriber.close)
-        receiver.subscriber = subscriber  # type: ignore[attr-defined]  # for renewing its keys
+        receiver.subscriber = subscriber
         return receiver
 
     async def publish_until(self, publisher: Publisher, until_: Callable[[], object]) -> None:
@@ -150,7 +151,7 @@ async def test_a_new_key_of_ours_or_of_the_other_end_without_a_restart(
     secured: SecuredPublisher,
 ) -> None:
     sender, receiver = secured.sender(), secured.receiver(secured.rings["left"])
-    subscriber: Subscriber = receiver.subscriber  # type: ignore[attr-defined]  # see SecuredPublisher.ear
+    subscriber = receiver.subscriber
     await secured.publish_until(sender, lambda: receiver.inbox)
     secured.known.public["left"] = secured.known.make_key("left")
     for name in ("main", "left"):
@@ -454,7 +455,7 @@ def test_of_a_hundred_thousand_forgeries_none_is_accepted(topic: str) -> None:
         del receiver.inbox[2:]
     assert accepted.total() == 0, {kind: n for kind, n in accepted.items() if n}
     assert receiver.counts.rejected == tried.total() == 34_000
-    assert len(receiver.problems) <= 12, "each cause is told once"
+    assert len(receiver.problems) <= 12, "each cause is reported once"
     assert len(subscriber._writers_seen) == 1, "nobody makes it remember more"
     offer(plain(encode(message, replace(HEADER, sequence=2**63 - 1))))
     assert len(receiver.inbox) == 3, "the true writer is heard on"

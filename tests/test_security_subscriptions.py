@@ -231,7 +231,7 @@ async def test_an_address_has_a_limited_number_of_connections(
         while await asyncio.to_thread(fourth.recv, 100):
             pass
     assert "has 3 connections already" in secured.refused[0]
-    receivers[0].subscriber.close()  # type: ignore[attr-defined]  # see SecuredPublisher.ear
+    receivers[0].subscriber.close()
     successor = secured.receiver(secured.rings["left"])
     await secured.publish_until(publisher, lambda: successor.inbox)
 

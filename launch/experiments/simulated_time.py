@@ -57,7 +57,12 @@ from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlann
 from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
-from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
+from flexsheet.nodes.triangulator.tracking import (
+    PREDICTION_STEP_S,
+    Tracker,
+    TrackingSettings,
+    make_horizons_s,
+)
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.arms import ArmMechanics, Servo
@@ -78,7 +83,7 @@ READ_OUT_S, COMPUTING_S, SENDING_S = 0.004, 0.002, 0.001
 computation until the target is published, and transmission until an arm command uses it."""
 
 PIXEL_NOISE_PX = 0.02
-PREDICTION_STEP_S, PREDICTION_S = 0.01, 0.12
+PREDICTION_S = 0.12
 SERVO_LAG_S = 0.025
 """Servo lag of the simulated arms, unless the apparatus states it."""
 
@@ -131,7 +136,7 @@ class MeasuredFinger:
         self._tracker = Tracker(
             TRACKING_METHODS[settings.tracking](speed_m_per_s), TrackingSettings(speed_m_per_s)
         )
-        self._horizons_s = np.arange(0.0, PREDICTION_S + 1.5 * PREDICTION_STEP_S, PREDICTION_STEP_S)
+        self._horizons_s = make_horizons_s(PREDICTION_S)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
         """Measure the finger, whose true position and velocity at the timestamp are given, (3,).

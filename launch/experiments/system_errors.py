@@ -7,7 +7,7 @@ depend on the load of the computer. All errors are relative to the simulator's g
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -33,7 +33,7 @@ from flexsheet.launch.experiments.stroke import (
 from flexsheet.launch.experiments.true_geometry import ArmPair, place_edges
 from flexsheet.launch.methods.blocks import attribute_error
 from flexsheet.messages.apparatus import Apparatus
-from flexsheet.messages.methods import Methods, SoftBodyChoice
+from flexsheet.messages.methods import Methods, SoftBodyChoice, SoftBodyMethod
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, SoftBody
 from flexsheet.nodes.arrays import Floats
@@ -133,7 +133,7 @@ class ErrorEvaluator:
             else None,
         }
 
-    def _once(self, key: tuple[Any, ...], compute: Any) -> Any:
+    def _once(self, key: tuple[Any, ...], compute: Callable[[], Any]) -> Any:
         if key not in self._known:
             self._known[key] = compute()
         return self._known[key]
@@ -253,10 +253,10 @@ class RestingPush:
 
 
 @cache
-def _load_curve(scene_json: str, method: str, spacing_m: float) -> SoftBody:
+def _load_curve(scene_json: str, method: SoftBodyMethod, spacing_m: float) -> SoftBody:
     scene = Scene.model_validate_json(scene_json)
     factory = SoftBodyFactory(skin_spacing_m=spacing_m, cache_dir=default_cache_dir())
-    bodies = factory.bodies(scene, method, lambda *_: None)  # type: ignore[arg-type]
+    bodies = factory.bodies(scene, method, lambda *_: None)
     rest = bodies[0].at_rest()
     return make_soft_body(rest.force_curve, rest.stiffness_n_per_m)
 
@@ -266,15 +266,8 @@ def load_body(scene: Scene, choice: SoftBodyChoice | None) -> SoftBody:
 
     As in the solver node, the linear method replaces a table that is not computed.
     """
-    method, spacing_m = (
-        ("linear", 0.003)
-        if choice is None
-        else (
-            choice.method,
-            choice.skin_spacing_m,
-        )
-    )
-    return _load_curve(scene.model_dump_json(), method, spacing_m)
+    given = choice or SoftBodyChoice(method="linear", skin_spacing_m=0.003)
+    return _load_curve(scene.model_dump_json(), given.method, given.skin_spacing_m)
 
 
 def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: Any) -> Floats:

@@ -8,9 +8,13 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Fingertip, FingertipReason
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.adaptive import TRACKING_METHODS
-from flexsheet.nodes.triangulator.node import PREDICTION_STEP_S
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
-from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
+from flexsheet.nodes.triangulator.tracking import (
+    PREDICTION_STEP_S,
+    Tracker,
+    TrackingSettings,
+    make_horizons_s,
+)
 
 
 class ExternalFingertip:
@@ -31,8 +35,7 @@ class ExternalFingertip:
         self._tracker = Tracker(method(scene.finger.max_speed_m_per_s), settings)
         self._volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)
         self._covariance = np.eye(3) * noise_m**2
-        end_s = limits.prediction_horizon_s + 1.5 * PREDICTION_STEP_S
-        self._horizons_s = np.arange(0.0, end_s, PREDICTION_STEP_S)
+        self._horizons_s = make_horizons_s(limits.prediction_horizon_s)
 
     def update(self, at_ns: int, measured_m: Floats) -> Fingertip:
         """Return the fingertip after a measured position (3,), world, m."""

@@ -41,16 +41,18 @@ from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.self_checks import CameraCheck
 from flexsheet.nodes.triangulator.skew import compensate_detection_skew
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
-from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
+from flexsheet.nodes.triangulator.tracking import (
+    PREDICTION_STEP_S,
+    Tracker,
+    TrackingSettings,
+    make_horizons_s,
+)
 from flexsheet.nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     StereoGeometry,
     TriangulatedPoint,
     check_images,
 )
-
-PREDICTION_STEP_S = 0.01
-"""Time between the points of the predicted path, a tenth of the period of a 10 Hz tremor."""
 
 TIMEOUT_PERIODS = 2.5
 """Minimum timeout of a track in periods of the camera, so that one image pair may be missing."""
@@ -130,9 +132,7 @@ class Triangulator(Node):
             max_reprojection_px=p.max_reprojection_px,
             sensor=PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level),
         )
-        self.horizons_s = np.arange(
-            0.0, p.prediction_horizon_s + 1.5 * PREDICTION_STEP_S, PREDICTION_STEP_S
-        )
+        self.horizons_s = make_horizons_s(p.prediction_horizon_s)
         self.tracking = TrackingSettings(
             max_speed_m_per_s=scene.finger.max_speed_m_per_s,
             max_acceleration_m_per_s2=p.max_acceleration_m_per_s2,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import struct
 from collections import Counter
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.limits import LimitedModel
@@ -67,8 +68,8 @@ class OscInputParameters(NodeParameters):
 
     host: str = Field(
         default="127.0.0.1",
-        description="address on which the node listens. OSC has no authentication: on any address "
-        "except that of the loopback interface, everyone in the network can send positions",
+        description="loopback address on which the node listens. OSC has no authentication: run "
+        "this node on the computer that sends the positions",
     )
     port: Annotated[int, Field(ge=0, le=65535)] = Field(
         default=9000, description="UDP port; 0: any free port"
@@ -91,6 +92,20 @@ class OscInputParameters(NodeParameters):
     watch_hz: Positive = Field(
         default=20.0, description="rate at which missing messages are checked, Hz"
     )
+
+    @field_validator("host")
+    @classmethod
+    def _check_loopback(cls, host: str) -> str:
+        try:
+            is_loopback = ipaddress.ip_address(host).is_loopback
+        except ValueError:
+            is_loopback = False
+        if not is_loopback:
+            raise ValueError(
+                f'"{host}" is not a loopback address, and OSC has no authentication; use '
+                "127.0.0.1, and run osc_input on the computer that sends the positions"
+            )
+        return host
 
     @model_validator(mode="after")
     def _check_streams(self) -> Self:
@@ -168,15 +183,13 @@ class OscInput(Node):
     def _receive(self, data: bytes) -> None:
         """Publish the positions in a packet; count messages that are rejected or ignored."""
         now_ns = self.clock.now_ns()
+        if len(data) > MAX_PACKET_BYTES:
+            self.rejected[Rejection.MALFORMED] += 1
+            return
         try:
-            if len(data) > MAX_PACKET_BYTES:
-                raise RejectedError(Rejection.MALFORMED)
-            try:
-                messages = list(read_packet(data))
-            except (ValueError, struct.error) as error:
-                raise RejectedError(Rejection.MALFORMED) from error
-        except RejectedError as error:
-            self.rejected[error.reason] += 1
+            messages = list(read_packet(data))
+        except (ValueError, struct.error):
+            self.rejected[Rejection.MALFORMED] += 1
             return
         for address, numbers in messages:
             if address not in self._inputs:

@@ -22,8 +22,16 @@ ok: added to the track.  too_fast: farther away than a finger can move.  unconfi
 start a track, or arrived late; a late point is inserted into the track or dropped.
 """
 
+PREDICTION_STEP_S = 0.01
+"""Time between the points of the predicted path, a tenth of the period of a 10 Hz tremor."""
+
 GATE_SIGMAS = 5.0
 """Margin of the gate for measurement and prediction errors, in their standard deviations."""
+
+
+def make_horizons_s(longest_s: float) -> Floats:
+    """Return the horizons (n,), s, of the points of a predicted path that exceeds `longest_s`."""
+    return np.arange(0.0, longest_s + 1.5 * PREDICTION_STEP_S, PREDICTION_STEP_S)
 
 
 @dataclass(frozen=True, slots=True)
