@@ -493,14 +493,11 @@ class Laboratory:
             )
             for side, lag in found.servo.items()
         ]
-        for name, node_type, parameter, delay in (
-            ("stamp_offset", "camera", "stamp_offset_s", found.stamp_offset),
-        ):
-            if delay is not None:
-                measured[name] = delay
-                value = round(delay.lag_s, 5)
-                values.append(NodeValue(node_type=node_type, parameter=parameter, value=value))
         stamp = found.stamp_offset
+        if stamp is not None:
+            measured["stamp_offset"] = stamp
+            value = round(stamp.lag_s, 5)
+            values.append(NodeValue(node_type="camera", parameter="stamp_offset_s", value=value))
         return StepResult(
             residual=1e3 * max(one.uncertainty_s for one in measured.values()),
             unit="ms",
