@@ -489,9 +489,11 @@ async def test_the_nodes_and_the_simulation_without_nodes_agree(
 
 @dataclass(frozen=True, slots=True)
 class GraphRun:
-    """Push in a running graph: response of the hand, force curve of the object, and delay (s)."""
+    """Push in a running graph: motion and force of the finger, force curve of the object, delay."""
 
-    response: Response
+    times_s: Floats
+    depths_m: Floats
+    forces_n: Floats
     curve: Floats
     delay_s: float
 
@@ -518,10 +520,10 @@ def push_in_graph(hand: HandImpedance, path: FingerPath, folder: Path) -> GraphR
     run_experiment(
         DEMO, settings, bag, procedure, print, apparatus=str(apparatus), without=[Feature.IMAGE]
     )
-    return read_push(hand, path, bag)
+    return read_push(path, bag)
 
 
-def read_push(hand: HandImpedance, path: FingerPath, bag: Path) -> GraphRun:
+def read_push(path: FingerPath, bag: Path) -> GraphRun:
     times, forces, depths, delays, curve = [], [], [], [], CURVE
     for _, message, header, _ in BagReader(
         bag, topics=["twin/finger", "sheet_target", "soft_body"]
@@ -539,13 +541,13 @@ def read_push(hand: HandImpedance, path: FingerPath, bag: Path) -> GraphRun:
                 pass
     before = np.array(times) < path.times_s[-1] - 0.1
     at_s, depths_m, forces_n = (np.array(values)[before] for values in (times, depths, forces))
-    response = measure_response(hand, (at_s, depths_m), (at_s, forces_n))
-    return GraphRun(response, curve, float(np.median(delays)))
+    return GraphRun(at_s, depths_m, forces_n, curve, float(np.median(delays)))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("hand", SLOW_HANDS)
 def test_the_running_graph_and_the_simulation_agree(hand: HandImpedance, tmp_path: Path) -> None:
+    """Compare the motions, because a fit of a well-damped oscillation is ill-conditioned."""
     path = make_push(PUSH_M, 2.5)
     graph = push_in_graph(hand, path, tmp_path)
     fixed_s = 0.5 * SCENE.camera.exposure_s + READ_OUT_S + SENDING_S + SERVO_LAG_S
@@ -559,4 +561,11 @@ def test_the_running_graph_and_the_simulation_agree(hand: HandImpedance, tmp_pat
         settings=LoopSettings(computing_s=graph.delay_s - fixed_s),
     )
     assert recorded.delay_s == pytest.approx(graph.delay_s, abs=0.004)
-    assert_agree(graph.response, measure_recorded(hand, recorded, path))
+    expected_m = np.interp(
+        graph.times_s, recorded.times_s - SETTLING_S, -recorded.positions_m[:, 2]
+    )
+    assert np.abs(graph.depths_m - expected_m).max() < 0.1 * expected_m.max()
+    expected = measure_recorded(hand, recorded, path)
+    steady = graph.times_s > graph.times_s[-1] - 0.2
+    assert graph.forces_n[steady].mean() == pytest.approx(expected.steady_n, rel=0.1)
+    assert graph.forces_n.max() == pytest.approx(expected.peak_n, rel=0.1)
