@@ -10,7 +10,7 @@ give the force and its uncertainty. All lengths are in finger radii, forces in Y
 the square of the finger radius.
 
 felupe (GPL) and pypardiso are tools for development, not dependencies: `pip install felupe
-pypardiso`. A run takes 10 to 40 minutes of one core. Solved curves in FILE are kept, so that an
+pypardiso`. A run takes a few minutes of one core. Solved curves in FILE are kept, so that an
 interrupted run continues.
 """
 
@@ -132,9 +132,12 @@ class SphereContact:
 
 
 class FelupeBody:
-    """Neo-Hookean cylinder of felupe with the contact of a rigid sphere."""
+    """Neo-Hookean cylinder of felupe with the contact of a rigid sphere.
 
-    def __init__(self, push: Push) -> None:
+    isochoric: use a law that separates the change of volume from that of the form.
+    """
+
+    def __init__(self, push: Push, *, isochoric: bool = False) -> None:
         import felupe
         from pypardiso import PyPardisoSolver
 
@@ -148,7 +151,11 @@ class FelupeBody:
         )
         nu = push.poisson_ratio
         shear, bulk = 0.5 / (1.0 + nu), 1.0 / (3.0 * (1.0 - 2.0 * nu))
-        self._law = felupe.NeoHookeCompressible(mu=shear, lmbda=bulk - 2.0 / 3.0 * shear)
+        self._law = (
+            felupe.NeoHooke(mu=shear, bulk=bulk)
+            if isochoric
+            else felupe.NeoHookeCompressible(mu=shear, lmbda=bulk - 2.0 / 3.0 * shear)
+        )
         grid = felupe.Mesh(self.mesh.points, self.mesh.cells, "hexahedron27")
         self._region = felupe.RegionTriQuadraticHexahedron(grid)
         if self._region.dV.min() <= 0.0:

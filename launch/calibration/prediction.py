@@ -81,6 +81,13 @@ CREEP_RATIO_PER_DECADE, CREEP_STD = 0.05, 0.02
 
 MAX_HYSTERESIS_RATIO = 0.9
 
+IMAGE_MODEL_STD_M = 6e-5
+"""Image error that remains if all calibrated parameters are exact, m (root mean square).
+
+The causes are the lens of the projector and the calculated shape of the sheet. The value is from
+the simulated laboratories 0 to 11.
+"""
+
 
 class PredictedError(LimitedModel):
     """Predicted error of one metric, in the unit of the metric.
@@ -151,6 +158,8 @@ def predict_errors(
             continue
         if metric is Metric.SHEET:
             errors = np.hypot(errors, 1e3 * tracking_m)
+        elif metric is Metric.IMAGE:
+            errors = np.hypot(errors, 1e3 * IMAGE_MODEL_STD_M)
         # With few samples, the quantile of a fitted normal distribution is more certain than the
         # empirical quantile.
         high = float(errors.mean() + NORMAL_95 * errors.std(ddof=1))

@@ -1,0 +1,192 @@
+"""Compare the stored force reference with the finite-element program CalculiX.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.force_witness [SCENE_FILE] [--scale 2] [--json]
+
+CalculiX solves the push of the reference's first position with its own 20-node hexahedra, contact
+(surface to surface) and equation solver. Its neo-Hookean law separates the change of volume, which
+that of the reference does not. Therefore felupe solves the same mesh with both laws, and the ratio
+of these forces converts the force of CalculiX. Lengths are in finger radii, forces in Young's
+modulus times squared finger radius.
+
+CalculiX (the program `ccx`, Debian package `calculix-ccx`, GPL), felupe and pypardiso are tools for
+development, not dependencies. A run takes about half an hour of one core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.force_reference import (
+    DEPTHS,
+    PENALTY,
+    SCALES,
+    SCENE_FILE,
+    FelupeBody,
+    Push,
+    reference_pushes,
+)
+from benchmarks.hexahedra import HexMesh, cylinder_hexahedra
+from flexsheet.launch.experiments.force_reference import REFERENCE_FILE
+from flexsheet.launch.plans.plan import load_scene
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MAX_DEPTH = 10.0 / 7.0
+"""Maximum depth in finger radii. Contact of CalculiX did not converge at larger depths."""
+SUBDIVISIONS = 4
+"""Subdivisions of the icosahedron that represents the finger."""
+SHELL_RATIO = 0.9
+"""Inner radius of the shell of wedges whose outer surface is the finger."""
+INCREMENT = 0.1
+"""First increment of each load step, as a fraction of the step."""
+
+
+class WitnessError(RuntimeError):
+    """Raised if CalculiX is missing or does not converge."""
+
+
+def make_icosphere(subdivisions: int) -> tuple[Floats, Ints]:
+    """Return points (n, 3) and triangles (m, 3) of a sphere with the volume of the unit sphere."""
+    golden = 0.5 * (1.0 + 5.0**0.5)
+    corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+    points = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners])
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    edge = 1.01 * np.linalg.norm(points[1:] - points[0], axis=1).min()
+    near = np.linalg.norm(points[:, None] - points, axis=2) < edge
+    triples = [
+        (i, j, k)
+        for i in range(12)
+        for j in range(i + 1, 12)
+        for k in range(j + 1, 12)
+        if near[i, j] and near[j, k] and near[i, k]
+    ]
+    outward = [np.linalg.det(points[list(one)]) > 0.0 for one in triples]
+    triangles = np.array(
+        [one if out else one[::-1] for one, out in zip(triples, outward, strict=True)]
+    )
+    for _ in range(subdivisions):
+        edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
+        unique, number = np.unique(edges, axis=0, return_inverse=True)
+        middles = points[unique].mean(axis=1)
+        middles /= np.linalg.norm(middles, axis=1)[:, None]
+        a, b, c = triangles.T
+        ab, bc, ca = (len(points) + number.reshape(-1, 3)).T
+        triangles = np.concatenate(
+            [np.column_stack(one) for one in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        )
+        points = np.concatenate([points, middles])
+    volume = np.linalg.det(points[triangles]).sum() / 6.0
+    return points * (4.0 * np.pi / 3.0 / volume) ** (1.0 / 3.0), triangles
+
+
+def write_deck(mesh: HexMesh, push: Push, centre: Floats, depths: Sequence[float]) -> str:
+    """Return the input of CalculiX for pushes to the depths, one load step each.
+
+    centre (3,): centre of the finger at depth 0.
+    """
+    normal = centre / np.linalg.norm(centre[1:])
+    normal[0] = 0.0
+    cells = mesh.cells[:, :20]
+    used = np.unique(cells)
+    skin = set(mesh.faces.ravel().tolist())
+    touched = [
+        number for number, cell in enumerate(cells, 1) if skin.issuperset(cell[4:8].tolist())
+    ]
+    sphere, triangles = make_icosphere(SUBDIVISIONS)
+    triangles = triangles[(sphere[triangles] @ normal).min(axis=1) < 0.1]
+    kept, triangles = np.unique(triangles, return_inverse=True)
+    triangles = triangles.reshape(-1, 3)
+    first = len(mesh.points) + 1
+    outer = first + np.arange(len(kept))
+    inner = outer + len(kept)
+    shear = 0.5 / (1.0 + push.poisson_ratio)
+    bulk = 1.0 / (3.0 * (1.0 - 2.0 * push.poisson_ratio))
+    wedges = np.hstack([inner[triangles], outer[triangles]])
+    shell = [centre + ratio * sphere[kept] for ratio in (1.0, SHELL_RATIO)]
+    lines = [
+        "*NODE, NSET=NBODY", *_rows(used + 1, mesh.points[used]),
+        "*NODE, NSET=NBALL", *_rows(np.concatenate([outer, inner]), np.vstack(shell)),
+        "*ELEMENT, TYPE=C3D20, ELSET=BODY", *_elements(1, cells + 1),
+        "*ELEMENT, TYPE=C3D6, ELSET=BALL", *_elements(len(cells) + 1, wedges),
+        "*MATERIAL, NAME=SOFT", "*HYPERELASTIC, NEO HOOKE", f"{0.5 * shear:.12g}, {2.0 / bulk:.12g}",
+        "*SOLID SECTION, ELSET=BODY, MATERIAL=SOFT",
+        "*SOLID SECTION, ELSET=BALL, MATERIAL=SOFT",
+        "*SURFACE, NAME=SKIN, TYPE=ELEMENT", *(f"{number}, S2" for number in touched),
+        "*SURFACE, NAME=FINGER, TYPE=ELEMENT",
+        *(f"{len(cells) + 1 + number}, S2" for number in range(len(wedges))),
+        "*SURFACE INTERACTION, NAME=TOUCH", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR",
+        f"{push.penalty:.12g}",
+        "*CONTACT PAIR, INTERACTION=TOUCH, TYPE=SURFACE TO SURFACE", "SKIN, FINGER",
+        "*BOUNDARY",
+        *(f"{node + 1}, {axis + 1}" for node in used for axis in np.flatnonzero(mesh.held[node])),
+    ]  # fmt: skip
+    for depth in depths:
+        lines += [
+            "*STEP, NLGEOM, INC=400", "*STATIC", f"{INCREMENT}, 1., 1e-5, 1.", "*BOUNDARY",
+            *(f"NBALL, {axis}, {axis}, {value:.12g}" for axis, value in enumerate(-depth * normal, 1)),
+            "*NODE PRINT, NSET=NBALL, TOTALS=ONLY, FREQUENCY=1000", "RF", "*END STEP",
+        ]  # fmt: skip
+    return "\n".join([*lines, ""])
+
+
+def _rows(numbers: Ints, values: Floats) -> Iterable[str]:
+    for number, (x, y, z) in zip(numbers, values, strict=True):
+        yield f"{number}, {x:.12g}, {y:.12g}, {z:.12g}"
+
+
+def _elements(first: int, nodes: Ints) -> Iterable[str]:
+    """Yield the lines of elements; a line contains at most 16 numbers."""
+    for number, row in enumerate(nodes.tolist(), first):
+        names = [str(one) for one in (number, *row)]
+        yield ", ".join(names[:15]) + ("," if len(names) > 15 else "")
+        if len(names) > 15:
+            yield ", ".join(names[15:])
+
+
+def solve_with_calculix(push: Push, depths: Sequence[float]) -> list[float]:
+    """Return the normal forces at the depths; raises WitnessError without CalculiX or result."""
+    program = shutil.which("ccx")
+    if program is None:
+        raise WitnessError("`ccx` is not installed; install the package `calculix-ccx`")
+    mesh = cylinder_hexahedra(
+        radius=push.radius,
+        length=push.length,
+        support_angle_rad=push.support_angle_rad,
+        along=push.along,
+        angle_rad=push.angle_rad,
+        scale=push.scale,
+    )
+    normal = np.array([0.0, np.sin(push.angle_rad), np.cos(push.angle_rad)])
+    centre = (push.radius + 1.0) * normal + np.array([push.along, 0.0, 0.0])
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "push.inp").write_text(write_deck(mesh, push, centre, depths))
+        done = subprocess.run(
+            [program, "push"], cwd=folder, check=False, capture_output=True, text=True
+        )
+        results = Path(folder, "push.dat")
+        forces = read_forces(results.read_text() if results.exists() else "")
+    if len(forces) < len(depths):
+        raise WitnessError(
+            f"CalculiX solved {len(forces)} of {len(depths)} depths of {push}; its last lines: "
+            f"{done.stdout[-600:]}"
+        )
+    return [mesh.copies * float(-force @ normal) for force in forces]
+
+
+def read_forces(text: str) -> list[Floats]:
+    """Return the reaction forces (3,) of the finger in a result file, one per load step."""
+    totals = re.findall(r"total force \(fx,fy,fz\) for set NBALL.*\n\s*\n(.*)", text)
+    return [np.array([float(one) for one in row.split()]) for row in totals]
