@@ -1,15 +1,16 @@
 """Compare the stored force reference with the finite-element program CalculiX.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.force_witness [SCENE_FILE] [--scale 2] [--json]
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.force_witness [SCENE_FILE] [--json]
 
 CalculiX solves the push of the reference's first position with its own 20-node hexahedra, contact
-(surface to surface) and equation solver. Its neo-Hookean law separates the change of volume, which
-that of the reference does not. Therefore felupe solves the same mesh with both laws, and the ratio
-of these forces converts the force of CalculiX. Lengths are in finger radii, forces in Young's
-modulus times squared finger radius.
+(surface to surface) and equation solver, on two meshes. The force is extrapolated from both with
+the order of convergence of the reference. The neo-Hookean law of CalculiX separates the change of
+volume from that of the form; the law of the reference does not. Therefore felupe solves one mesh
+with both laws, and the ratio of these forces converts the force of CalculiX. Lengths are in finger
+radii, forces in Young's modulus times squared finger radius.
 
 CalculiX (the program `ccx`, Debian package `calculix-ccx`, GPL), felupe and pypardiso are tools for
-development, not dependencies. A run takes about half an hour of one core.
+development, not dependencies. A run takes about 10 minutes of one core.
 """
 
 from __future__ import annotations
@@ -23,14 +24,13 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.force_reference import (
     DEPTHS,
-    PENALTY,
+    ORDER,
     SCALES,
     SCENE_FILE,
     FelupeBody,
@@ -38,14 +38,17 @@ from benchmarks.force_reference import (
     reference_pushes,
 )
 from benchmarks.hexahedra import HexMesh, cylinder_hexahedra
-from flexsheet.launch.experiments.force_reference import REFERENCE_FILE
+from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene, require_material
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-MAX_DEPTH = 10.0 / 7.0
-"""Maximum depth in finger radii. Contact of CalculiX did not converge at larger depths."""
+MAX_DEPTH = 1.5
+"""Maximum depth, in finger radii, at which the programs are compared."""
+MESHES = SCALES[:2]
+"""Scales of the two meshes."""
 SUBDIVISIONS = 4
 """Subdivisions of the icosahedron that represents the finger."""
 SHELL_RATIO = 0.9
@@ -121,7 +124,8 @@ def write_deck(mesh: HexMesh, push: Push, centre: Floats, depths: Sequence[float
         "*NODE, NSET=NBALL", *_rows(np.concatenate([outer, inner]), np.vstack(shell)),
         "*ELEMENT, TYPE=C3D20, ELSET=BODY", *_elements(1, cells + 1),
         "*ELEMENT, TYPE=C3D6, ELSET=BALL", *_elements(len(cells) + 1, wedges),
-        "*MATERIAL, NAME=SOFT", "*HYPERELASTIC, NEO HOOKE", f"{0.5 * shear:.12g}, {2.0 / bulk:.12g}",
+        "*MATERIAL, NAME=SOFT", "*HYPERELASTIC, NEO HOOKE",
+        f"{0.5 * shear:.12g}, {2.0 / bulk:.12g}",
         "*SOLID SECTION, ELSET=BODY, MATERIAL=SOFT",
         "*SOLID SECTION, ELSET=BALL, MATERIAL=SOFT",
         "*SURFACE, NAME=SKIN, TYPE=ELEMENT", *(f"{number}, S2" for number in touched),
@@ -134,9 +138,10 @@ def write_deck(mesh: HexMesh, push: Push, centre: Floats, depths: Sequence[float
         *(f"{node + 1}, {axis + 1}" for node in used for axis in np.flatnonzero(mesh.held[node])),
     ]  # fmt: skip
     for depth in depths:
+        shift = -depth * normal
         lines += [
             "*STEP, NLGEOM, INC=400", "*STATIC", f"{INCREMENT}, 1., 1e-5, 1.", "*BOUNDARY",
-            *(f"NBALL, {axis}, {axis}, {value:.12g}" for axis, value in enumerate(-depth * normal, 1)),
+            *(f"NBALL, {axis}, {axis}, {value:.12g}" for axis, value in enumerate(shift, 1)),
             "*NODE PRINT, NSET=NBALL, TOTALS=ONLY, FREQUENCY=1000", "RF", "*END STEP",
         ]  # fmt: skip
     return "\n".join([*lines, ""])
@@ -190,3 +195,58 @@ def read_forces(text: str) -> list[Floats]:
     """Return the reaction forces (3,) of the finger in a result file, one per load step."""
     totals = re.findall(r"total force \(fx,fy,fz\) for set NBALL.*\n\s*\n(.*)", text)
     return [np.array([float(one) for one in row.split()]) for row in totals]
+
+
+def compare(scene: Scene, depths: Sequence[float]) -> list[dict[str, float]]:
+    """Return a row for each depth: forces of CalculiX and of the reference, in N."""
+    finger_m = scene.finger.radius_m
+    unit_n = require_material(scene).young_modulus_pa * finger_m**2
+    curve = find_reference_curve(scene, 0.0, 0.0)
+    if curve is None:
+        raise WitnessError("no curve is stored for the scene: run benchmarks.force_reference")
+    first = reference_pushes(scene)[0]
+    coarse, fine = (
+        np.array(solve_with_calculix(replace(first, scale=scale), depths)) for scale in MESHES
+    )
+    extrapolated = fine - (coarse - fine) / ((MESHES[0] / MESHES[1]) ** ORDER - 1.0)
+    laws = [
+        np.array(list(FelupeBody(replace(first, scale=MESHES[1]), isochoric=law).solve(depths)))
+        for law in (False, True)
+    ]
+    rows = []
+    for depth, force, step, factor in zip(
+        depths, extrapolated, fine / extrapolated - 1.0, laws[0] / laws[1], strict=True
+    ):
+        reference = curve.force(depth * finger_m)
+        assert reference is not None, "the depths are those of the reference"
+        witness_n = unit_n * float(force * factor)
+        rows.append({
+            "depth_mm": 1e3 * depth * finger_m,
+            "calculix_n": witness_n,
+            "calculix_uncertainty_percent": 100.0 * abs(float(step)),
+            "reference_n": reference.force_n,
+            "reference_uncertainty_percent": 100.0 * reference.uncertainty_ratio,
+            "difference_percent": 100.0 * (witness_n / reference.force_n - 1.0),
+        })  # fmt: skip
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scene", nargs="?", type=Path, default=SCENE_FILE)
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    given = parser.parse_args()
+    rows = compare(load_scene(given.scene), [depth for depth in DEPTHS if depth < MAX_DEPTH])
+    if given.json:
+        version = subprocess.run(["ccx", "-v"], capture_output=True, text=True, check=False).stdout
+        print(json.dumps({"version": version.strip(), "rows": rows}))
+        return
+    for row in rows:
+        print(
+            f"{row['depth_mm']:5.1f} mm: CalculiX {row['calculix_n']:.4f} N, reference "
+            f"{row['reference_n']:.4f} N, difference {row['difference_percent']:+.1f} %"
+        )
+
+
+if __name__ == "__main__":
+    main()
