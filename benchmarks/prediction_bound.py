@@ -68,7 +68,8 @@ def sample_hand(truth: Apparatus, random: np.random.Generator) -> Floats:
 def compute_bound_mm(scene: Scene, truth: Apparatus, random: np.random.Generator) -> float:
     """Return the mean absolute error, mm, of the best linear prediction along one axis."""
     rate_hz = truth.camera.rate_hz or scene.camera.rate_hz
-    lag_s = 0.5 * (truth.arms.left.servo_lag_s + truth.arms.right.servo_lag_s)
+    lags_s = [arm.servo_lag_s or 0.0 for arm in (truth.arms.left, truth.arms.right)]
+    lag_s = float(np.mean(lags_s))
     first_s = 0.5 * scene.camera.exposure_s + (truth.camera.read_out_s or 0.0) + FIXED_S + lag_s
     lags = autocovariance(sample_hand(truth, random), MEMORY_S + first_s + 1.0 / rate_hz)
     grid_s = np.arange(len(lags)) / GRID_HZ
