@@ -12,6 +12,7 @@ import typer
 
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.launching import print_omitted
 from flexsheet.launch.commands.options import (
     BagArgument,
     DurationOption,
@@ -595,6 +596,7 @@ async def _play(request: PlayRequest, launch: Path | None, run_directory: Path |
         plan, run = running_graph(run_directory)
         return await _play_into(request, plan, run)
     plan = load_graph(launch)
+    print_omitted(plan, None)
     async with RunningGraph(plan) as graph:
         with words.status(f"starting {launch}"):
             await graph.wait_ready()
