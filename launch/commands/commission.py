@@ -133,9 +133,9 @@ def commission(
 ) -> None:
     """Calibrate camera, arms, sheet, projector, marker and eyes in sequence; verify the result.
 
-    Finished steps are not repeated. With --apparatus, all devices are simulated. Otherwise the
-    command stops at a step whose data are missing, with exit code 1, and states how to capture
-    them.
+    The command does not repeat finished steps. With --apparatus, all devices are simulated.
+    Otherwise the command stops with exit code 1 at a step whose data are missing, and states how to
+    capture the data.
     """
     from flexsheet.launch.calibration.commission import MissingDataError, StepName
     from flexsheet.launch.commands.calibrate import FOUR_BITS, _parse_board
@@ -153,7 +153,7 @@ def commission(
         )
     if check and (repeats or skips or any(name is not StepName.VERIFICATION for name in given)):
         raise CommandError(
-            "--check only repeats the verification; remove --step, --skip and other steps' --data",
+            "--check repeats only the verification; remove --step, --skip and other --data",
             BAD_INPUT,
         )
     lab, devices = open_laboratory(
@@ -202,7 +202,9 @@ def _parse_step(option: str, text: str) -> StepName:
 
 
 def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
-    """Parse values STEP=TEXT; raises CommandError for an unknown step or an empty text."""
+    """Parse the values STEP=TEXT of an option; return the texts by step.
+
+    Raises CommandError for an unknown step or an empty text."""
     pairs = {}
     for one in given or ():
         name, _, text = one.partition("=")

@@ -23,7 +23,7 @@ app = make_app()
 
 
 class ExternalTopic(StrEnum):
-    """Topic that ROS nodes may publish for flexsheet."""
+    """A topic that ROS nodes may publish for flexsheet."""
 
     EYE = "eye"
     FINGERTIP = "fingertip"

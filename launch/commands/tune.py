@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
-"""Exit code if a method family has no method within the tolerance; the best one is chosen."""
+"""The exit code if no method of a family meets the tolerance, so that the best one is chosen."""
 
 
 app = make_app()
