@@ -225,8 +225,8 @@ def capture(
 ) -> None:
     """Record joint angles and board images for `calibrate arms`, from the running graph.
 
-    Mount the board on the flange and move the arm with its teach pendant. A pose is recorded when
-    the arm is at rest and the board appears in a new pose. Ctrl-C stops.
+    Mount the board on the flange and move the arm with its teach pendant. The command records a
+    pose when the arm is at rest and the board is in a new pose. Ctrl-C ends the recording.
     """
     from flexsheet.launch.calibration.arm_poses import PoseRecorder, make_lens_rig
     from flexsheet.launch.plans.plan import load_scene

@@ -161,8 +161,8 @@ def edges_capture(
     """Record marks on both clamps for `calibrate edges`, from the running graph.
 
     Fix three bright marks on each clamp: at its centre and 45 % of its length above and below. Move
-    the sheet to poses that differ in position, rotation and stretch. A pose is recorded when both
-    arms are at rest. Ctrl-C ends the recording.
+    the sheet to poses that differ in position, rotation and stretch. The command records a
+    pose when both arms are at rest. Ctrl-C ends the recording.
     """
     from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.launch.plans.plan import load_scene

@@ -51,7 +51,7 @@ def chart(
         typer.Option(
             "--scene",
             metavar="SCENE",
-            help="Scene to measure in; default: cylinder. For system: repeat for several; default: "
+            help="Scene to measure in; default: cylinder. For system: repeat the option; default: "
             "all shipped scenes.",
             autocompletion=complete.scenes,
         ),
@@ -103,7 +103,7 @@ def chart(
         typer.Option(
             "--configuration",
             metavar="NAME",
-            help="For system: name of a configuration; repeat for several; default: all.",
+            help="For system: configuration to measure; repeat the option; default: all.",
         ),
     ] = None,
     as_json: JsonOption = False,

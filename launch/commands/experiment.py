@@ -91,8 +91,8 @@ def stroke(
         typer.Option(
             min=1,
             max=1000,
-            help="Number of strokes, each in a new graph with another random seed; several give "
-            "the 95 % confidence interval of the mean.",
+            help="Number of strokes; each stroke runs in a new graph with another random seed. "
+            "Several strokes give the 95 % confidence interval of the mean.",
         ),
     ] = 1,
     ablations: Annotated[
@@ -104,7 +104,8 @@ def stroke(
         ),
     ] = False,
     radii: Annotated[
-        bool, typer.Option("--radii", help="Also measure on a cylinder of twice the radius.")
+        bool,
+        typer.Option("--radii", help="Also measure strokes on a cylinder of twice the radius."),
     ] = False,
     workers: WorkersOption = 1,
     scheduler: SchedulerOption = None,
@@ -222,7 +223,7 @@ def push(
         typer.Option(
             "--tilt",
             metavar="DEG",
-            help="Contact angle around the axis of the cylinder, degrees; it inclines the sheet.",
+            help="Contact angle around the axis of the cylinder, degrees; it tilts the sheet.",
         ),
     ] = 0.0,
     map_file: MapOption = None,
@@ -401,7 +402,7 @@ def gestures(
         typer.Option(
             "--gesture",
             metavar="NAME",
-            help="Name of a gesture to run, or CSV file with a fingertip path; repeat for several; "
+            help="Name of a gesture, or CSV file with a fingertip path; repeat for several; "
             "default: all gestures.",
             autocompletion=complete.gestures,
         ),

@@ -133,7 +133,10 @@ def _words(text: str) -> set[str]:
     )
 )
 def explain(
-    message: Annotated[str, typer.Argument(help="Text, code or class name of an error or note.")],
+    message: Annotated[
+        str,
+        typer.Argument(help="Text, code or class name of an error, or text of a note of a node."),
+    ],
     as_json: JsonOption = False,
 ) -> None:
     """Print the meaning and the remedy of an error or note; docs/errors.md lists all of them."""

@@ -186,8 +186,9 @@ def delay(
 ) -> None:
     """Measure the age of a topic's data when it arrives at this command.
 
-    The age is counted from the source timestamp, for instance the camera exposure. Messages with
-    timestamps of another computer's clock are ignored, because their age is not known here.
+    The age is the time since the source timestamp, for instance since the exposure of an image. The
+    command ignores messages with timestamps of another computer, because it does not know the
+    difference of the clocks.
     """
     from flexsheet.messages.clock import SystemClock
 
@@ -229,8 +230,9 @@ def pub(
 ) -> None:
     """Publish a message to the running graph.
 
-    The topic must allow several writers, or be listed under `external_topics` in the launch file. A
-    latched message reaches subscribers that connect later only while this command runs.
+    The topic must allow several writers, or be listed under `external_topics` in the launch file.
+    Subscribers that connect later receive a message of a latched topic only while this command
+    runs.
     """
     found = _find_topic(topic)
     built = _parse_message(found, message)
