@@ -44,14 +44,17 @@ SCENE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder
 POSES, SEED = 20, 2
 GROUPS = 4
 WRONG_PX = 1.0
-"""Maximum distance of a corner from its true position; corners beyond it are counted, not averaged.
+"""The maximum error of a corner, in px; corners with larger errors are counted but not averaged.
 """
 
 CRITERIA = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 
 
 def by_window(half_px: float | None, smoothing_px: float) -> Finder:
-    """Make a finder with OpenCV's refinement in a window; None: 0.4 of the nearest distance."""
+    """Make a finder that refines corners in a window with OpenCV.
+
+    half_px: half the side of the window; None: 0.4 times the smallest distance of two corners.
+    """
 
     def find(image: Image, board: Board) -> Floats | None:
         found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows))
@@ -128,7 +131,7 @@ def joint(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> 
 
 
 def robust(loss: str, scale_px: float) -> Fitter:
-    """Make a joint fit with a loss that grows less than quadratically beyond `scale_px`."""
+    """Make a joint fit with a robust loss, which is not quadratic for errors over `scale_px`."""
 
     def fit(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> StereoRig:
         start = fit_pairs(pairs, points, size)
@@ -160,7 +163,7 @@ def robust(loss: str, scale_px: float) -> Fitter:
 def with_board_shape(
     pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
 ) -> StereoRig:
-    """Fit the rig jointly, alternating with the height of each corner over the board's plane."""
+    """Fit the rig and the height of each corner over the board's plane in alternation."""
     fit = fit_pairs(pairs, points, size)
     shape = points.copy()
     for _ in range(6):

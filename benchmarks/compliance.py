@@ -7,9 +7,9 @@ body. For each modulus the planner's compliance selects stretch and advance. The
 then gives the force on a finger at each depth. For comparison: a stretch for the object's stiffness
 only, without advance.
 
-Prints the same at other points of the sheet, and the range of moduli that the sheet can render.
-Takes two minutes. With --table the planner uses a table of the membrane's finite elements instead
-of the closed form, which takes half a minute more.
+The program also prints the force errors at other points of the sheet, and the range of moduli that
+the sheet can render. It takes two minutes. With --table, the planner uses a table from finite
+elements of the membrane instead of a formula, which takes half a minute more.
 """
 
 from __future__ import annotations

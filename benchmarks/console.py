@@ -49,7 +49,10 @@ WINDOW = {"width": 1200, "height": 800}
 SETTLE_S = 5.0
 TOPICS = ("fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "frame")
 PICTURE_BYTES = 10_000
-"""Minimum size of an update window that contains the sheet; smaller ones contain only a table."""
+"""The minimum size of an update window that contains the sheet, in bytes.
+
+Smaller update windows contain only a table.
+"""
 
 CAMERA = {
     "type": "ViewerCameraMessage",
@@ -81,7 +84,7 @@ class Statuses:
         self.newest[status.node] = status
 
     def lost(self) -> dict[str, int]:
-        """Return the number of skipped or lost messages by topic, without those of the console."""
+        """Return the number of skipped or lost messages by topic, except those of the console."""
         found = dict.fromkeys(TOPICS, 0)
         for status in self.newest.values():
             for port in status.inputs if status.node not in ("console", "recorder") else ():
@@ -111,7 +114,7 @@ class ViewerCounts:
 
 
 async def watch(statuses: Statuses, seconds: float) -> dict[str, Any]:
-    """Return rates and losses over some seconds, and the console's fraction of a core."""
+    """Return the rates and losses of the nodes, and the processor time of the console in cores."""
     written, lost = statuses.written(), statuses.lost()
     await asyncio.sleep(seconds)
     return {
@@ -191,7 +194,7 @@ async def run(seconds: float, settings: list[str]) -> dict[str, Any]:
 
 
 async def viewed(statuses: Statuses, seconds: float, got: ViewerCounts) -> dict[str, Any]:
-    """Return the result of `watch`, with the data that reached the viewer."""
+    """Return the result of `watch` and the rate of the data that reaches the viewer."""
     got.pictures = got.size_bytes = 0
     found = await watch(statuses, seconds)
     found["pictures_per_s"] = got.pictures / seconds

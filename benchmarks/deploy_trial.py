@@ -39,22 +39,24 @@ from tests.lab import ROOT, Network, missing
 PAGE = ROOT / "docs" / "deploy.md"
 HOSTS = ("main", "left", "right")
 ADDRESSES = {"main": "192.0.2.10", "left": "192.0.2.11", "right": "192.0.2.12"}
-"""Addresses that differ from those of launch/three.yaml, which must therefore be edited."""
+"""The addresses of the computers, which differ from those in launch/three.yaml."""
 
 PROMPT = re.compile(rf"(each|{'|'.join(HOSTS)})\$ (.*)")
 EXIT_CODE = re.compile(r"# .*exit code (\d+)")
 SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 READY_S, COMMAND_S = 300.0, 300.0
 FOLLOWED_M, FOLLOWED_SHARE = 0.005, 0.6
-"""Minimum fraction of the stroke in which both arms follow; one busy computer simulates three."""
+"""The maximum distance between sheet and target in metres for arms that follow, and the minimum
+fraction of the stroke in which both arms follow. One busy computer simulates three computers.
+"""
 
 MOVED_M = 0.005
-"""Minimum travel of the sheet's centre, which is 7 mm in the page's stroke."""
+"""The minimum travel of the sheet's centre in metres; the stroke of the page moves it by 7 mm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Line at a prompt of the page: its computers, the command and the expected exit code."""
+    """A command in a console block of the page: its computers, text and expected exit code."""
 
     line: int
     hosts: tuple[str, ...]
@@ -64,7 +66,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """Result of a step on one computer."""
+    """The result of a step on one computer."""
 
     line: int
     host: str
@@ -96,7 +98,7 @@ def steps(text: str) -> Iterator[Step]:
 
 
 class Computer:
-    """Shell in a network namespace with separate directories."""
+    """A shell in a network namespace with separate directories."""
 
     def __init__(self, name: str, space: str, folder: Path) -> None:
         self.name, self.folder, self._space = name, folder / name, space
@@ -148,7 +150,7 @@ class Computer:
         raise RuntimeError(f"the shell of {self.name} has ended: {''.join(words)}")
 
     async def follow(self, command: str) -> tuple[int, str]:
-        """Run a line of the page; wait until a launch, run in the background, is ready."""
+        """Run a command of the page; run a launch in the background, and wait until it is ready."""
         command = re.sub(r"\bNAME\b", self.name, command).replace("URL", "$TRIAL/clone")
         if command == "make setup":
             self._lend_packages()
@@ -198,7 +200,7 @@ class Computer:
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """Following of the arms during the finger's path.
+    """Measures of how well the arms follow the finger's path.
 
     following: fraction of the planner's messages at which both arms followed.
     apart_m: 95 % quantile of the distance between the sheet's centre and its target.
@@ -222,7 +224,7 @@ class Stroke:
 
 
 def evaluate_stroke(bag: Path) -> Stroke:
-    """Evaluate both arms during the path that a command gave to the simulated finger."""
+    """Evaluate both arms while the simulated finger moves along its path."""
     reader = BagReader(bag, ["scene", "arm_left", "arm_right", "sheet_target", "twin/finger"])
     states: dict[str, list[tuple[int, ArmState]]] = {"left": [], "right": []}
     targets, path, scene = [], [], None
@@ -262,7 +264,7 @@ def evaluate_stroke(bag: Path) -> Stroke:
 
 
 async def try_page(folder: Path, until: int) -> list[StepResult]:
-    """Follow the page up to a line of it; stop at an unexpected exit code."""
+    """Run the commands of the page up to a line number; stop at an unexpected exit code."""
     done: list[StepResult] = []
     async with Network(f"fs{os.getpid()}", ADDRESSES) as network:
         computers = {name: Computer(name, network.space(name), folder) for name in HOSTS}

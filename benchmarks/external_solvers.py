@@ -54,7 +54,10 @@ DENSITY, DAMPING_RATIO = 1000.0, 0.02
 
 @dataclass(frozen=True, slots=True)
 class ExternalSolution:
-    """An external solver's answer: displacement (s, 3) of the skin, force (3,) on the finger, N."""
+    """The result of an external solver.
+
+    It contains the displacement (s, 3) of the skin, m, and the force (3,) on the finger, N.
+    """
 
     displacement: Floats
     force_n: Floats
@@ -64,7 +67,7 @@ ExternalSolver = Callable[[ContactQuery], ExternalSolution]
 
 
 def import_optional(name: str) -> Any | None:
-    """Return a module that flexsheet does not require; None, logged with the remedy, without it."""
+    """Return an optional module; log a remedy and return None if it is not installed."""
     package = {"skfem": "scikit-fem"}.get(name, name)
     try:
         return import_module(name)
@@ -96,7 +99,7 @@ class ContactLoads:
 
 
 def sparse_factor(body: SceneBody, scene: Scene) -> ExternalSolver:
-    """Factor once and solve for each push, instead of adding precomputed rows."""
+    """Factor the stiffness matrix once, and solve for each push."""
     from scipy.sparse.linalg import splu
 
     mesh = build_mesh(body.spec.mesh)
@@ -156,7 +159,7 @@ def _stiffness(mesh: SolidMesh, scene: Scene) -> Any:
 
 
 def _scikit_basis(skfem: Any, mesh: SolidMesh) -> tuple[Any, Ints]:
-    """Return scikit-fem's basis on the curved mesh, and our degree of freedom for each of its."""
+    """Return scikit-fem's basis on the curved mesh, and indices of its degrees of freedom."""
     from scipy.spatial import cKDTree
 
     corners = np.unique(mesh.elements[:, :4])
@@ -182,8 +185,8 @@ def mujoco_flex(
 ) -> tuple[Callable[[], object], int] | None:
     """Return one step of MuJoCo's dynamics and the number of nodes of its flex.
 
-    The finger is pushed into linear tetrahedra on the mesh's corners. The contact is not tuned:
-    only the time counts.
+    The finger is pushed into linear tetrahedra at the corners of the mesh. Only the time of the
+    step is measured, so the contact parameters are not tuned.
     """
     mujoco = import_optional("mujoco")
     if mujoco is None:

@@ -29,7 +29,7 @@ from tests.lab_bags import Arm, Floats, Gap, Times, gaps, measure_hold, read_arm
 
 
 class Span:
-    """Start and end of a fault, s of the monotonic clock.
+    """The start and the end of a fault, in seconds of the monotonic clock.
 
     killed_side: arm whose bridge is killed, if any.
     """
@@ -39,7 +39,7 @@ class Span:
         self.begun_s = self.over_s = time.monotonic()
 
     def begin(self) -> None:
-        """Set the fault's start, and its preliminary end, to the present time."""
+        """Set the start and the preliminary end of the fault to the present time."""
         self.begun_s = self.over_s = time.monotonic()
 
     def end(self) -> None:
@@ -50,24 +50,24 @@ Work = Callable[[Span], Awaitable[Any]]
 
 SIDES = ("left", "right")
 RECORDERS = ("record_left", "record_right")
-"""Nodes that are never killed, because the evaluation reads the arms' records."""
+"""The nodes that are never killed, because the evaluation reads their bags."""
 
 MAX_LENGTH_M = 0.24 * 1.15
 BACK_WITHIN_S = 60.0
 SILENT_S = 0.1
-"""Maximum age of a state of a bridge that follows."""
+"""The maximum age of the state of a bridge that follows, in seconds."""
 
 KILLED_SILENT_S = 0.02
-"""Maximum age of the last state of a bridge that is killed; the other arm must stop by itself."""
+"""The maximum age of the last state of a killed bridge, in seconds; the other arm then stops."""
 
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Result of one fault.
+    """The result of one fault.
 
-    stopped_s: time until neither arm followed; None if they never stopped.
-    back_s: longest time after the fault in which they did not both follow; None if they never did
-        again.
+    stopped_s: time until neither arm followed; None if the arms never stopped.
+    back_s: longest time after the fault in which an arm did not follow; None if the arms did not
+        follow again.
     during_ns: time from the start of the fault to the recovery.
     reasons: the three most frequent reasons why an arm did not follow.
     """
@@ -138,9 +138,9 @@ async def run_fault(lab: Lab, name: str, work: Work) -> Result:
 
 
 def longest_away_s(reported: list[tuple[float, set[str]]], span: Span) -> float:
-    """Return the longest time after the fault in which not both arms followed.
+    """Return the longest time after the fault in which at least one arm did not follow.
 
-    Shorter holds also occur on a busy computer without a fault.
+    On a busy computer, arms also hold for short times without a fault.
     """
     longest_s = 0.0
     since_s: float | None = None
@@ -221,7 +221,7 @@ async def kill_launcher(lab: Lab, host: str, span: Span) -> None:
 
 
 def worst_gaps(lost: list[Gap], results: list[Result]) -> list[Gap | None]:
-    """Return for each fault the longest gap of one writer's messages; None without a gap.
+    """Return the longest gap in the messages of one writer for each fault; None without a gap.
 
     A gap belongs to the fault that it overlaps most.
     """
@@ -244,11 +244,11 @@ KILLED_KINDS = {
     "clock": ("clock",),
     "node": ("",),
 }
-"""Words in the names of faults that tell what was killed; the first kind that fits counts."""
+"""The words in names of faults by kind of killed process; the first matching kind is used."""
 
 
 def summarize(results: list[Result]) -> dict[str, float]:
-    """Return the times after kills that stopped the arms, s, by what was killed.
+    """Return the times from a kill to the stop of the arms, s, by kind of killed process.
 
     follow_again: both arms follow again after the kill of a node's process.
     """
@@ -271,7 +271,7 @@ def rows(
     targets: tuple[Times, Floats],
     lost: list[Gap],
 ) -> list[dict[str, Any]]:
-    """Return the results of each fault with those of the bags, as table values; lengths in mm."""
+    """Return one table row per fault with the results of run and bags; lengths are in mm."""
     found = []
     for one, gap in zip(results, worst_gaps(lost, results), strict=True):
         sheet = measure_hold(arms, targets, one.during_ns)

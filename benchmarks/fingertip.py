@@ -39,15 +39,15 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cyl
 PAIRS, ROUNDS, BOUNDS = 100, 10, 10
 SPEEDS_M_PER_S = (0.0, 1.0)
 REACH_M = 0.009
-"""Maximum distance of a finger from its prediction one frame later, at 60 m/s^2 and 60 Hz."""
+"""The maximum error of the predicted position at 60 m/s^2 and 60 Hz, in metres."""
 
 PREDICTION_M = 0.001
-"""Standard deviation of the prediction's error, per axis."""
+"""The standard deviation of the prediction error per axis, in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class TestShot:
-    """Image pair with the true and the predicted fingertip."""
+    """An image pair with the true and the predicted position of the fingertip."""
 
     left: Image
     right: Image
@@ -58,7 +58,7 @@ class TestShot:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Times (s) of all calls, and the error (3,) m and covariance of each shot; NaN: not found."""
+    """Times of all calls, s, and error (3,), m, and covariance of each shot; NaN if not found."""
 
     times_s: Floats
     errors_m: Floats
@@ -86,7 +86,7 @@ def shots(camera: TwinCamera, speed_m_per_s: float, exposure_s: float) -> list[T
 
 
 def measure(scene: Scene, method: str, taken: list[TestShot]) -> tuple[Run, Run]:
-    """Detect in the region of interest and in the full images, in turn for each shot."""
+    """Detect the fingertip of each shot in the region of interest and in the full images."""
     geometry = StereoGeometry.of(scene.camera)
     config = DetectorConfig(
         blob_filter=BlobFilter(),

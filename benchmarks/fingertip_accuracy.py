@@ -50,16 +50,16 @@ Floats = NDArray[np.float64]
 LOW_M, HIGH_M = (-0.06, -0.06, -0.04), (0.06, 0.06, 0.04)
 SPEED_M_PER_S = 0.02
 FRAMES = 14
-"""Number of frames at each position; the first ones confirm the track."""
+"""The number of frames at each position, of which the first frames confirm the track."""
 
 SETTLED_FRAMES = 5
 APART_S = 2.0
-"""Time between two positions, long enough to lose the track."""
+"""The time between two positions in seconds, which is long enough to lose the track."""
 
 
 @dataclass(frozen=True, slots=True)
 class TestPositions:
-    """Finger that passes several positions slowly, one after the other."""
+    """A motion in which the finger passes several positions slowly."""
 
     places: Floats
     ways: Floats
@@ -105,7 +105,7 @@ async def follow(scene: Scene, walk: TestPositions, calibration: Path) -> list[O
 
 
 def bound_m2(scene: Scene, walk: TestPositions) -> Floats:
-    """Return the mean over the positions of the minimum variance per axis (3,), m^2."""
+    """Return the minimum variance per axis (3,), m^2, as the mean over all positions."""
     camera = twin_camera(scene, CLUTTER["lab"])
 
     def around(place: int) -> TruePathCase:
@@ -136,7 +136,7 @@ def tracked_errors(seen: Sequence[ObservedFrame]) -> Floats:
 
 
 def summary(errors_m: Floats) -> dict[str, Any]:
-    """Return error quantiles in mm: of the whole vector, and rms per axis."""
+    """Return quantiles of the error's norm and the rms error per axis, mm."""
     off_mm = 1e3 * np.linalg.norm(errors_m, axis=1)
     return {
         "frames": len(errors_m),

@@ -22,22 +22,22 @@ from flexsheet.nodes.twin.rig import pixels_per_slope
 Floats = NDArray[np.float64]
 
 STEP_PX = 0.02
-"""Half the step of the numeric derivatives by position, radius and blur."""
+"""Half the step of the numeric derivatives by position, radius and blur, in px."""
 
 ROUNDING_VARIANCE = 1.0 / 12.0
 FULL_LEVEL = 255.0
 NUISANCES = 4
 MAX_CONDITION = 1e10
-"""Largest condition number of the information matrix, scaled to a diagonal of one."""
+"""The maximum condition number of the information matrix after scaling its diagonal to one."""
 
 
 class BoundError(ValueError):
-    """The marker is not in both images, or its position is not observable."""
+    """Error: the marker is not in both images, or its position is not observable."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """Minimum covariances of any unbiased estimate.
+    """The minimum covariances of an unbiased estimate.
 
     position_m2: (3, 3) of the fingertip in the world, from both views.
     views_px2: (2, 2) of the marker's centre in the left and in the right view.
@@ -142,7 +142,7 @@ def pixel_information(sensor: Sensor, levels: Floats) -> Floats:
 def _about_the_mark(
     camera: TwinCamera, eye: CameraView, position: Position, exposure_s: float, margin_px: float
 ) -> Window:
-    """Return the part of an image that the marker lights during the exposure, with the margin."""
+    """Return the part of an image that the marker covers during the exposure, with a margin."""
     pixels, reach_px = [], 0.0
     for share in (-0.5, 0.0, 0.5):
         tip = position(share * exposure_s) + camera.marker_offset_m

@@ -10,8 +10,8 @@ give the force and its uncertainty. All lengths are in finger radii, forces in Y
 the square of the finger radius.
 
 felupe (GPL) and pypardiso are tools for development, not dependencies: `pip install felupe
-pypardiso`. A run takes a few minutes of one core. Solved curves in FILE are kept, so that an
-interrupted run continues.
+pypardiso`. A run takes a few minutes of one core. Curves that FILE already contains are not
+solved again.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 PENALTY, STIFFER = 1000.0, 4000.0
 """Stiffness of the contact (pressure per penetration), in Young's modulus per finger radius. The
-second value serves to estimate the error that the first one causes."""
+results for both values give an estimate of the error of the penalty."""
 DEPTHS = tuple(depth / 7.0 for depth in (0.5, 1.0, 2.0, 3.5, 6.0, 10.0, 13.0, 16.0))
 SCALES = (3.0, 2.0, 1.4)
-"""Scales of the meshes, the coarsest first."""
+"""The scales of the element sizes, from the coarsest to the finest mesh."""
 ORDER = 2.0
 INTERRUPTED = "interrupted"
 CURVE_KEYS = (
@@ -56,12 +56,12 @@ CURVE_KEYS = (
 POINTS_PER_EDGE = 6
 TOLERANCE, MAX_ITERATIONS = 1e-4, 25
 MAX_STEP, MIN_FRACTION = 0.3, 1.0 / 16.0
-"""Maximum load step, in finger radii, and minimum load step as a fraction of a depth increment."""
+"""The maximum load step in finger radii, and the minimum one as a fraction of a depth step."""
 
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """Inputs of one force curve; lengths in finger radii.
+    """The inputs of one force curve; lengths are in finger radii.
 
     along, angle_rad: pushed position along and around the axis. scale: factor of all element sizes.
     penalty: stiffness of the contact, see `PENALTY`.
@@ -78,7 +78,7 @@ class Push:
 
 
 class SphereContact:
-    """Penalty contact of a rigid sphere of radius 1 with nine-node faces."""
+    """A penalty contact of a rigid sphere of radius 1 with nine-node faces."""
 
     def __init__(self, mesh: HexMesh, penalty: float) -> None:
         points, weights = np.polynomial.legendre.leggauss(POINTS_PER_EDGE)
@@ -116,7 +116,10 @@ class SphereContact:
         return result
 
     def tangent(self, positions: Floats, centre: Floats, turning: float) -> Any:
-        """Return the second derivative as a sparse matrix; turning weights its indefinite part."""
+        """Return the second derivative of the energy as a sparse matrix.
+
+        turning: weight of its indefinite part.
+        """
         from scipy.sparse import coo_matrix
 
         face, point, depth, normal, away = self._inside(positions, centre)
@@ -132,7 +135,7 @@ class SphereContact:
 
 
 class FelupeBody:
-    """Neo-Hookean cylinder of felupe with the contact of a rigid sphere.
+    """A Neo-Hookean cylinder of felupe with the contact of a rigid sphere.
 
     isochoric: use a law that separates the change of volume from that of the form.
     """
@@ -223,7 +226,7 @@ class FelupeBody:
         return np.asarray(self._surface + (1.0 - depth) * self._normal)
 
     def solve(self, depths: Sequence[float]) -> Iterator[float]:
-        """Yield the normal forces at the depths, up to the last that converges."""
+        """Yield the normal forces at the depths, until a solution does not converge."""
         moved, at = np.zeros_like(self.mesh.points), 0.0
         for depth in depths:
             start, done = at, 0.0
@@ -261,7 +264,7 @@ def _quadratic_slope(t: Floats) -> Floats:
 
 
 def reference_pushes(scene: Scene) -> list[Push]:
-    """Return the pushes whose force curves the reference of a scene with a cylinder needs."""
+    """Return the pushes for the reference of a scene with a cylinder."""
     geometry, support = scene.object.geometry, scene.object.support
     if not (isinstance(geometry, Cylinder) and isinstance(support, StripSupport)):
         raise SystemExit("the force reference needs a cylinder on a strip; choose another scene")

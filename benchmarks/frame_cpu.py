@@ -41,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SKIN_SPACING_M = 0.0045
 STRETCH = 1.05
 SMALL = 0.1
-"""Fraction of the projector's width and height while the CPU side is measured."""
+"""The image size relative to the projector, per axis, while processor time is measured."""
 GL_TYPES: tuple[type, ...] = (
     moderngl.Buffer,
     moderngl.Context,
@@ -54,7 +54,7 @@ GL_TYPES: tuple[type, ...] = (
 
 
 class Clock:
-    """Times of one frame by name, s; a call in `apart` pauses the enclosing span."""
+    """Times of one frame by name, s, in which calls that are timed apart are not counted twice."""
 
     def __init__(self) -> None:
         self.spent: dict[str, float] = defaultdict(float)
@@ -164,7 +164,7 @@ def bodies(skin: Skin) -> Iterator[SoftBody]:
 
 
 def predict_sheet(scene: Scene, edges: tuple[Floats, Floats], number: int) -> SheetPose:
-    """Return the sheet between two edges, pushed at several points."""
+    """Return the predicted sheet between two edges; `number` determines the pushed point."""
     tip = np.array([0.02 * np.sin(0.1 * number), 0.02 * np.cos(0.1 * number), -0.015])
     sheet = estimate_sheet(
         *edges,

@@ -42,7 +42,7 @@ WARM_UP = 20
 
 
 def find_driver() -> str:
-    """Return the name of the OpenGL driver, or an empty text without OpenGL."""
+    """Return the name of the OpenGL driver; an empty string if OpenGL is not available."""
     try:
         context = headless_context()
     except NoOpenGLError:
@@ -53,7 +53,7 @@ def find_driver() -> str:
 
 
 def measure_frames(scene: Scene, frames: int) -> dict[str, float]:
-    """Return wall and processor time of stereo frames, each with a new sheet and soft body, ms."""
+    """Return wall and processor time of stereo frames, ms; each has a new sheet and soft body."""
     given = RendererParameters()
     renderer = SceneRenderer(
         scene,

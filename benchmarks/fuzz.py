@@ -24,7 +24,7 @@ from typing import Any
 MEMORY_MIB = 2048
 MAX_S = 20
 FOUND = ("crash", "oom", "timeout")
-"""Name prefixes of the files in which atheris stores findings."""
+"""The name prefixes of the files in which atheris stores findings."""
 
 MAX_BYTES = 1 << 20
 TARGETS = ("wire", "bag", "launch", "scene", "mesh", "modbus", "mxt")

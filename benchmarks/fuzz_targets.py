@@ -67,12 +67,12 @@ from flexsheet.nodes.twin.mxt_controller import FILTER_S, MxtController
 LAUNCH = Path(flexsheet.launch.__file__).parent
 AT_REST_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 MEMORY_BYTES = 256 << 20
-"""Maximum additional memory for one input."""
+"""The maximum additional memory for one input, in bytes."""
 
 FORBIDDEN = frozenset(
     {"os.system", "os.exec", "os.posix_spawn", "subprocess.Popen", "pickle.find_class", "os.fork"}
 )
-"""Python's audit events of an execution."""
+"""The audit events of Python that show the execution of a program or of code."""
 
 Mutate = Callable[[bytes, random.Random], bytes]
 
@@ -80,11 +80,11 @@ _log = logging.getLogger("flexsheet.fuzz")
 
 
 class Finding(AssertionError):
-    """An input had a forbidden effect."""
+    """Error: an input had a forbidden effect."""
 
 
 class ExecutionMonitor:
-    """Permanent monitor that raises Finding if something is executed while `on`."""
+    """A permanent monitor that raises Finding if a program or code is executed while it is on."""
 
     on = False
     _hooked = False
@@ -123,7 +123,10 @@ def _peak_bytes() -> int:
 
 @dataclass(frozen=True)
 class Target:
-    """Fuzzing target; run: returns whether the bytes were decoded, False for the declared error."""
+    """A target of fuzzing.
+
+    run: function that decodes bytes; it returns False if it raised the declared error.
+    """
 
     name: str
     about: str
@@ -132,7 +135,7 @@ class Target:
     mutate: Mutate
 
     def check(self, data: bytes) -> bool:
-        """Execute `run` with the monitor; raises Finding and the target's undeclared exceptions."""
+        """Run the target on bytes; raise Finding and its undeclared exceptions."""
         with ExecutionMonitor.looks(), bounded_memory():
             return self.run(data)
 
@@ -280,7 +283,7 @@ def scene() -> Scene:
 
 @cache
 def messages_of_scene() -> dict[str, Message]:
-    """Return valid messages of the topics whose values depend on one another."""
+    """Return valid messages of the topics whose values must be consistent with a scene."""
     return {"scene": scene(), "twin/apparatus": nominal_apparatus(scene())}
 
 
@@ -437,7 +440,7 @@ def join_records(records: Sequence[Record]) -> bytes:
 
 
 def mutate_bag(data: bytes, chance: random.Random) -> bytes:
-    """Mutate its records, those within a chunk (with a correct check sum), or the bytes."""
+    """Mutate the records of a bag, the records within a chunk, or the bytes of the bag."""
     if chance.random() < 0.2 or not data.startswith(MAGIC):
         return mutate_bytes(data, chance)
     records = read_records(data[len(MAGIC) :])
@@ -516,7 +519,7 @@ def _mutate_chunk(body: bytes, chance: random.Random) -> bytes:
 
 
 def import_nodes() -> None:
-    """Import the nodes before any monitor is on, since some libraries start processes on import."""
+    """Import the nodes before a monitor is on; some libraries start processes when imported."""
     for name in NODES:
         node_class(name)
 
@@ -534,11 +537,11 @@ YAML_TOKENS = (
 )  # fmt: skip
 
 BOMB = "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9) if n else 'x'}]\n" for n in range(12))
-"""Nested aliases: nine of nine of nine ..."""
+"""A YAML document whose nested aliases expand to a huge list."""
 
 
 def mutate_yaml(data: bytes, chance: random.Random) -> bytes:
-    """Mutate its values, or its text with constructs that YAML parsers handle badly."""
+    """Mutate the values of a YAML document, or insert constructs that YAML parsers handle badly."""
     text = data.decode(errors="replace")
     kind = chance.randrange(10)
     if kind < 6:
@@ -680,8 +683,11 @@ def mutate_mesh(data: bytes, chance: random.Random) -> bytes:
 # Modbus TCP.
 
 TID, CRC_RIGHT, ACCEPTED_RIGHT, SPLIT, CLOSE = 1, 2, 4, 8, 16
-"""Meaning of the bits of an answer's first byte: use the request's transaction; correct the check
-sum of the status block and its accepted number; split the answer; close the connection."""
+"""The bits in the first byte of an answer, which change the answer.
+
+In this order: use the transaction number of the request; correct the check sum of the status block;
+correct its accepted number; split the answer; close the connection.
+"""
 
 _REGISTERS = 26
 
@@ -743,7 +749,7 @@ class FakeArm:
 
 
 def correct_answer(answer: bytes, flags: int, request: bytes) -> bytes:
-    """Correct the parts of an answer that its flags name, from the request."""
+    """Correct the parts of an answer that `flags` selects, so that they match the request."""
     block = 9
     if flags & TID and len(answer) >= 2:
         answer = request[:2] + answer[2:]
@@ -780,7 +786,7 @@ def modbus_seeds() -> list[bytes]:
 
 
 def run_modbus(data: bytes) -> bool:
-    """Decode it as the answer of an arm, and its registers as a status and as a command."""
+    """Decode bytes as the answer of an arm, and their registers as a status and a command."""
     taken = fake_arm().ask(data)
     body = data[10 : 10 + 2 * _REGISTERS]
     registers = list(struct.unpack(f">{len(body) // 2}H", body[: len(body) // 2 * 2]))
@@ -819,7 +825,7 @@ def _mxt_controller() -> MxtController:
 
 
 def run_mxt(data: bytes) -> bool:
-    """Decode it as an answer, and packet by packet as commands."""
+    """Decode bytes as an answer of the controller, and each packet as a command."""
     taken = True
     try:
         status = decode_answer(data)

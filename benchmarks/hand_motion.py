@@ -1,6 +1,6 @@
 """Generate synthetic hand motion for the evaluation of predictors.
 
-Nothing here is shared with a predictor or with the simulator's finger.  Tremor is noise in narrow
+No code is shared with a predictor or with the simulated finger.  Tremor is noise in narrow
 bands around one to three peaks whose frequencies and amplitudes wander.
 Voluntary motion is low-pass noise, or minimum-jerk strokes with corrective submovements (Flash and
 Hogan 1985; Meyer et al. 1988).  Lengths are in mm, times in s.
@@ -17,22 +17,25 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 GRID_HZ = 1500.0
-"""Sampling rate of the true motion: a multiple of 15, 30 and 60 Hz that contains 44 and 100 ms."""
+"""The sampling rate of the true motion, Hz.
+
+Its period divides 44 and 100 ms and the periods of cameras of 15, 30 and 60 Hz.
+"""
 
 WANDER_MM = 0.5
-"""Standard deviation per axis of low-pass voluntary motion."""
+"""The standard deviation per axis of low-pass voluntary motion, in millimetres."""
 
 MODULATION = 0.4
-"""Standard deviation of the slow relative change of a tremor's amplitude (Marsden et al. 1969)."""
+"""The standard deviation of the relative change of a tremor's amplitude (Marsden et al. 1969)."""
 
 FREQUENCY_WANDER_HZ = 0.4
-"""Standard deviation of the slow change of a peak's frequency."""
+"""The standard deviation of the slow change of a peak's frequency, in hertz."""
 
 SLOW_HZ = 0.15
-"""Bandwidth of those slow changes."""
+"""The bandwidth of the slow changes of amplitude and frequency, in hertz."""
 
 STROKE_BOX_MM = np.array([15.0, 15.0, 3.0])
-"""Half the size of the box that contains the targets of strokes."""
+"""Half the size of the box that contains the targets of strokes, in millimetres."""
 
 
 def low_pass_noise(random: np.random.Generator, count: int, cutoff_hz: float) -> Complexes:
@@ -53,7 +56,7 @@ def _shaped(random: np.random.Generator, amplitudes: Floats) -> Complexes:
 
 @dataclass(frozen=True, slots=True)
 class TremorPeak:
-    """Hold one peak of a tremor: frequency, half-power width, power, and gains (3,) by axis."""
+    """One peak of a tremor: frequency, half-power width, power, and gains (3,) by axis."""
 
     frequency_hz: float
     width_hz: float
@@ -96,7 +99,8 @@ def sample_tremor(
 def sample_wander(bandwidth_hz: float, duration_s: float, random: np.random.Generator) -> Floats:
     """Sample low-pass noise (n, 3) mm at GRID_HZ with 90 % of its power within the bandwidth.
 
-    The spectrum is that of white drive through two critically damped second-order muscles.
+    The spectrum is that of white noise after two critically damped filters of second order, which
+    model muscles.
     """
     count = round(duration_s * GRID_HZ)
     corner_hz = bandwidth_hz / 0.72

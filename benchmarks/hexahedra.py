@@ -16,26 +16,31 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 TOP_RAD = 1.7
-"""Half angle of the arc, centred on +z, that is one of the four sides of a meshed cross-section."""
+"""Half the angle of the arc, centred on +z, that is one of four sides of a meshed cross-section."""
 SIZE, NEAR = 0.17, 0.36
-"""Element size near the push, and distance from it with this size, in finger radii at scale 1."""
+"""The element size near the push, and the distance up to which elements have this size.
+
+Both are in finger radii at a scale of 1.
+"""
 GROWTH, MAX_SIZE_RATIO = 0.35, 0.3
-"""Increase of the element size per distance from the push, and maximum element size as a fraction
-of the radius of the cylinder, at a scale of 1."""
+"""The increase of the element size per distance from the push, and the maximum element size.
+
+The latter is a fraction of the radius of the cylinder, at a scale of 1.
+"""
 DEPTH_RATIO = 1.3
-"""Ratio of the element size along the depth to that along the skin."""
+"""The ratio of the element size along the depth to that along the skin."""
 OFFSETS = np.array(
     [(x, y, z) for z in (-1, 1) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
     + [(x, y, z) for z in (-1, 1) for x, y in ((0, -1), (1, 0), (0, 1), (-1, 0))]
     + [(x, y, 0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, 0), (1, 0), (0, -1), (0, 1))]
     + [(0, 0, -1), (0, 0, 1), (0, 0, 0)]
 )
-"""Local coordinates (27, 3) of the nodes of a hexahedron, in the order of VTK."""
+"""The local coordinates (27, 3) of the nodes of a hexahedron, in the order of VTK."""
 
 
 @dataclass(frozen=True, slots=True)
 class HexMesh:
-    """Mesh of a cylinder, reduced by its planes of symmetry.
+    """A mesh of a cylinder, reduced by its planes of symmetry.
 
     points (n, 3): nodes. cells (e, 27): hexahedra. held (n, 3): degrees of freedom that the support
     or a plane of symmetry holds. faces (f, 3, 3): nine-node faces of the touchable side. copies:
@@ -50,7 +55,7 @@ class HexMesh:
 
 
 def grade(ends: tuple[float, float], focus: float, size: float, scale: float, cap: float) -> Floats:
-    """Return coordinates whose spacing grows with the distance from the focus.
+    """Return coordinates between two ends whose spacing grows with the distance from `focus`.
 
     size: spacing near the focus. cap: maximum spacing. One coordinate is the focus if it is
     not near an end.

@@ -82,7 +82,10 @@ def camera_with_background(folder: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Case:
-    """Case; camera: makes the camera's entry in the launch file, given a folder for images."""
+    """A case of the measurement.
+
+    camera: function that returns the camera's entry in the launch file, given a folder for images.
+    """
 
     camera: Callable[[Path], dict[str, Any]]
     arming: str
@@ -116,7 +119,7 @@ def launch_file(folder: Path, case: Case) -> Path:
 
 
 async def measure(case: str, seconds: float) -> dict[str, Any]:
-    """Return the CPU time over wall time, per process and in total without the simulators."""
+    """Return the CPU time divided by wall time, per process and in total without the simulators."""
     with tempfile.TemporaryDirectory() as folder:
         plan = load_graph(launch_file(Path(folder), CASES[case]))
         async with RunningGraph(plan) as graph:

@@ -55,13 +55,13 @@ Image = NDArray[np.uint8]
 ROOT = Path(__file__).resolve().parents[1]
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
-"""Corrections for a flat sheet, for which four triangles are one plane."""
+"""The corrections for a flat sheet, for which `one_plane` equals the method of four triangles."""
 EYE_CORRECTIONS: tuple[Correction, ...] = ("none", "two_pass")
 ROUNDS = 40
 
 
 class CorrectionBench:
-    """Renderer, true sheet and eye of one scene."""
+    """The renderer, the true sheet and the viewer's eye of one scene."""
 
     def __init__(self, scene: Scene, *, stretch: float) -> None:
         self.scene, self.stretch = scene, stretch
@@ -103,7 +103,7 @@ class CorrectionBench:
         truth: DeformedSheet,
         sizes: Callable[[Image, float], Sequence[float]],
     ) -> Floats:
-        """Return the error of each size (m) against the expected image of the undeformed object."""
+        """Return the error of each size, m, relative to the image of the undeformed object."""
         shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
         projected = self.stage.draw(shown, predicted, DrawStyle(True, "object"), read=True)
         assert projected is not None
@@ -112,7 +112,7 @@ class CorrectionBench:
         return np.asarray(np.abs(np.array(sizes(picture, METRES_PER_PX)) - wanted))
 
     def errors(self, method: str, predicted: SheetPose, truth: DeformedSheet) -> ErrorMap:
-        """Return the errors at all points that the eye sees."""
+        """Return the image errors at all points that the eye sees."""
         pictures = draw_coordinate_ramps(self.stage, method, predicted)
         x, y = (seen(each, truth, self.scene, eye=self._eye) for each in pictures)
         return error_map(x, y, METRES_PER_PX)
@@ -166,7 +166,7 @@ def print_sizes(bench: CorrectionBench) -> None:
 
 
 def print_rolled_sizes_json(bench: CorrectionBench) -> None:
-    """Print the mean and the largest error of the sizes by two_pass, for sheets that roll, mm."""
+    """Print the mean and the largest size error of the method two_pass for rolling sheets, mm."""
     errors = []
     for degrees in (-50, -30, -10, 10, 30, 50):
         situation = bench.situation(roll_sheet(bench.scene, -np.radians(degrees)), None)
@@ -254,7 +254,7 @@ def print_stretches(bench: CorrectionBench) -> None:
 
 
 def print_frames(scene: Scene) -> None:
-    """Print the wall time of a stereo frame: the median over rounds that include every method."""
+    """Print the median wall time of a stereo frame for every method."""
     basis, context = deflection_cache.load_or_compute(scene, None), headless_context()
     print(f"\n{context.info['GL_RENDERER']}")
     heading("projector", "method", "ms", "over the floor", "processor, ms", "over the floor")

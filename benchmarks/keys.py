@@ -42,7 +42,7 @@ WITHOUT, WITH = NODES_USE, "the same with keys"
 
 
 def listen(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
-    """Subscribe as nodes do to another host; the key ring is that of the environment."""
+    """Subscribe like a node on another host, with the key ring that the environment names."""
 
     async def run() -> None:
         ended = asyncio.get_running_loop().create_future()
@@ -68,7 +68,7 @@ DESIGNS = (
 
 
 class Loop:
-    """Event loop in a thread for the ZAP authenticator, since the sender blocks its own."""
+    """An event loop in a thread, which runs the ZAP authenticator while the sender blocks."""
 
     def __init__(self) -> None:
         self.loop = asyncio.new_event_loop()
@@ -86,7 +86,7 @@ class Loop:
 
 @contextmanager
 def create_two_rings(folder: Path) -> Iterator[KeyRing]:
-    """Create the keys of two hosts; child processes read the other's ring."""
+    """Create the key rings of two hosts; child processes use the ring of the second host."""
     public = {}
     for host in ("main", "left"):
         public[host], secret = make_key_pair()
@@ -104,7 +104,7 @@ def create_two_rings(folder: Path) -> Iterator[KeyRing]:
 
 
 async def open_for_thread(topic: Topic, bind: list[str], keys: KeyRing) -> Publisher:
-    """Open a publisher on this loop, from which another thread sends; the loop stops reading it."""
+    """Open a publisher for another thread; the event loop then ignores its socket."""
     publisher = Publisher(topic, bind, keys=keys)
     await asyncio.sleep(0)
     asyncio.get_running_loop().remove_reader(publisher._socket.fileno())
@@ -112,7 +112,7 @@ async def open_for_thread(topic: Topic, bind: list[str], keys: KeyRing) -> Publi
 
 
 def measure(rounds: int, seconds: float, keys: KeyRing, loop: Loop) -> list[dict[str, Any]]:
-    """Return p50 and p99 of both designs per payload, and the medians of their ratios per round."""
+    """Return p50, p99 and the median of the ratios over rounds, of both designs per payload."""
 
     async def open_publisher(topic: Topic, endpoint: str) -> Publisher:
         return await open_for_thread(topic, [endpoint], keys)
@@ -161,7 +161,7 @@ def measure(rounds: int, seconds: float, keys: KeyRing, loop: Loop) -> list[dict
 
 
 def cost_of_checks() -> dict[str, float]:
-    """Return microseconds per message to read a header, without and with all checks."""
+    """Return the time to read a header without and with all checks, us per message."""
     payload = PAYLOADS[0]
     plan, writers = "0123456789abcdef", frozenset({"bench"})
     header = Header(1, 2, 3, "bench", "bench", 1, plan)

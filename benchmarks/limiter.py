@@ -66,28 +66,28 @@ Random = np.random.Generator
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 PERIOD_S = 1.0 / 140.0
 JITTER_S = 0.0015
-"""Maximum jitter of the delivery of commands."""
+"""The maximum jitter of the delivery of commands, in seconds."""
 SERVO_LAG_S = 0.025
 LANES = 96
-"""Number of arms that are simulated in parallel."""
+"""The number of arms that are simulated in parallel."""
 SIDES: tuple[Side, Side] = ("left", "right")
 PAIRS = 32
 LIFE = 400
-"""Number of commands after which an arm restarts at another position."""
+"""The number of commands after which an arm restarts at another position."""
 SHEET_FRACTION = 0.2
 THAW_S = 0.4
-"""Time in which a frozen arm catches up: sixteen lags of its servos."""
+"""The time in which a frozen arm catches up: sixteen lags of its servos, in seconds."""
 WITHIN = 1.0 + 1e-6
 NOISE_RAD = 5e-6
-"""Standard deviation of encoder noise."""
+"""The standard deviation of encoder noise, in radians."""
 HISTORY = 150
-"""Number of past measurements that a false one may repeat."""
+"""The number of past measurements that a false measurement may repeat."""
 FALSE_CHANCE, FALSE_CHANCE_MOVING, SECOND_CHANCE = 0.0005, 0.01, 0.0005
 """Probabilities per arm and cycle of a false measurement, and of a second master."""
 MAX_UNCHANGED_CYCLES = 7
-"""Number of cycles after which unchanged counters count as stalled."""
+"""The number of cycles after which unchanged counters count as stalled."""
 HUNTS = 80
-"""Number of sequences that hypothesis tries."""
+"""The number of sequences that hypothesis tries."""
 START_GUESS_RAD = RV_1A_MECHANICS.start_rad
 RANGE_RAD = RV_1A_MECHANICS.range_rad
 SPEED_RAD_PER_S = RV_1A_MECHANICS.speed_rad_per_s
@@ -115,7 +115,7 @@ class Tally:
     under: dict[str, AdversaryCounts] = field(default_factory=lambda: defaultdict(AdversaryCounts))
 
     def check_ratio(self, name: str, share: Floats | float, allowed: Flags | bool = False) -> None:
-        """Count ratios to a limit above 1; those that are `allowed` are counted apart."""
+        """Count ratios to a limit above 1; ratios that are `allowed` are counted separately."""
         shares = np.atleast_1d(np.asarray(share, dtype=np.float64))
         if shares.size == 0:
             return
@@ -126,9 +126,9 @@ class Tally:
 
 
 def compute_flange_poses(joints_rad: Floats) -> tuple[Floats, Floats]:
-    """Return rotations (n, 3, 3) and positions (n, 3) m of flanges in the base, of joints (n, 6).
+    """Return the rotations (n, 3, 3) and positions (n, 3), m, of flanges for joints (n, 6), rad.
 
-    Multiplies the joints of the simulated arm, for many arms at once.
+    The poses are products of the joint transforms of the simulated arm, in the frame of its base.
     """
     q = joints_rad.T
     axes = "zyyzyz"
@@ -148,7 +148,7 @@ def compute_flange_poses(joints_rad: Floats) -> tuple[Floats, Floats]:
 
 
 def points_on_tool(joints_rad: Floats, tool: Floats) -> Floats:
-    """Transform the tool's points (points, 3) from the flange to the base, (n, points, 3)."""
+    """Return the points (points, 3) of the tool in the base frames of n arms, (n, points, 3)."""
     turns, places = compute_flange_poses(joints_rad)
     found: Floats = np.einsum("nij,pj->npi", turns, tool) + places[:, None, :]
     return found
@@ -163,7 +163,7 @@ def find_tool_points(scene: Scene) -> Floats:
 
 
 class CheckedServos:
-    """Simulated joint servos of n arms, checked in each millisecond."""
+    """The simulated joint servos of n arms, whose limits are checked in each millisecond."""
 
     def __init__(self, joints_rad: Floats, scene: Scene, tally: Tally) -> None:
         self.servo = Servo(joints_rad.copy(), SERVO_LAG_S)
@@ -171,7 +171,7 @@ class CheckedServos:
         self._tool, self._fastest = find_tool_points(scene), scene.arms.max_tool_speed_m_per_s
         self._tally = tally
         self.speed_share = np.zeros(len(joints_rad))
-        """Maximum ratio to the tool speed of each arm in the last `advance`."""
+        """The maximum ratio to the tool speed of each arm in the last `advance`."""
 
     def advance(
         self,
@@ -183,8 +183,8 @@ class CheckedServos:
     ) -> None:
         """Advance all arms by `duration_s`.
 
-        moving (n,): 1 for an arm that obeys, 0 for one that decelerates, -1 for a frozen one.
-        catching_up (n,): it was frozen, and catches up as fast as it can.
+        moving (n,): 1 for an arm that obeys, 0 for an arm that decelerates, -1 for a frozen arm.
+        catching_up (n,): true for an arm that was frozen and now catches up at full speed.
         """
         steps = int(np.ceil(duration_s / 1e-3))
         step_s = duration_s / steps
@@ -210,7 +210,7 @@ class CheckedServos:
             self.speed_share = np.maximum(self.speed_share, speed / self._fastest)
 
     def _hold_back(self, joints: Floats, velocity: Floats, moving: Floats, step_s: float) -> None:
-        """Undo the step of frozen arms; decelerate stopping ones instead."""
+        """Undo the step of frozen arms, and decelerate stopping arms."""
         servo, still, braking = self.servo, moving < 0, moving == 0
         servo.joints_rad[still], servo.velocity_rad_per_s[still] = joints[still], 0.0
         slower = decelerate(velocity, step_s, ACCELERATION_RAD_PER_S2)
@@ -248,7 +248,7 @@ def _anywhere(random: Random, limits: JointLimits, beyond: float = 0.0) -> Float
 def random_goals(
     random: Random, limits: JointLimits, lane: Lane
 ) -> Iterator[tuple[Floats, Floats]]:
-    """Yield goals anywhere, in range or beyond, each for some cycles."""
+    """Yield random goals within and beyond the range; each goal is repeated for some cycles."""
     while True:
         goal = _anywhere(random, limits, 0.5)
         for _ in range(random.integers(1, 60)):
@@ -269,7 +269,7 @@ def invalid_goals(
 
 
 def extremes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """Yield alternating ends of each joint's range, at periods from two cycles to many."""
+    """Yield goals that alternate between the ends of each joint's range, at different periods."""
     while True:
         up, each = random.random(6) < 0.5, int(random.integers(1, 40))
         goal = np.where(up, limits.max_rad, limits.min_rad)
@@ -298,7 +298,7 @@ def false_velocities(
 
 
 def spins(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """Yield J4 against J6 with J5 near zero, then J5 away from it: the wrist singularity."""
+    """Yield goals near the wrist singularity: J4 and J6 rotate in opposite directions."""
     while True:
         goal = lane.joints_rad.copy()
         goal[4] = 0.0
@@ -315,7 +315,7 @@ def spins(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Flo
 
 
 def pushes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """Yield motions of each joint that move the tool fastest, forth and back."""
+    """Yield motions back and forth of each joint that move the tool at its maximum speed."""
     while True:
         direction = random.normal(0.0, 1.0, 3)
         nudged = lane.joints_rad + np.vstack([np.zeros(6), 1e-4 * np.eye(6)])
@@ -328,7 +328,7 @@ def pushes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Fl
 
 
 def walks(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """Yield a moving goal with its true velocity, which changes now and then."""
+    """Yield a moving goal with its true velocity, which changes at random times."""
     goal, speed = lane.joints_rad.copy(), np.zeros(6)
     while True:
         if random.random() < 0.05:
@@ -417,7 +417,7 @@ def check_commands(
     velocities: tuple[Floats, Floats],
     step_s: float,
 ) -> None:
-    """Check commands (n, 6) that follow `held`, with the velocities (n, 6) of both steps."""
+    """Check commands `now` (n, 6) that follow commands `held` (n, 6), and their velocities."""
     limits, fastest = geometry.joint_limits, geometry.max_tool_speed
     old, new = velocities
     beyond = np.maximum(limits.min_rad - now, now - limits.max_rad).max(axis=1)
@@ -493,12 +493,12 @@ def search_sequences(scene: Scene) -> list[list[Floats]]:
 
 
 History = deque[Floats]
-"""Measured joints (n, 6) of all arms, the newest last."""
+"""The measured joints (n, 6) of all arms, in order of time."""
 
 
 @dataclass
 class FalseMeasurement:
-    """False measurement of an arm for some cycles; the kinds are applied one after another."""
+    """A source of false measurements of an arm for some cycles, of one kind at a time."""
 
     kinds: tuple[str, ...]
     cycles: int
@@ -582,7 +582,7 @@ FALSE_KINDS: dict[str, Callable[..., tuple[Floats, Freshness]]] = {
 
 @dataclass
 class SecondMaster:
-    """Other client that commands the same arm for some cycles, at up to half the tool speed.
+    """A second client that commands the same arm for some cycles, at up to half the tool speed.
 
     refuses: whether the controller rejects the bridge's commands; otherwise it executes both in
         turn.
@@ -613,7 +613,7 @@ class SecondMaster:
 
 @dataclass
 class Bridge:
-    """Control of one bridge, and the remaining cycles of its arm's faults."""
+    """The control of one bridge, and the remaining cycles of the faults of its arm."""
 
     geometry: ArmGeometry
     control: ArmControl
@@ -661,7 +661,7 @@ class Bridge:
             self.control.on_exchange_failed("no answer", silent=True)
 
     def other_command(self, random: Random, joints_rad: Floats, step_s: float) -> Floats | None:
-        """Return joints (6,) that a second master sends in this cycle, or None."""
+        """Return the joints (6,), rad, that a second master sends; None if there is none."""
         if self.second is None and random.random() < SECOND_CHANCE:
             self.second = second_master(random, self.geometry, joints_rad)
         if self.second is None:
@@ -687,7 +687,7 @@ class Bridge:
 
 
 def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
-    """Yield targets: jumps, moving, invalid, overstretched and late ones."""
+    """Yield sheet targets that jump, move, are invalid, overstretch the sheet, or are late."""
     while True:
         reach = random.choice([0.02, 0.1, 0.3])
         place, turn = random.normal(0.0, reach, 3), random.normal(0.0, 2.0 * reach, 3)
@@ -711,7 +711,7 @@ def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
 
 
 def sheet_targets(commands: int, random: Random, scene: Scene, tally: Tally) -> None:
-    """Run this number of commands of pairs of bridges with simulated arms."""
+    """Run pairs of bridges with simulated arms until they have sent this number of commands."""
     end = tally.commands + commands
     while tally.commands < end:
         left = (end - tally.commands) // (2 * PAIRS) + 1
@@ -809,7 +809,10 @@ def check_bridge(
     before: Floats | None,
     step_s: float,
 ) -> None:
-    """Judge a bridge's command (6,); before: the last one, None if it did not move the arm."""
+    """Check a command of a bridge.
+
+    before: previous command (6,), rad; None if it did not move the arm.
+    """
     if command.mode != "move":
         return
     joints, limits = command.joints_rad, geometry.joint_limits
@@ -880,7 +883,10 @@ def percentiles_us(times_ns: Sequence[int]) -> dict[str, float]:
 
 
 def run(commands: int, seed: int, *, searching: bool = True) -> dict[str, Any]:
-    """Run the whole benchmark."""
+    """Run the benchmark with this number of commands; return its report.
+
+    searching: whether hypothesis searches for sequences of goals first.
+    """
     began_s = time.perf_counter()
     scene, random = load_scene(SCENE_FILE), np.random.default_rng(seed)
     check = random.uniform(-1.0, 1.0, (5, 6))

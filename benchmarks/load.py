@@ -66,11 +66,11 @@ MEASURED: dict[str, tuple[str, Callable[[Scene], float]]] = {
     "hold_mm.p95": ("sheet to its target", lambda scene: 1e3 * scene.tolerances.sheet_position_m),
     "exposure_to_arm_ms.p95": ("exposure to arm", lambda scene: 1e3 * scene.tolerances.latency_s),
 }
-"""Label and tolerance of each value that is compared with a tolerance, by its key in a row."""
+"""The label and the tolerance of each evaluated value, by the key of the value in a row."""
 
 
 class State(StrEnum):
-    """State of a level, from best to worst."""
+    """The worst state that occurred at a level; members are ordered from best to worst."""
 
     WITHIN = "within_tolerance"
     OUT = "out_of_tolerance"
@@ -84,7 +84,7 @@ MARKERS = {State.WITHIN: "o", State.OUT: "s", State.HOLDS: "^", State.STOPS: "X"
 
 @dataclass(frozen=True, slots=True)
 class Factor:
-    """Quantity that is varied.
+    """A quantity that is varied.
 
     levels: values, in `unit`. key: path of the value in the scene file; None: it is not in the
     scene. on_cables: whether it is a property of the arms' network cables.
@@ -109,7 +109,7 @@ FACTORS = {
     "loss": Factor("%", (0, 1, 2, 5, 10, 20), on_cables=True),
 }
 JITTER_DELAY_S = 0.02
-"""Delay of the cables while the jitter is varied."""
+"""The delay of the cables while the jitter is varied, in seconds."""
 
 
 def make_cable(factor: str, level: float) -> dict[str, float]:
@@ -124,7 +124,7 @@ def make_cable(factor: str, level: float) -> dict[str, float]:
 
 
 def write_scene(name: str, level: float, target: Path) -> Path:
-    """Write the demo's scene with a value of a factor; for the stretch, it is held constant."""
+    """Write the demo's scene with a value of a factor; the factor stretch makes it constant."""
     yaml = YAML()
     values = yaml.load(SCENE_FILE.read_text())
     key = FACTORS[name].key
@@ -243,7 +243,7 @@ def evaluate_arms(
 
 
 def read_value(row: Mapping[str, Any], key: str) -> float | None:
-    """Return the value at a key such as "sheet_mm.p95"; None if the row lacks it."""
+    """Return the value at a key such as "sheet_mm.p95"; None if the row does not contain it."""
     outer, _, inner = key.partition(".")
     found = row.get(outer)
     value = found.get(inner) if isinstance(found, dict) else None

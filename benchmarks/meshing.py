@@ -102,7 +102,7 @@ def meshed_volume(mesh: SolidMesh) -> float:
 
 
 def spacing_mm(mesh: SolidMesh) -> float:
-    """Return the root of the touchable skin's area per node."""
+    """Return the mean spacing of touchable nodes, mm: the root of the skin's area per node."""
     corners = mesh.nodes[mesh.contact_nodes][mesh.contact_faces]
     area = 0.0
     for i, j, k in ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)):

@@ -53,7 +53,10 @@ EPOCH = 1
 
 
 class Line(Protocol):
-    """Sending end of a design; `endpoint` is passed to its receiver."""
+    """The sending end of a design.
+
+    endpoint: address for the receiver.
+    """
 
     endpoint: str
 
@@ -71,7 +74,9 @@ class Payload:
 
 @dataclass(frozen=True)
 class Design:
-    """Method of receiving; `typed` designs return validated messages, others bytes.
+    """A method of receiving messages.
+
+    typed: whether it returns validated messages; other designs return bytes.
 
     open: opens its sending end; None: a publisher of `flexsheet.messages.bus`.
     """
@@ -203,7 +208,7 @@ DESIGNS = (
 
 
 def refuse_receiver(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
-    """Stand in for the receiver of a design without a second process."""
+    """Raise RuntimeError, since this design has no receiving process."""
     raise RuntimeError(f'"{ONE_PROCESS}" has no receiving process')
 
 
@@ -250,7 +255,7 @@ def receive_rounds(
     results: Connection,
     prepare: Callable[[], None] | None,
 ) -> None:
-    """Receive in a child process: measure, answer, and send the latencies of each round."""
+    """Receive messages in a child process, and send the latencies of each round to the parent."""
     if prepare is not None:
         prepare()
     latencies: list[int] = []
@@ -285,7 +290,7 @@ def make_header(sequence: int, stamp_ns: int) -> Header:
 
 
 class BusLine:
-    """Publisher of `messages.bus`; for raw designs it sends as many bytes."""
+    """A publisher of `messages.bus`, which sends the same number of raw bytes for raw designs."""
 
     def __init__(
         self,
@@ -318,7 +323,7 @@ class BusLine:
 
 
 class Sender:
-    """Parent's end of one design: its line and the receiving child process.
+    """The sender of one design and its receiving child process.
 
     prepare: function that the child calls first.
     """
@@ -390,7 +395,7 @@ class Sender:
 
 
 class LocalSender:
-    """Publisher and subscriber in one loop; the counterpart of `Sender`."""
+    """A publisher and a subscriber in one event loop, with the interface of `Sender`."""
 
     def __init__(self, payload: Payload, endpoint: str) -> None:
         self.design, self._payload, self._endpoint = LOCAL, payload, endpoint
@@ -456,7 +461,7 @@ def measure(
     open_sender: Callable[[Design, Payload, int], Sender | LocalSender],
     step: Callable[[], object],
 ) -> list[dict[str, Any]]:
-    """Return one row per design: p50, p99, and their ratios to the floor, medians over rounds.
+    """Return one row per design: medians over rounds of p50, p99 and their ratios to ZeroMQ.
 
     open_sender: its third argument is the design's index.
     """
@@ -508,7 +513,7 @@ def measure(
 
 
 def codec_costs() -> list[dict[str, Any]]:
-    """Return microseconds within one process, the minimum of several repetitions."""
+    """Return the times to encode and decode messages, us, as the minimum of repetitions."""
 
     def best_us(action: Callable[..., object], *arguments: Any, **named: Any) -> float:
         call = partial(action, *arguments, **named)
@@ -589,7 +594,7 @@ def print_tables(report: dict[str, Any], console: Console) -> None:
 
 
 def format_ratios(report: dict[str, Any], design: str = NODES_USE) -> str:
-    """Format the ratios of a design, by default of the one that nodes use."""
+    """Format the ratios of a design; the default is the design that nodes use."""
     return "; ".join(
         f"{row['payload']} {row['p50_ratio']:.2f} at p50, {row['p99_ratio']:.2f} at p99"
         for row in report["latency"]

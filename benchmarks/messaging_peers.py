@@ -56,7 +56,7 @@ OVER = {
 
 @dataclass(frozen=True)
 class Peer:
-    """Messaging library: its package, its address for each transport, and its transports."""
+    """A messaging library: its package, its address for each transport, and its transports."""
 
     package: str
     design: Design
@@ -110,7 +110,7 @@ PEERS = (
 
 
 class KeyedLine(BusLine):
-    """Publisher with keys, which needs a running event loop."""
+    """A publisher with keys, which needs a running event loop."""
 
     def __init__(self, payload: Payload, place: str, ring: KeyRing, loop: keys.Loop) -> None:
         super().__init__(
@@ -140,7 +140,7 @@ def _libc(call: str, *arguments: int) -> None:
 
 
 def enter_network(pid: int) -> None:
-    """Enter the network namespace of that process, before any socket is opened."""
+    """Enter the network namespace of a process; call this function before a socket is opened."""
     with open(f"/proc/{pid}/ns/net") as space:
         _libc("setns", space.fileno(), CLONE_NEWNET)
 

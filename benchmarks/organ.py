@@ -19,7 +19,7 @@ Indices = NDArray[np.int64]
 SUBDIVISIONS = 3
 HALF_MM = (62.0, 42.0, 30.0)
 TAPER_Y, TAPER_Z = 0.2, 0.25
-"""Relative decrease of the organ's size from its middle to its thin end."""
+"""The relative decrease of the organ's size from its middle to its thin end."""
 FURROW_AT, FURROW_WIDTH, FURROW_MM = 0.2, 0.3, 4.0
 
 

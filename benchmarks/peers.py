@@ -39,12 +39,12 @@ DORA_STARTS_S, DORA_ENDS_S = 20.0, 5.0
 
 
 def raw_bytes(payload: Payload) -> bytearray:
-    """Make one block as long as our message; it begins with sequence and stamp."""
+    """Make a block of bytes as long as the message, with sequence number and timestamp first."""
     return bytearray(b"".join(encode(payload.make(0), make_header(0, 0))))
 
 
 class ZmqLine:
-    """ZeroMQ without flexsheet: the reference where `flexsheet.messages.bus` would require keys."""
+    """A ZeroMQ publisher: the reference between networks, where flexsheet requires keys."""
 
     def __init__(self, payload: Payload, place: str) -> None:
         self._frames = [bytearray(one) for one in encode(payload.make(0), make_header(0, 0))]
@@ -111,7 +111,7 @@ nodes:
   - {id: sender, path: dynamic, outputs: [message]}
   - {id: receiver, path: dynamic, inputs: {message: {source: sender/message, queue_size: 1000}}}
 """
-"""Dataflow of dynamic nodes, which are this benchmark's processes."""
+"""The dataflow of dora; its nodes are processes of this benchmark."""
 
 
 def dora_node(name: str) -> Any:
@@ -129,7 +129,10 @@ def dora_node(name: str) -> Any:
 
 
 class DoraLine:
-    """Dataflow under a daemon that `dora run` starts; place: a folder for it."""
+    """A dataflow whose daemon `dora run` starts.
+
+    place: folder for its files.
+    """
 
     def __init__(self, payload: Payload, place: str) -> None:
         self.endpoint = "receiver"
@@ -333,7 +336,7 @@ class LcmHeader:
 
 @dataclass(slots=True)
 class LcmFingertip:
-    """LCM type with the fields of `Fingertip`."""
+    """An LCM type with the fields of `Fingertip`."""
 
     header: LcmHeader
     valid: bool
@@ -388,7 +391,7 @@ class LcmFingertip:
 
 @dataclass(slots=True)
 class LcmStereoPair:
-    """LCM type with the fields of `StereoPair`; images are byte[rows * columns]."""
+    """An LCM type with the fields of `StereoPair`; images are byte[rows * columns]."""
 
     header: LcmHeader
     device: str

@@ -76,7 +76,7 @@ def geometries() -> dict[str, Mapping[str, Any]]:
 
 
 def make_planner(scene: Scene, geometry: Mapping[str, Any]) -> SheetTrajectoryPlanner:
-    """Make the planner's model from its own parameters, the object in the world frame."""
+    """Make the planner's model with its default parameters for an object in the world frame."""
     here = Pose(position_m=np.zeros(3), rpy_rad=np.zeros(3))
     body = scene.object.model_validate(
         {**dict(scene.object), "geometry": dict(geometry), "world_from_object": here}
@@ -105,7 +105,7 @@ def make_compliance(scene: Scene) -> ComplianceController:
 
 
 def copy_planner(plan: SheetTrajectoryPlanner) -> SheetTrajectoryPlanner:
-    """Copy a plan in its initial state, since making one for a mesh takes a second."""
+    """Copy a plan in its initial state; to make a plan for a mesh takes a second."""
     other = copy.copy(plan)
     other._contact_state = copy.copy(plan._contact_state)  # it changes by assignment only
     return other

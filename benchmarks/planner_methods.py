@@ -46,13 +46,13 @@ from tests.facets import Facets
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 NormalAt = Callable[[Floats], Floats]
-"""Function from points (n, 3) to the unit normals (n, 3) of the nearest surface points."""
+"""The function from points (n, 3) to the unit normals (n, 3) of the nearest surface points."""
 
 SEMI_AXES_M = (0.05, 0.03, 0.02)
 SUBDIVISIONS = (2, 3, 4)
 QUERIES, HEIGHT_RATIO = 400, 1.05
 MAX_EDGE_RATIO = 0.35
-"""Maximum median edge of meshes for jets, over the smallest radius of curvature."""
+"""The maximum ratio of median edge length to smallest radius of curvature for the jet methods."""
 
 
 def ellipsoid_mesh(subdivisions: int) -> tuple[Floats, Indices]:
@@ -65,13 +65,13 @@ def ellipsoid_mesh(subdivisions: int) -> tuple[Floats, Indices]:
 
 
 def facet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
-    """Return the normal of the nearest triangle."""
+    """Return a function that computes the normal of the nearest triangle."""
     facets, normals = Facets(vertices, triangles), triangle_normals(vertices, triangles)
     return lambda points: np.asarray(normals[facets.nearest(points)[0]])
 
 
 def blended_normals(vertices: Floats, triangles: Indices) -> NormalAt:
-    """Interpolate the vertices' normals at the nearest point of the facets (Phong 1975)."""
+    """Return a function that interpolates the normals of vertices (Phong 1975)."""
     facets, normals = Facets(vertices, triangles), vertex_normals(vertices, triangles)
 
     def normal_at(points: Floats) -> Floats:
@@ -83,13 +83,13 @@ def blended_normals(vertices: Floats, triangles: Indices) -> NormalAt:
 
 
 def jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
-    """Return the normals of `SmoothMeshShape`, for independent queries."""
+    """Return a function that computes normals by `SmoothMeshShape` without a previous point."""
     shape = SmoothMeshShape(vertices, triangles, default_smoothing_m(vertices, triangles))
     return lambda points: shape.closest(points).normal
 
 
 def followed_jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
-    """Return the normals of `SmoothMeshShape`, starting from points 0.3 mm away."""
+    """Return a function like `jet_normals` that starts from a previous point 0.3 mm away."""
     shape = SmoothMeshShape(vertices, triangles, default_smoothing_m(vertices, triangles))
     earlier: dict[bytes, Floats] = {}
 
@@ -141,7 +141,7 @@ def _trial(
     case: Case,
     in_range: bool,
 ) -> Trial:
-    """Return the trial of one query in time, and of all queries in error."""
+    """Return a trial with the time of one query and the error of all queries."""
 
     def error_deg(_: Floats) -> float:
         apart = np.linalg.norm(normal_at(queries) - wanted, axis=1)
@@ -163,7 +163,7 @@ MESH_NORMAL = Family(
 
 
 RollStep = Callable[[Shape, SheetContact, Floats], SheetContact]
-"""Function of a shape, the previous contact and a finger (3,) that returns the next contact."""
+"""The function of a shape, the previous contact and a finger (3,) that returns the next contact."""
 
 ROLLED_SHAPES: dict[str, Callable[[], Shape]] = {
     "cylinder": lambda: CylinderShape(0.0353553, 0.12),
@@ -216,7 +216,7 @@ def roll_by_chords(shape: Shape, before: SheetContact, finger: Floats) -> SheetC
 
 
 def roll(shape: Shape, before: SheetContact, finger: Floats) -> SheetContact:
-    """Roll as the planner does, see `rolling.roll_contact`."""
+    """Roll the sheet by the method of the planner, `rolling.roll_contact`."""
     return roll_contact(before, shape.closest(finger, previous=before.point))
 
 
@@ -285,7 +285,7 @@ def _roll_trial(
     corners: Floats,
     in_range: bool,
 ) -> Trial:
-    """Return the trial of one step in time, and of the whole stroke in error."""
+    """Return a trial with the time of one step and the error of the whole stroke."""
     step = ROLLING_METHODS[method]
     begun = make_tangent_contact(np.eye(3), shape.closest(fingers[0]), WIDE_M)
     wanted = apply(true.object_from_sheet, corners)

@@ -45,23 +45,25 @@ from tests.lab_bags import Arm, Gap, bags, gaps, read_arm
 
 PUBLISH_PERIOD_S = 1.0
 MARGIN_NS = round(1e9 * (FLUSH_PERIOD_S + PUBLISH_PERIOD_S + READER_RECONNECT_S + 0.5))
-"""Allowed gap before and after a fault: data not yet written, and messages sent before a reader is
-connected again."""
+"""The allowed gap in a bag before and after a fault, in nanoseconds.
+
+It covers data that are not yet written, and messages that are sent before a reader reconnects.
+"""
 
 STANDS_RAD = 1e-3
 STOPPED_NS = 200_000_000
-"""Time that joints need to reach a command, because servos lag."""
+"""The time that joints need to reach a command in nanoseconds, because servos lag."""
 
 MAX_MORE_DESCRIPTORS = 10
 MAX_MORE_BYTES = 20 << 20
 MIN_LIFE_S = 600.0
-"""Minimum lifetime of a process for the detection of leaks; its first quarter is the warm-up."""
+"""The minimum lifetime of a process for the detection of leaks in seconds, with its warm-up."""
 
 RESET_TRIES = 10
 
 
 class FaultKind(StrEnum):
-    """Kind of a fault."""
+    """The kind of a fault."""
 
     NODE_KILLED = "node killed"
     NODE_SUSPENDED = "node suspended"
@@ -75,7 +77,7 @@ class FaultKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """Random fault: its host, its node (or None) and its duration."""
+    """A random fault: its host, its node (or None) and its duration."""
 
     kind: FaultKind
     host: str
@@ -183,7 +185,7 @@ class Sample:
 
 @dataclass
 class ProcessMonitor:
-    """Samples of all processes, and remains of ended ones."""
+    """Samples of all processes, and files and processes that ended processes have left."""
 
     lab: Lab
     samples: dict[tuple[int, float, str], list[Sample]] = field(
@@ -192,7 +194,7 @@ class ProcessMonitor:
     violations: list[str] = field(default_factory=list)
 
     def sample(self) -> None:
-        """Sample all processes, and record remains of ended ones."""
+        """Sample all processes, and record what ended processes have left."""
         launchers = {process.pid for process in self.lab.launchers.values()}
         root = str(self.lab.folder)
         for process in psutil.process_iter():
@@ -266,14 +268,14 @@ def merge_spans(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def fault_free_ratio(results: list[Result]) -> float:
-    """Return the fraction of the time that no fault and no margin of a fault covers."""
+    """Return the fraction of the time that is outside of all faults and their margins."""
     spans = merge_spans([(one.during_ns[0], one.during_ns[1]) for one in results])
     covered_ns = sum(end - begin for begin, end in spans)
     return 1.0 - covered_ns / (spans[-1][1] - spans[0][0]) if spans else 1.0
 
 
 def missing_by_fault(lost: list[Gap], results: list[Result]) -> dict[str, float]:
-    """Return the longest gap in the main host's bag after each fault, s, the longest first."""
+    """Return the longest gap in the main host's bag after each fault, s, sorted by length."""
     longest: dict[str, float] = {}
     for gap in lost:
         earlier = [one for one in results if one.during_ns[0] - MARGIN_NS <= gap.from_ns]
@@ -289,7 +291,7 @@ def moves_under_estop(arm: Arm) -> float:
 
 
 async def restore(lab: Lab) -> None:
-    """Restart all launchers after a fault that left the arms stuck, so that later faults count."""
+    """Restart all launchers after a fault from which the arms did not recover."""
     for host in HOSTS:
         await lab.cable(host)
     for process in lab.launchers.values():
@@ -345,7 +347,7 @@ async def run_random(given: argparse.Namespace) -> int:
 
 
 async def attempt(lab: Lab, fault: Fault) -> Result:
-    """Inject the fault, and wait until both arms follow again."""
+    """Inject a fault, and wait until both arms follow again."""
     work: Callable[[Span], Awaitable[Any]] = partial(inject, lab, fault)
     begun_ns = time.monotonic_ns()
     try:

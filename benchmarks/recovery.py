@@ -56,7 +56,10 @@ async def kill_during_stroke(bag: Path) -> int:
 
 
 def compute_times(bag: Path, killed_ns: int) -> dict[str, Any]:
-    """Return the times in ms, from the stamps of the bag."""
+    """Return the recovery times of a bag, ms.
+
+    killed_ns: time at which the node was killed, ns.
+    """
     tips: list[int] = []
     arms: dict[str, list[tuple[int, str]]] = {"left": [], "right": []}
     for topic, message, header, _ in BagReader(bag, topics=["fingertip", "arm_left", "arm_right"]):

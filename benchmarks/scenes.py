@@ -119,7 +119,7 @@ async def measure(plan: ResolvedGraph, seconds: float) -> dict[str, Any]:
 
 
 def run_scene(scene: str, seconds: float) -> dict[str, Any]:
-    """Measure a scene, and the start of the smallest one directly afterwards."""
+    """Measure a scene, and then the start-up time of `rigid-plane` for comparison."""
     with tempfile.TemporaryDirectory() as folder:
         plan = load_scene_graph(Path(folder), scene)
         precompute_graph(plan, lambda text: print(text, file=sys.stderr))

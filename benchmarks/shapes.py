@@ -39,14 +39,14 @@ SOLIDS = (
 )
 QUERIES, REPEATS = 200, 5
 MOVED_M = 3e-4
-"""Motion of a finger at 20 mm/s between two images at 60 Hz."""
+"""The motion of a finger at 20 mm/s between two images at 60 Hz."""
 EDGES = (1.25, 1.75, 2.5, 3.5)
 STEPS_M = (4e-4, 1e-4)
 WAYS, WAY_M = 8, 0.06
 
 
 def microseconds(ask: Callable[[int], object]) -> str:
-    """Format median and 99th percentile over queries, each the minimum of several repeats."""
+    """Return the median and 99th percentile of query times (minimum of repeats) as text, us."""
     best = np.empty(QUERIES)
     for i in range(QUERIES):
         took = []

@@ -73,19 +73,19 @@ Floats = NDArray[np.float64]
 SAMPLE_S = 10.0
 WARM_UP_S = 600.0
 WARM_UP_SHARE = 0.25
-"""Warm-up, as a fraction of a run that is shorter than four warm-ups."""
+"""The warm-up of a short run, as a fraction of its duration."""
 
 MIN_FIT_S = 900.0
-"""Minimum duration for slopes; caches that fill in less time look like leaks."""
+"""The minimum duration for slopes in seconds; in less time, caches that fill look like leaks."""
 
 READER_NICE = 15
 
 GROWTH_B_PER_H = 2 << 20
-"""Minimum certain growth of a finding: 0.3 GB in a week."""
+"""The minimum growth of memory that is reported, in bytes per hour: 0.3 GB in a week."""
 
 MIN_GROWTH_B = 1 << 20
 DRIFT_RATIO = 1.2
-"""Maximum ratio of the last third's median latency to the first third's."""
+"""The maximum ratio of the median latencies in the last and the first third of a run."""
 
 MIN_DRIFT_MS = 1.0
 LAUNCHER = "launcher"
@@ -121,7 +121,7 @@ class MachineSample:
 
 @dataclass(frozen=True, slots=True)
 class Slope:
-    """Growth per hour: the estimate and its 95 % interval."""
+    """The growth per hour: the estimate and its 95 % interval."""
 
     per_h: float
     low_per_h: float
@@ -130,7 +130,7 @@ class Slope:
 
 @dataclass
 class PortTotal:
-    """Sum of a reader's counters over all starts of its process."""
+    """The sum of the counters of a reader over all starts of its process."""
 
     messages: int = 0
     dropped: int = 0
@@ -292,7 +292,7 @@ class Soak:
         self._cpu_s: dict[int, float] = {}
 
     async def run(self) -> None:
-        """Use the graph for the duration; a premature end is reported in `problems`."""
+        """Run the graph for the duration; record a premature end in `problems`."""
         scene = self.plan.scene_message()
         assert scene is not None  # the demo has one
         precompute_graph(self.plan, say)
@@ -405,7 +405,7 @@ class Soak:
     async def _read_bags(self, *, all_of_them: bool = False) -> None:
         """Evaluate the complete bags in a process with low priority, and remove them.
 
-        The newest bag is still being written; at the end it is evaluated and not removed.
+        The newest bag is incomplete until the end of the run; it is then evaluated but not removed.
         """
         bags = sorted(self.folder.glob("soak-*.mcap"), key=lambda bag: bag.stat().st_mtime_ns)
         context = multiprocessing.get_context("spawn")
@@ -433,7 +433,7 @@ def lower_priority() -> None:
 
 
 def slope(times_s: Floats, values: Floats) -> Slope | None:
-    """Return the median of the slopes between all pairs (Theil, Sen); None for too short a time."""
+    """Return the median slope of all pairs (Theil, Sen); None if the time is too short."""
     if times_s[-1] - times_s[0] < MIN_FIT_S:
         return None
     found = theilslopes(values, times_s / 3600.0)
@@ -445,7 +445,7 @@ def warm_up_s(lived_s: float) -> float:
 
 
 def process_report(samples: Sequence[Sample]) -> dict[str, Any]:
-    """Summarize a process; of a restarted one, its newest start."""
+    """Summarize the samples of a process since its newest start."""
     pid = samples[-1].pid
     ours = [one for one in samples if one.pid == pid]
     settled_from_s = ours[0].time_s + warm_up_s(ours[-1].time_s - ours[0].time_s)

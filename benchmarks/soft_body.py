@@ -40,16 +40,16 @@ Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 DEMO_SPACING_M = 0.0045
 JUDGED_AT = ((0.004, 0.1), (0.021, 0.55))
-"""Position along the axis (m) and angle of points that are not samples of a table."""
+"""The positions along the axis (m) and angles (rad) of points that are no samples of a table."""
 JUDGE_RATIO = 0.3
-"""Spacing of the reference mesh at the push, in finger radii: finer than the table's."""
+"""The spacing of the reference mesh at the push in finger radii, finer than that of the table."""
 SPACINGS_M = (0.006, 0.0045, 0.003, 0.0022)
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.003, 0.006, 0.010, 0.020)
 HEADINGS_RAD = np.radians([0.0, 37.0, 90.0])
 STEP_M, STEPS = 2e-5, 300
 FROM_M = (0.004, 0.003)
 MIN_TOUCH_ANGLE_RAD = 0.7
-"""Touchable height of the finest mesh, so that its table fits into memory."""
+"""The touchable angle of the finest mesh in radians, for which its table fits into memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ def places(heading_rad: float) -> Iterator[tuple[float, float]]:
 
 
 def evaluate_table(scene: Scene, spacing_m: float) -> None:
-    """Evaluate a table: compute or load it, compare it with full Newton, slide over it, print."""
+    """Print the error of a table relative to Newton solutions, and results of slides."""
     maker = SoftBodyFactory(
         skin_spacing_m=spacing_m,
         linear_depth_m=0.006,
@@ -173,7 +173,7 @@ def hertz_force_n(scene: Scene, depth_m: float) -> float:
 
 
 def measure(scene: Scene, spacing_m: float) -> None:
-    """Precompute one mesh, cold and warm, slide over it, print."""
+    """Print the time to precompute one mesh without and with a cache, and results of slides."""
     spec = body.make_soft_body_spec(scene, spacing_m)
     if spacing_m == min(SPACINGS_M):
         mesh = replace(spec.mesh, touch_angle_rad=MIN_TOUCH_ANGLE_RAD)

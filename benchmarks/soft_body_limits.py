@@ -47,7 +47,7 @@ LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """Scene's body by the linear method, and its mesh."""
+    """The soft body of a scene by the linear method, and its mesh."""
 
     scene: Scene
     soft: SceneBody
@@ -63,7 +63,7 @@ def make_scene(
     nu: float = 0.45,
     finger_m: float = 0.007,
 ) -> Scene:
-    """Return the demo's scene with another object, its front at the world's origin."""
+    """Return the demo's scene with another object whose front is at the world's origin."""
     content = load_scene(SCENE_FILE).model_dump()
     content["object"] = {
         "geometry": geometry,
@@ -97,7 +97,7 @@ def make_sample(body: Body, x: float = 0.002, y: float = 0.0015) -> SamplePoint:
 
 
 def newton(body: Body, sample: SamplePoint, depths_m: tuple[float, ...] = DEPTHS_M) -> Snapshot:
-    """Solve full Newton on the body's own mesh."""
+    """Solve for the forces at several depths with Newton's method on the mesh of the body."""
     return solve_snapshot(
         SnapshotJob(
             nodes=body.mesh.nodes,
@@ -244,7 +244,7 @@ def rim() -> None:
 
 
 def two_supports() -> None:
-    """Compare a cylinder fixed at the middles of its ends only with one fixed along its back."""
+    """Compare a cylinder that is fixed at its ends with a cylinder that is fixed along its back."""
     row("held", "held nodes", "linear: force at 5 mm", "skin moves at most", "Newton: to")
     ends = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 0.008]}
     point = {"kind": "sphere_patch", "centre_m": [0.025, 0.0, 0.0], "radius_m": 0.0005}
@@ -286,7 +286,7 @@ def slivers() -> None:
 def flatten_element(mesh: SolidMesh, share: float) -> Floats:
     """Return the nodes of a mesh with one inner corner close to the opposite face of an element.
 
-    The distance is `fraction` of the corner's height; edges remain straight.
+    share: distance as a fraction of the corner's height. Edges remain straight.
     """
     skin = np.zeros(len(mesh.nodes), dtype=bool)
     skin[mesh.skin] = True
@@ -314,7 +314,7 @@ EDGES_OF = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 
 def thinnest(nodes: Floats, mesh: SolidMesh) -> float:
-    """Return the minimum height of an element over its longest edge."""
+    """Return the minimum ratio of height to longest edge over all elements."""
     corners = nodes[mesh.elements[:, :4]]
     edges = corners[:, [1, 2, 3, 2, 3, 3]] - corners[:, [0, 0, 0, 1, 1, 2]]
     volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
@@ -333,7 +333,7 @@ def force_n(body: Body, nodes: Floats, sample: SamplePoint) -> float:
 
 
 def teleport() -> None:
-    """Compare a finger that jumps in every frame with one that moved straight to each point."""
+    """Compare a finger that jumps in every frame with one that moves straight to each point."""
     row("finger", "skin differs from that of a finger fresh from outside by at most")
     body, rng = make_body(cylinder()), np.random.default_rng(4)
     held: ContactAnchor | None = None

@@ -4,7 +4,7 @@ OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_size [--output docs/charts
 
 Bodies of 500 to 20,000 skin nodes respond to fingers at random points and to slowly moving ones.
 The geometry is the demo's cylinder with a suitable mesh, and the steps are those of the node. The
-tables contain make_synthetic_body numbers, and rows for as many nodes as fit into `TABLE_BYTES`.
+tables contain random numbers, and rows for as many nodes as fit into `TABLE_BYTES`.
 Solving for 20,000 nodes would take hours, and 10,000 contact nodes some 100 GB with the nonlinear
 table. The memory of a full table is printed as well. The floor is this machine's current time to
 read the same number of bytes, by a dot product.
@@ -54,18 +54,18 @@ DEPTH_M = 0.005
 CONTACT_SPACING_M = 0.0022
 CONTACT_DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.012)
 LINEAR_RANGE_M = (0.012, 0.018)
-"""Finger radius, larger than the method's range so that the contact grows with the depth."""
+"""The finger radius, larger than the method's range so that the contact grows with the depth."""
 TABLE_BYTES, MAX_PLACES = 400_000_000, 800
 FLOOR_BYTES = 400_000_000
 STEPS = 600
 SLOW_STEP_M = 2e-5
 ROWS_PER_ANSWER = 6 * 4
-"""Rows of the nonlinear table: six nodes, four depths."""
+"""The rows of the nonlinear table per response: six nodes at four depths each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Measurement; times in s, median and 99th percentile, at random points and on a slow slide.
+    """A measurement with median and 99th percentile of times, s, at random points and on a slide.
 
     floor_s: time to read `read_bytes` from random positions in memory.
     """
@@ -85,7 +85,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Synthetic:
-    """Body of a given size, with make_synthetic_body rows at the contact nodes of a patch."""
+    """A body of a given size with random rows at the contact nodes of a patch."""
 
     mesh: SolidMesh
     response: SkinResponse

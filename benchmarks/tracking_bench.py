@@ -28,7 +28,7 @@ from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 TruePathCase = Callable[[float], Floats]
-"""Function that returns the true fingertip (3,) at a time, s."""
+"""The function that returns the true fingertip (3,) at a time, s."""
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
@@ -36,12 +36,12 @@ CALIBRATION_FILE = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 MACHINE = "2-core Intel Xeon VM, no GPU"
 
 WRONG_FOOTED_M = 5e-3
-"""Maximum error of a valid fingertip of the finger itself."""
+"""The error of a valid fingertip above which it belongs to another object, in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """Frame to simulate.
+    """A frame to simulate.
 
     time_s: true middle of its exposure. stamp_s: stamp of the camera; None if correct. mark:
         whether the finger has its marker. right_from_column: first column that the right camera
@@ -61,7 +61,7 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class ObservedFrame:
-    """True fingertip (3,) of a frame, and the triangulator's message; None if it was late."""
+    """The true fingertip (3,) of a frame, m, and the triangulator's message; None if late."""
 
     frame: Frame
     truth: Floats
@@ -89,7 +89,10 @@ class ObservedFrame:
 
 @dataclass
 class Observer:
-    """Triangulator with simulated images; calibration None: exact optics of the scene."""
+    """A triangulator that receives simulated images.
+
+    calibration: calibration file; None: exact optics of the scene.
+    """
 
     scene: Scene
     calibration: Path | None = CALIBRATION_FILE
@@ -164,7 +167,7 @@ def twin_camera(
 
 
 def calibration_covariance(scene: Scene, file: Path = CALIBRATION_FILE) -> Floats:
-    """Return the covariance (3, 3) m^2 of all fingertips by the calibration's uncertainty."""
+    """Return the covariance (3, 3) of fingertips that the calibration's uncertainty causes, m^2."""
     uncertainty = load_calibration(file).uncertainty
     if uncertainty is None:
         raise ValueError(f"{file}: uncertainty: null; calibrate again to estimate it")

@@ -69,7 +69,7 @@ Floats = NDArray[np.float64]
 
 SEQUENCE_FRAMES = 2000
 MIDDLE_M, SPREAD_M = (0.0, 0.01, 0.02), (0.05, 0.04, 0.03)
-"""Standard deviation of the centres of the clutter, around the gestures."""
+"""The mean and the standard deviation (3,) of the centres of the clutter, in metres."""
 
 SOLE_CANDIDATE_TIME_S = 0.5
 BLINKS_PER_S = 0.4
@@ -79,7 +79,7 @@ SIGMAS = (3, 4, 5, 6)
 BEYOND_MM = (0.3, 1.0, 5.0)
 SHOWN = 30
 CLEAR_PX = 3.0
-"""Minimum distance from the marker's edge in the image of objects that leave it in full view, px.
+"""The minimum image distance between the marker and objects that do not hide it, px.
 """
 
 
@@ -308,7 +308,7 @@ def evaluate_sequence(seen: list[ObservedFrame], scene: Scene, seed: int) -> Tal
 
 
 def _jump(before: ObservedFrame, after: ObservedFrame) -> tuple[float, float, float]:
-    """Return the fingertip's motion beyond the finger's, m, and its standard deviations.
+    """Return the error (m) of the fingertip's motion between two frames, and standard deviations.
 
     The first is that of the whole difference (root of the trace of the sum of both covariances),
     the second that along the motion.

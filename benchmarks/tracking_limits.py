@@ -63,10 +63,10 @@ MOVE_S = 0.4
 REPETITIONS = 6
 SCREEN_M = 0.05
 SETTLED_S = 0.1
-"""Time after which a track has started."""
+"""The time after which a track has started, in seconds."""
 
 AFTERMATH_S = 0.3
-"""Time after a gap or a clock step that is still disturbed by it."""
+"""The time after a gap or a clock step that counts as disturbed, in seconds."""
 
 CHARTS = ROOT / "docs" / "charts"
 MAX_DEFOCUS_APERTURE_M = 0.05
@@ -74,7 +74,7 @@ MAX_DEFOCUS_APERTURE_M = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Frames in order of their true times; those in [begins_s, ends_s) are disturbed.
+    """Frames in order of their true times; frames in [begins_s, ends_s) are disturbed.
 
     calibration: None if the scene's optics are exact.
     """
@@ -88,12 +88,12 @@ class Scenario:
 
 
 Setting = Callable[[Scene, float, int], Scenario]
-"""Function that makes the scenario of a failure, by severity and repetition."""
+"""The function that makes the scenario of a failure, by severity and repetition."""
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """Kind of disturbance.
+    """A kind of disturbance.
 
     severities: from mild to severe; some have two directions.
     """
@@ -137,7 +137,10 @@ def clean() -> TwinCamera:
 def times(
     scene: Scene, until_s: float, *, since_s: float = 0.0, rate_hz: float = 0.0
 ) -> list[float]:
-    """Return middles of exposures, by default at the camera's rate."""
+    """Return the middles of exposures, s.
+
+    rate_hz: rate of the images; 0: rate of the camera.
+    """
     period_s = 1.0 / (rate_hz or scene.camera.rate_hz)
     return [float(t) for t in np.arange(since_s, until_s - 1e-9, period_s)]
 

@@ -1,4 +1,4 @@
-"""Regret of the tracking methods: their errors over the best method's, and over the least possible.
+"""Measure the regret of tracking methods: their errors relative to the best method and to a bound.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_regret [--seeds 100-101] [--json]
         [--recording FILE] [--output docs/charts]
@@ -65,7 +65,7 @@ MAX_TAPS_S, MAX_TAPS = 1.6, 90
 
 @dataclass(frozen=True, slots=True)
 class Hand:
-    """Hold a hand: its name, true path (n, 3) mm at GRID_HZ and autocovariance by axis (lags, 3).
+    """A hand: its name, true path (n, 3), mm, at GRID_HZ, and autocovariance by axis (lags, 3).
 
     A recorded hand has no autocovariance.
     """
@@ -79,7 +79,7 @@ class Hand:
 
 @dataclass(frozen=True, slots=True)
 class Regret:
-    """Hold one case: conditions, and the RMS error in mm of each method and reference.
+    """One case: its conditions, and the RMS error of each method and reference, mm.
 
     error_mm: by method.  bank_mm: of the bank's best single model, chosen in hindsight.
     wiener_mm: of the predictor that knows the spectrum; None for a recorded hand.

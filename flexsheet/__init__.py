@@ -1,7 +1,7 @@
 """Build, run, record and evaluate node graphs of an encountered-type visual-haptic display.
 
-Names are imported on first use, so that `import flexsheet` stays fast.  The message types are in
-`flexsheet.messages.types`, the scene's in `flexsheet.messages.scene`.
+A name is imported on first use, so that `import flexsheet` is fast. The message types are in
+`flexsheet.messages.types`, and the types of scenes are in `flexsheet.messages.scene`.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "files": ("files",),
     "man": ("man",),
 }
-"""Modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
+"""The modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
 The first module defines the typer app, called `app` or as given after a colon. The other modules
 add commands to it with `register(app)`.
@@ -89,8 +89,8 @@ def _import(module: str) -> Any:
 INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms", "view"})
 """Commands for which Python's SIGINT handler is not installed.
 
-Until their event loop handles SIGINT, the signal ends them without cleanup. In other commands,
-Python's handler raises KeyboardInterrupt, and they clean up.
+Before the event loop of such a command handles SIGINT, the signal ends the command without cleanup.
+In all other commands, Python's handler raises KeyboardInterrupt, and the command cleans up.
 """
 
 
@@ -103,11 +103,11 @@ ROS_COMMANDS = {
     "rviz2": "`flexsheet view` shows a running graph in Foxglove",
     "tf": "`flexsheet view` shows the transforms in Foxglove",
 }
-"""Commands of ROS 2 that flexsheet lacks, with what to use instead."""
+"""The commands of ROS 2 that flexsheet does not have, and the command to use instead."""
 
 
 class CommandTable(Mapping[str, Any]):
-    """Read-only table of commands by name; imports each command on first use."""
+    """A read-only table of commands by name, which imports each command on first use."""
 
     def __getitem__(self, name: str) -> Any:
         return load_command(name)
@@ -120,7 +120,7 @@ class CommandTable(Mapping[str, Any]):
 
 
 class CommandGroup(TyperGroup):
-    """Typer group whose subcommands are imported on first use by `CommandTable`."""
+    """A group of commands that imports each command on first use."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -173,7 +173,7 @@ def flexsheet(
 
 
 def main() -> None:
-    """Run the command line.  Errors that users can correct are printed without a traceback."""
+    """Run the command line; print errors that users can correct without a traceback."""
     try:
         app(prog_name="flexsheet")
     except Exception as error:
@@ -187,7 +187,7 @@ def main() -> None:
 
 
 def error_text(error: Exception) -> str:
-    """Return the text of an error; add path and remedy to the text of a disk error."""
+    """Return the text of an error; the text of a disk error also states the path and a remedy."""
     if not isinstance(error, OSError) or isinstance(error, FileWriteError):
         return str(error)
     return str(make_write_error(Path(error.filename or "standard output"), error))

@@ -578,10 +578,16 @@ def test_play_can_bring_its_graph_and_restores_latched_topics_first(
             writer.write(TOPICS["display"], show, header, 10**9 + i * 10**8)
             reset = EStop(engaged=False, reason="then all was clear")
             writer.write(TOPICS["estop"], reset, header, 10**9 + i * 10**8)
-    values = {**GRAPH, "external_topics": ["display"], "record": {"bag": "played.mcap"}}
+    values = {
+        "scene": str(Path("launch/scenes/rigid-plane.yaml").resolve()),
+        "nodes": {**GRAPH["nodes"], "fem_solver": {"type": "fem_solver"}},
+        "external_topics": ["display"],
+        "record": {"bag": "played.mcap"},
+    }
     printed = flexsheet("bag", "play", bag, "--start", "0.25", "--launch", write(tmp_path, values))
     assert printed.code == 0, printed.err
     assert "played 3 messages on display" in printed.err
+    assert "not started: fem_solver; the scene's object is rigid" in printed.err
     entries = list(BagReader(tmp_path / "played.mcap", ["display", "estop"]))
     shown = [message.label for _, message, _, _ in entries if isinstance(message, Display)]
     assert shown == ["number 2", "number 3", "number 4"]

@@ -586,7 +586,7 @@ def test_real_devices_stop_at_the_first_step_without_data(
         (("--data", "camera"), "expected STEP=TEXT with a non-empty text"),
         (("--data", "camera=nowhere"), "--data camera=nowhere: does not exist"),
         (("--check",), "--check: the steps camera, arms, .* are not done"),
-        (("--check", "--step", "arms"), "--check only repeats the verification"),
+        (("--check", "--step", "arms"), "--check repeats only the verification"),
         (("--apparatus", "seed:1", "--data", "camera=x"), "--data, .* are for real devices"),
         (("--board", "9"), "--board 9: expected COLUMNSxROWS"),
     ],

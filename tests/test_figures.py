@@ -33,9 +33,9 @@ def test_figures_are_written_with_the_decimals_of_the_page(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("changed", "wrong"),
     [
-        ({"error": {}}, "no single error.mean_m"),
-        ({"error": {"mean_m": "1"}}, "is no number"),
-        ({"rows": []}, r"no single rows\[deg=3\].at"),
+        ({"error": {}}, "exactly one value error.mean_m"),
+        ({"error": {"mean_m": "1"}}, "is not a number"),
+        ({"rows": []}, r"exactly one value rows\[deg=3\].at"),
     ],
 )
 def test_a_figure_without_a_result_is_an_error(

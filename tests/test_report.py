@@ -31,7 +31,15 @@ from flexsheet.launch.cli import main
 from flexsheet.launch.experiments.stroke import read_recording, stroke_errors, summary
 from flexsheet.messages.bag import BagError, BagWriter
 from flexsheet.messages.methods import Methods
-from flexsheet.messages.types import CpuPressure, HostStatus, PortStatus, ProgramCpu, TwinFinger
+from flexsheet.messages.types import (
+    ArmState,
+    CpuPressure,
+    HostStatus,
+    PortStatus,
+    ProgramCpu,
+    Status,
+    TwinFinger,
+)
 from tests import sessions
 from tests.arm_states import arm_state
 from tests.colours import luminance
@@ -242,6 +250,44 @@ def test_an_arm_that_starts_is_no_event_and_no_fault(tmp_path: Path) -> None:
             desk.write("arm_left", arm_state("left", mode=mode), 0.1 * number)
     numbers = compute_numbers(read_session(bag))
     assert numbers["events"]["counts"] == {}
+
+
+@pytest.mark.parametrize(
+    ("stop_s", "again", "kind"),
+    [
+        (2.5, None, "end"),
+        # The bridge runs on, ends much later, or reports a moving arm again: the arm had a fault.
+        (None, None, "fault"),
+        (9.0, None, "fault"),
+        (2.5, arm_state("left", mode="follow"), "fault"),
+    ],
+)
+def test_a_controller_that_ends_before_its_bridge_is_no_fault(
+    tmp_path: Path, stop_s: float | None, again: ArmState | None, kind: str
+) -> None:
+    bag = tmp_path / "end.mcap"
+    lost = arm_state("left", mode="disconnected", reason="no answer", faults=("no answer",))
+    running = Status(node="bridge", state="running", pid=1, uptime_s=1.0, cpu_ratio=0.0,
+                     resident_bytes=1, inputs=(), outputs=(), errors=0, last_error="", note="",
+                     plan_hash="")  # fmt: skip
+    with BagWriter(bag, {"recording": {"clock_id": "clock"}}) as writer:
+        desk = sessions.MessageWriter(writer, ())
+        for tenth in range(20):
+            following = arm_state("left", mode="follow")
+            desk.write("arm_left", following, 0.1 * tenth, writer="bridge")
+        desk.write("status", running, 1.0, writer="bridge")
+        desk.write("arm_left", lost, 2.0, writer="bridge")
+        if again is not None:
+            desk.write("arm_left", again, 2.2, writer="bridge")
+        if stop_s is not None:
+            stopping = running.model_copy(update={"state": "stopping"})
+            desk.write("status", stopping, stop_s, writer="bridge")
+    numbers = compute_numbers(read_session(bag))
+    counts = {"end": 2} if kind == "end" else {"arm": 1, "fault": 1}
+    assert numbers["events"]["counts"] == counts
+    found = [one.text for one in find_problems(numbers) if one.section == "timeline"]
+    assert any(text.startswith("Arm fault") for text in found) == (kind == "fault")
+    assert bool(found) == (kind == "fault")
 
 
 def test_errors_are_listed_with_the_worst_first(numbers: dict[str, Any]) -> None:

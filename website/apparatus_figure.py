@@ -46,7 +46,7 @@ STYLE = """
 """
 
 EDGE_M, HALF_HEIGHT_M = 0.16, 0.15
-"""Distance of the sheet's clamped edges from its centre, and half of their length, m."""
+"""The distance of the sheet's clamped edges from its centre, and half of their length, m."""
 EYE: Point = (0.0, 0.0, 0.72)
 CAMERA: Point = (0.0, 0.56, 0.46)
 PROJECTOR: Point = (0.0, -0.20, -1.1)

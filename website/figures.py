@@ -20,7 +20,7 @@ KEY = re.compile(r"([^.\[\]]+)|\[([^\]]+)\]")
 
 
 class FigureError(ValueError):
-    """A page names a value that no result contains."""
+    """Error: a page names a value that no result contains."""
 
 
 def update(text: str, folder: Path = RESULTS) -> str:
@@ -60,7 +60,11 @@ def _select(value: Any, figure: re.Match[str]) -> float:
         else:
             value = value.get(key) if isinstance(value, dict) else None
         if value is None:
-            raise FigureError(f"{figure['file']}.json has no single {figure['path']}")
+            raise FigureError(
+                f"{figure['file']}.json does not contain exactly one value {figure['path']}"
+            )
     if not isinstance(value, int | float):
-        raise FigureError(f"{figure['file']}.json: {figure['path']} is no number")
+        raise FigureError(
+            f"{figure['file']}.json: {figure['path']} is not a number; correct the path"
+        )
     return value

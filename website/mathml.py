@@ -17,14 +17,17 @@ from markdown.extensions import Extension
 from markdown.inlinepatterns import InlineProcessor
 
 INLINE = r"(?<![\\$\w])\$(?=[^\s$])([^$\n]*[^\s$\\])\$(?![\w$])"
-"""Inline formula: no space next to the dollar signs, to exclude prices and shell variables."""
+"""The pattern of a formula within a line.
+
+No space is next to the dollar signs, which excludes prices and shell variables.
+"""
 
 AFTER_CODE, BEFORE_ESCAPES = 190, 185
-"""Priorities of Python-Markdown: after code spans, before backslash escapes."""
+"""Priorities in Python-Markdown: after code spans and before backslash escapes."""
 
 
 PRIME = re.compile(r"<msup>(<m[in]>[^<]*</m[in]>)<mi>&#x02032;</mi></msup>")
-"""Superscript of a prime, which is a raised character already."""
+"""The pattern of a superscript that contains a prime, which is a raised character already."""
 
 
 def mathml(formula: str, display: Literal["inline", "block"]) -> str:
@@ -52,7 +55,7 @@ class FormulaBlock(BlockProcessor):
 
 
 class MathMLExtension(Extension):
-    """Extension with both processors."""
+    """An extension with both processors."""
 
     def extendMarkdown(self, md: Markdown) -> None:
         md.inlinePatterns.register(InlineFormula(INLINE, md), "mathml", BEFORE_ESCAPES)

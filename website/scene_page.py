@@ -16,7 +16,7 @@ from website.messages_page import describe_bounds, format_table
 from website.parameters_page import unit
 
 LEAVES: tuple[type[BaseModel], ...] = (Pose, Lens)
-"""Types that the page describes once."""
+"""The types that the page describes only once."""
 
 EFFECTS: Mapping[str, str] = {
     "name": "name in logs, bags and reports",
@@ -82,7 +82,7 @@ EFFECTS: Mapping[str, str] = {
     "cy_px": "principal point in y",
     "distortion": "Brown's coefficients k1, k2, p1, p2, k3 in OpenCV's convention",
 }
-"""Effects of keys whose fields have no sufficient description of their own."""
+"""The effects of keys whose fields do not describe them sufficiently."""
 
 
 def render() -> str:
@@ -160,7 +160,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def _single_model(annotation: Any) -> type[BaseModel] | None:
-    """Return the model that an annotation is, also where it may be None; None for others."""
+    """Return the model type of an annotation `Model` or `Model | None`; None for others."""
     if get_origin(annotation) is Annotated:
         return None
     kinds = [one for one in (annotation, *get_args(annotation)) if isinstance(one, type)]

@@ -33,7 +33,7 @@ def _introduce(result: dict[str, Any]) -> str:
 
 
 def _ratios(cases: Sequence[Case]) -> list[str]:
-    """Return the cells of a row: each method's error over the best one's, then the bounds."""
+    """Return the cells of a row: errors relative to the best method, then those of the bounds."""
     names = list(cases[0]["error_mm"])
     cells = [
         _summarise([case["error_mm"][name] / min(case["error_mm"].values()) for case in cases])

@@ -37,7 +37,8 @@ def sample(
     seed: Annotated[
         int,
         typer.Option(
-            min=0, help="Random seed; 0 to 99 are for development, higher ones for evaluation."
+            min=0,
+            help="Random seed; seeds 0 to 99 are for development, higher seeds for evaluation.",
         ),
     ],
     output: Annotated[Path, output_file("Apparatus file to write.")],
@@ -81,7 +82,8 @@ def show(
 ) -> None:
     """Check an apparatus file, and list its differences from the scene.
 
-    Exit code 2: the file has unknown keys or impossible values, or belongs to another scene.
+    The exit code is 2 if the file has unknown keys or impossible values, or belongs to another
+    scene.
     """
     from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.launch.plans.plan import load_scene

@@ -85,7 +85,7 @@ def stop(
     It does not replace the hard-wired e-stop. Without --run, the arms of all graphs of this user on
     this computer are stopped.
 
-    Exit code 0 if a launcher or an arm bridge has confirmed the stop, or both arms report it.
+    The exit code is 0 if a launcher or an arm bridge confirms the stop, or if both arms report it.
     """
     from flexsheet.launch.running.runs import list_live_runs
     from flexsheet.launch.running.stopping import sent_early, stop_arms
@@ -157,7 +157,7 @@ def reset(
 
 
 def _describe_reset(plan: ResolvedGraph) -> str:
-    """Return a text that says when each arm moves after a reset; its bridge defines this."""
+    """Return a text that states when each arm moves after a reset, as its bridge defines."""
     from flexsheet.launch.plans.plan_model import ArmingMode
 
     arming = {
@@ -178,7 +178,7 @@ def _describe_reset(plan: ResolvedGraph) -> str:
 
 
 class _Arms:
-    """Asynchronous context that receives the states of a graph's arms and publishes commands."""
+    """An asynchronous context manager that receives states of arms and publishes commands."""
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
@@ -235,7 +235,7 @@ class _Arms:
         return StopAttempt(StopPath.TOPIC, "estop", outcome, 1e3 * (self._loop.time() - begun_s))
 
     async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
-        """Wait until arm states younger than MAX_STATE_AGE_S satisfy `done`; False on timeout."""
+        """Wait until recent arm states satisfy `done`; return False on a timeout."""
         for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
             now_s = self._loop.time()
             if done(

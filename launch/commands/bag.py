@@ -12,6 +12,7 @@ import typer
 
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.launching import print_omitted
 from flexsheet.launch.commands.options import (
     BagArgument,
     DurationOption,
@@ -60,7 +61,7 @@ FormerOutput = Annotated[Path | None, typer.Argument(help="Same as --output.", h
 def record(
     *,
     bag: Annotated[
-        Path | None, typer.Argument(metavar="BAG", help="Bag file to write, as with --output.")
+        Path | None, typer.Argument(metavar="BAG", help="Bag file to write; same as --output.")
     ] = None,
     output: Annotated[
         Path | None,
@@ -72,8 +73,8 @@ def record(
         typer.Option(
             "--include",
             metavar="TOPIC",
-            help="Topic to record in addition to the default ones, such as stereo; repeat for "
-            "several.",
+            help="Topic to record in addition to the default topics, such as stereo; repeat the "
+            "option for several topics.",
             autocompletion=complete.topics,
         ),
     ] = None,
@@ -84,8 +85,8 @@ def record(
             "--max-bag-size",
             metavar="MB",
             min=1.0,
-            help="Maximum size of a file, MB; then recording continues in BAG-2.mcap, BAG-3.mcap "
-            "and so on.",
+            help="Maximum size of a file, MB; when it is reached, recording continues in "
+            "BAG-2.mcap, BAG-3.mcap and so on.",
         ),
     ] = None,
     max_duration_s: Annotated[
@@ -95,7 +96,8 @@ def record(
             "--max-bag-duration",
             metavar="SECONDS",
             min=1.0,
-            help="Maximum duration of a file, s; then recording continues in another file.",
+            help="Maximum duration of a file, s; when it is reached, recording continues in a new "
+            "file.",
         ),
     ] = None,
     duration: DurationOption = None,
@@ -146,11 +148,14 @@ def play(
             "--rate",
             metavar="FACTOR",
             min=0.01,
-            help="Playback speed as a factor of real time.",
+            help="Playback speed relative to the recording; 2 is twice as fast.",
         ),
     ] = 1.0,
     start: Annotated[
-        float, typer.Option(metavar="SECONDS", help="Start position in the bag, s.", min=0.0)
+        float,
+        typer.Option(
+            metavar="SECONDS", help="Time in the bag at which playback starts, s.", min=0.0
+        ),
     ] = 0.0,
     loop: Annotated[
         bool, typer.Option("-l", "--loop", help="Repeat playback until Ctrl-C.")
@@ -169,9 +174,9 @@ def play(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Publish recorded messages into a running graph, or into a graph started for this.
+    """Publish the messages of a bag to a running graph, or to a graph that --launch starts.
 
-    Only topics listed under `external_topics` in the launch file are played.
+    Only topics that the launch file lists under `external_topics` are played.
     """
     request = PlayRequest(bag, tuple(topics or ()), rate, start, loop, as_json)
     raise typer.Exit(run_interruptible(_play(request, launch, run)))
@@ -179,7 +184,7 @@ def play(
 
 @app.command(epilog=examples("flexsheet bag info session.mcap"))
 def info(bag: BagArgument, as_json: JsonOption = False) -> None:
-    """Print the contents of a bag; a truncated bag is read as far as possible."""
+    """Print the topics, metadata and attachments of a bag, even if it is truncated."""
     from flexsheet.messages.bag import info as bag_info
 
     summary = bag_info(bag)
@@ -284,7 +289,7 @@ def to_parquet(
         Path | None, output_file("Folder to write; default: bag path without suffix.", "FOLDER")
     ] = None,
     topics: TopicsOption = None,
-    images: Annotated[bool, typer.Option("--images", help="Include images as bytes.")] = False,
+    images: Annotated[bool, typer.Option("--images", help="Also export images, as bytes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Convert each topic of a bag to a Parquet file, for pandas and other analysis tools."""
@@ -321,9 +326,9 @@ def verify(
 ) -> None:
     """Run a node twice on its recorded inputs, and compare the outputs.
 
-    Exit code 1: the two runs differ, the node failed, or it cannot be replayed. Exit code 3: the
-    runs are equal but differ from the recorded outputs, for example because the node reads the
-    system clock.
+    The exit code is 1 if the two runs differ, if the node fails, or if it cannot be replayed. The
+    exit code is 3 if the runs are equal but differ from the recorded outputs, for example because
+    the node reads the system clock.
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
@@ -359,8 +364,8 @@ def report(
 ) -> None:
     """Write an HTML report on a recording: faults, charts, tables and images.
 
-    The page needs no network connection. With --json, the values are printed, and a page is written
-    only if --output is given. A truncated bag is read as far as possible.
+    The page needs no network connection. With --json, the command prints the values, and writes a
+    page only if --output is given. It reads a truncated bag as far as possible.
     """
     from flexsheet.launch.bags.report.write import default_output
     from flexsheet.launch.bags.report.write import report as report_on
@@ -388,7 +393,7 @@ def plot(
         list[str],
         typer.Argument(
             metavar="TOPIC.FIELD...",
-            help="Numeric fields, such as fingertip.position_m; one chart for each.",
+            help="Numeric fields, such as fingertip.position_m; each field has its own chart.",
         ),
     ],
     output: Annotated[
@@ -508,7 +513,7 @@ async def _record(
     running: tuple[ResolvedGraph, Run],
     seconds: float | None,
 ) -> int:
-    """Run a recorder node in this process, connected to the running graph; return exit code 0."""
+    """Run a recorder in this process that records topics of the running graph; return 0."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
     from flexsheet.launch.running.runs import local_sources, ring_file
     from flexsheet.launch.running.tools import tools_host
@@ -564,7 +569,7 @@ async def _record(
 
 
 async def _show_remaining(label: str, duration_s: float | None) -> None:
-    """Show a progress bar for a recording; return at once if its duration is not limited."""
+    """Show a progress bar for a recording of limited duration; None: no limit and no bar."""
     if duration_s is None:
         return
     loop = asyncio.get_running_loop()
@@ -595,6 +600,7 @@ async def _play(request: PlayRequest, launch: Path | None, run_directory: Path |
         plan, run = running_graph(run_directory)
         return await _play_into(request, plan, run)
     plan = load_graph(launch)
+    print_omitted(plan, None)
     async with RunningGraph(plan) as graph:
         with words.status(f"starting {launch}"):
             await graph.wait_ready()

@@ -1,6 +1,7 @@
 """`flexsheet calibrate`: calibrate a stereo camera with images of a calibration board.
 
-Also checks such calibrations, and defines the functions that the other calibrations share.
+The module also contains the commands that check such calibrations, and functions that the commands
+of other calibrations use.
 """
 
 from __future__ import annotations
@@ -256,7 +257,7 @@ def check(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a calibration: measure a board of known size in images not used to calibrate."""
+    """Check a calibration with images of a board that were not used to compute it."""
     from flexsheet.launch.calibration.check import check_stereo
     from flexsheet.messages.calibration import load_calibration
 
@@ -300,9 +301,10 @@ def cross_check(
     ] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Cross-validate a calibration: measure each image pair with a calibration from the others.
+    """Cross-validate a calibration: measure image pairs that it did not use.
 
-    Prints the errors next to those of a calibration by OpenCV's functions alone.
+    The command calibrates repeatedly, each time without some of the image pairs, and measures the
+    board in these. It also prints the errors of a calibration by OpenCV's functions alone.
     """
     from flexsheet.launch.calibration import check
 
@@ -350,7 +352,7 @@ def print_board(
 ) -> None:
     """Write an image of a calibration board, to be printed at true size.
 
-    It is a chessboard; with --marker-mm, it is a ChArUco board.
+    The board is a chessboard; with --marker-mm, it is a ChArUco board.
     """
     from flexsheet.launch.calibration.printing import make_caption, write_board
 
@@ -411,7 +413,7 @@ def _parse_board(text: str, square_mm: float, marker_mm: float | None, dictionar
 def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float | None:
     """Return the distance (m) at which the uncertainty is reported; None if it is not known.
 
-    Default is the distance of the left camera from the screen centre in the scene.
+    The default is the distance of the left camera from the centre of the screen in the scene.
     """
     if distance_mm is not None:
         return 1e-3 * distance_mm
@@ -461,10 +463,10 @@ def require_twin(apparatus: str | None, *, simulated: bool) -> None:
 def load_true_devices(
     text: str | None, scene: Scene, scene_file: Path | None = None
 ) -> Apparatus | None:
-    """Load the apparatus of a simulated calibration; None if no text is given.
+    """Load the apparatus of a simulated calibration; return None if `text` is None.
 
-    It is described in the world frame that the stereo camera defines, to which all calibrations
-    refer.
+    The parameters of the apparatus refer to the world frame of the stereo camera, as all
+    calibrations do.
     """
     from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.nodes.twin.truth import align_world_to_camera

@@ -225,14 +225,14 @@ def capture(
 ) -> None:
     """Record joint angles and board images for `calibrate arms`, from the running graph.
 
-    Mount the board on the flange and move the arm with its teach pendant. A pose is recorded when
-    the arm is at rest and the board appears in a new pose. Ctrl-C stops.
+    Mount the board on the flange and move the arm with its teach pendant. The command records a
+    pose when the arm is at rest and the board is in a new pose. Ctrl-C ends the recording.
     """
     from flexsheet.launch.calibration.arm_poses import PoseRecorder, make_lens_rig
     from flexsheet.launch.plans.plan import load_scene
 
     if side not in SIDES:
-        raise CommandError(f"--arm {side}: expected left or right")
+        raise CommandError(f"--arm {side}: unknown arm; give left or right")
     scene = load_scene(scene_file)
     described = _parse_board(board, square_mm, marker_mm, dictionary)
     try:
@@ -267,7 +267,9 @@ async def record_poses(
     places: int,
     run: Path | None,
 ) -> int:
-    """Pass images and arm states of the running graph to a recorder, until it has enough poses.
+    """Pass images and arm states of the running graph to a recorder that collects poses.
+
+    The function returns when the recorder has enough poses.
 
     on_arm: called with each state of the topics `arms` and the time of its arrival, s. size: of the
     images, px.
@@ -427,7 +429,7 @@ def _write_copy(scene_file: Path, measured: ArmsCalibration, copy: Path) -> None
 def _true_errors(
     scene: Scene, side: Side, fit: BaseFit, apparatus: Apparatus | None, seed: int
 ) -> dict[str, float]:
-    """Return the errors of a simulated arm's flange at the world origin, without backlash."""
+    """Return the errors of the flange of a simulated arm at the world origin, without backlash."""
     import numpy as np
 
     from flexsheet.launch.calibration.arm_poses import SimulatedArm
@@ -543,7 +545,7 @@ def _format_pose(base: ArmBase) -> str:
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """Return distance (m) and angle (rad) from the base pose in the scene to the measured one."""
+    """Return distance (m) and angle (rad) between the base poses of scene and calibration."""
     import numpy as np
 
     from flexsheet.nodes.models.rigid import pose_matrix, vector_from_rotation

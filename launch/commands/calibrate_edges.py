@@ -74,8 +74,8 @@ def edges(
 ) -> None:
     """Measure where the arms hold the sheet, from marks on the clamps that the camera sees.
 
-    For each arm, the pose of the base, the pose of the edge on the flange, the joint offsets and
-    the compliance of the flange are fitted together, and written into a copy of the scene.
+    For each arm, the command fits the pose of the base, the pose of the edge on the flange, the
+    joint offsets and the compliance of the flange, and writes them into a copy of the scene.
     """
     from flexsheet.launch.calibration.edge_fit import EdgeFitError, fit_edges
     from flexsheet.launch.calibration.edge_marks import read_edge_marks, simulate_edge_marks
@@ -84,7 +84,7 @@ def edges(
 
     check_folder("-o", output)
     if twin == (rows is not None):
-        raise CommandError("give exactly one of --rows CSV and --twin")
+        raise CommandError("give exactly one source of marks: --rows CSV or --twin")
     require_twin(apparatus, simulated=twin)
     scene = load_scene(scene_file)
     if rows is not None:
@@ -161,8 +161,8 @@ def edges_capture(
     """Record marks on both clamps for `calibrate edges`, from the running graph.
 
     Fix three bright marks on each clamp: at its centre and 45 % of its length above and below. Move
-    the sheet to poses that differ in position, rotation and stretch. A pose is recorded when both
-    arms are at rest. Ctrl-C ends the recording.
+    the sheet to poses that differ in position, rotation and stretch. The command records a
+    pose when both arms are at rest. Ctrl-C ends the recording.
     """
     from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.launch.plans.plan import load_scene

@@ -72,7 +72,8 @@ def marker(
 ) -> None:
     """Determine the marker's position relative to the pad of the finger, which touches the sheet.
 
-    Touches of known points are rows of a CSV file (--rows, --scene) or are simulated (--twin).
+    The finger touches known points. The touches are rows of a CSV file (--rows, --scene) or are
+    simulated (--twin).
     """
     from flexsheet.launch.calibration.touches import read_touches, simulate_touches
     from flexsheet.launch.plans.plan import load_scene
@@ -82,7 +83,7 @@ def marker(
 
     check_folder("-o", output)
     if (rows is None) == (twin is None):
-        raise CommandError("give exactly one of --rows CSV and --twin SCENE")
+        raise CommandError("give exactly one source of touches: --rows CSV or --twin SCENE")
     for name, value in (("--apparatus", apparatus), ("--calibration", calibration_file)):
         if value is not None and twin is None:
             raise CommandError(f"{name} {value}: the option is for --twin SCENE only; remove it")
@@ -108,7 +109,9 @@ def marker(
 
 
 def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerCalibration:
-    """Fit the marker's position to touches, and return it as a calibration; raises CommandError."""
+    """Fit the position of the marker to touches, and return the calibration.
+
+    Raises CommandError if the touches do not determine the position."""
     from flexsheet.launch.calibration.marker_fit import MarkerFitError, fit_marker
     from flexsheet.messages.marker_calibration import MarkerCalibration
 

@@ -201,7 +201,7 @@ def read_views(folder: Path, count: int) -> Iterator[Views]:
 def simulate_views(
     scene: Scene, true: Projector, apparatus: Apparatus | None, poses: int, seed: int
 ) -> Iterator[Views]:
-    """Yield the simulated left and right images of all patterns, for each pose of the sheet.
+    """Yield, for each pose of the sheet, the simulated left and right images of all patterns.
 
     true: simulated projector. apparatus: other true devices, whose arms hold the sheet; None: the
     sheet is flat, at the commanded poses.
@@ -229,7 +229,7 @@ def simulate_views(
 
 
 def load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
-    """Return the camera of the scene, with lenses and baseline from a calibration file if given."""
+    """Return the camera of the scene; a calibration replaces its lenses and its baseline."""
     optics = load_optics(calibration, scene)
     if optics is None:
         return scene.camera
@@ -261,7 +261,7 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
 
 
 def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
-    """Write a scene file with another projector to `copy`; preserve its comments and layout."""
+    """Write a copy of a scene file with another projector, and preserve comments and layout."""
     with edit_scene(scene_file, copy) as tree:
         lens, pose = tree["projector"]["lens"], tree["projector"]["world_from_projector"]
         for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
@@ -334,7 +334,7 @@ def _print_result(
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """Return the true image errors (mm) at the eye, before and after a simulated calibration."""
+    """Return the true image errors at the eye before and after a simulated calibration, mm."""
     from flexsheet.nodes.twin.projector import errors_at_eye, sheet_poses
 
     eye, planes = scene.eyes.centre_world_m, sheet_poses(7)

@@ -101,9 +101,9 @@ def sheet(
 ) -> None:
     """Fit the force model of a sheet to forces of a finger that pushes it.
 
-    The fitted parameters are modulus times thickness, width without tension, and a cubic term. The
-    pushes are rows of a CSV file (--rows, --scene), or come from a recording with a force gauge
-    (--bag), or are simulated (--twin).
+    The command fits the product of Young's modulus and thickness, the width without tension, and a
+    cubic term of the force. The pushes are rows of a CSV file (--rows, --scene), come from a
+    recording with a force gauge (--bag), or are simulated (--twin).
     """
     from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
     from flexsheet.launch.calibration.sheet_rows import read_rows
@@ -112,7 +112,9 @@ def sheet(
 
     check_folder("-o", output)
     if sum(one is not None for one in (rows, bag, twin)) != 1:
-        raise CommandError("give exactly one of --rows CSV, --bag BAG and --twin SCENE")
+        raise CommandError(
+            "give exactly one source of pushes: --rows CSV, --bag BAG or --twin SCENE"
+        )
     require_twin(apparatus, simulated=twin is not None)
     command = ["flexsheet", "calibrate", "sheet"]
     if rows is not None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 POSES_PER_PAIR = 3
-"""Number of simulated board poses per requested image pair, as not every pose is accepted."""
+"""The number of simulated board poses per requested image pair; not every pose is accepted."""
 
 
 def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
@@ -150,7 +150,7 @@ def _show_coverage(capture: Capture) -> Iterator[Any]:
 
 
 def coverage_view(capture: Capture, hint: str) -> RenderableType:
-    """Return tables with actual and required numbers of pairs per image cell, tilt and distance."""
+    """Return tables of actual and required numbers of pairs by image cell, tilt and distance."""
     from rich.columns import Columns
     from rich.console import Group
     from rich.table import Table

@@ -51,7 +51,7 @@ def chart(
         typer.Option(
             "--scene",
             metavar="SCENE",
-            help="Scene to measure in; default: cylinder. For system: repeat for several; default: "
+            help="Scene to measure in; default: cylinder. For system: repeat the option; default: "
             "all shipped scenes.",
             autocompletion=complete.scenes,
         ),
@@ -103,16 +103,17 @@ def chart(
         typer.Option(
             "--configuration",
             metavar="NAME",
-            help="For system: name of a configuration; repeat for several; default: all.",
+            help="For system: configuration to measure; repeat the option; default: all.",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure computing time and error of the methods in a family on this computer; draw a chart.
 
-    For each method, the maximum of the median times and of the errors is printed, over all cases in
-    the method's range. "front" marks methods of which no other is both faster and more accurate.
-    `system` runs whole graphs instead; if it was interrupted, repeat it with the same --output.
+    For each method, the command prints the maximum of the median times and of the errors over all
+    cases in the method's range. "front" marks a method if no other method is both faster and more
+    accurate. `system` measures whole graphs instead. To continue an interrupted measurement of
+    `system`, repeat the command with the same --output.
     """
     logs_on_stderr()
     chosen = [find_file(one, SCENES) for one in scene_files or ()]

@@ -47,7 +47,7 @@ def commission(
             "-o",
             "--output",
             metavar="FOLDER",
-            help="Folder for state and results; continue the commissioning if it exists.",
+            help="Folder for state and results; if it exists, the commissioning continues.",
         ),
     ],
     launch_file: LaunchOption = DEMO,
@@ -56,7 +56,9 @@ def commission(
     data: Annotated[
         list[str] | None,
         typer.Option(
-            "--data", metavar="STEP=PATH", help="Captured data of a step; may be repeated."
+            "--data",
+            metavar="STEP=PATH",
+            help="Captured data of a step; repeat the option for several steps.",
         ),
     ] = None,
     finger_radius_mm: Annotated[
@@ -74,37 +76,41 @@ def commission(
             "--sheet-kg-per-m2",
             metavar="DENSITY",
             min=0.0,
-            help="Measured mass per area of the sheet, which determines its sag.",
+            help="Measured mass per area of the sheet, kg/m²; it determines the sag.",
         ),
     ] = None,
     board: Annotated[
         str,
         typer.Option(
             metavar="COLUMNSxROWS",
-            help="Inner corners per row and column of the chessboard for the camera calibration.",
+            help="Number of inner corners of the board for the camera, such as 9x6.",
         ),
     ] = "9x6",
     square_mm: Annotated[
         float,
-        typer.Option(metavar="MM", min=1e-3, help="Side of a square of the camera's board, mm."),
+        typer.Option(
+            metavar="MM", min=1e-3, help="Side length of a square of the camera's board, mm."
+        ),
     ] = 25.0,
     flange_board: Annotated[
         str,
         typer.Option(
             metavar="COLUMNSxROWS",
-            help="Inner corners per row and column of the chessboard on the flanges.",
+            help="Number of inner corners of the board on the flanges, such as 7x5.",
         ),
     ] = "7x5",
     flange_square_mm: Annotated[
         float,
-        typer.Option(metavar="MM", min=1e-3, help="Side of a square of the flanges' board, mm."),
+        typer.Option(
+            metavar="MM", min=1e-3, help="Side length of a square of the flanges' board, mm."
+        ),
     ] = 15.0,
     repeated: Annotated[
         list[str] | None,
         typer.Option(
             "--step",
             metavar="STEP",
-            help="Step to run again, with all later steps; may be given several times.",
+            help="Step to run again, with all later steps; repeat the option for several.",
         ),
     ] = None,
     skipped: Annotated[
@@ -112,12 +118,12 @@ def commission(
         typer.Option(
             "--skip",
             metavar="STEP=REASON",
-            help="Step to skip, and why; may be given several times.",
+            help="Step to skip, and the reason; repeat the option for several steps.",
         ),
     ] = None,
     check: Annotated[
         bool,
-        typer.Option("--check", help="Only repeat the verification step with the stored results."),
+        typer.Option("--check", help="Repeat only the verification step, with the stored results."),
     ] = False,
     duration: Annotated[
         float,
@@ -133,9 +139,9 @@ def commission(
 ) -> None:
     """Calibrate camera, arms, sheet, projector, marker and eyes in sequence; verify the result.
 
-    Finished steps are not repeated. With --apparatus, all devices are simulated. Otherwise the
-    command stops at a step whose data are missing, with exit code 1, and states how to capture
-    them.
+    The command does not repeat finished steps. With --apparatus, all devices are simulated.
+    Otherwise the command stops with exit code 1 at a step whose data are missing, and states how to
+    capture the data.
     """
     from flexsheet.launch.calibration.commission import MissingDataError, StepName
     from flexsheet.launch.commands.calibrate import FOUR_BITS, _parse_board
@@ -153,7 +159,7 @@ def commission(
         )
     if check and (repeats or skips or any(name is not StepName.VERIFICATION for name in given)):
         raise CommandError(
-            "--check only repeats the verification; remove --step, --skip and other steps' --data",
+            "--check repeats only the verification; remove --step, --skip and other --data",
             BAD_INPUT,
         )
     lab, devices = open_laboratory(
@@ -202,7 +208,9 @@ def _parse_step(option: str, text: str) -> StepName:
 
 
 def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
-    """Parse values STEP=TEXT; raises CommandError for an unknown step or an empty text."""
+    """Parse the values STEP=TEXT of an option; return the texts by step.
+
+    Raises CommandError for an unknown step or an empty text."""
     pairs = {}
     for one in given or ():
         name, _, text = one.partition("=")

@@ -57,14 +57,16 @@ FLANGE_BOARD = Board(kind="chessboard", columns=7, rows=5, square_m=0.015)
 """Calibration boards of simulated laboratories, for the camera and for the flanges."""
 
 CALLIPER_M = 3e-4
-"""Standard deviation of the simulated measurement of the finger's radius."""
+"""The standard deviation of the simulated measurement of the finger's radius, in metres."""
 
 GAUGE_N = 0.005
-"""Standard deviation of the noise of the simulated force gauge."""
+"""The standard deviation of the noise of the simulated force gauge, in newtons."""
 
 WEIGHING_RATIO = 0.004
-"""Relative standard deviation of the mass per area of a simulated sheet, from a scale of 0.2 g and
-a ruler of 0.5 mm."""
+"""The relative standard deviation of the measured mass per area of a simulated sheet.
+
+The errors of the scale (0.2 g) and of the ruler (0.5 mm) cause it.
+"""
 
 INSTRUCTIONS: dict[StepName, str] = {
     StepName.CAMERA: "capture board images with `flexsheet calibrate stereo --device-source ... "
@@ -93,7 +95,7 @@ REPEAT: dict[str, StepName] = {
     "marker_offset": StepName.MARKER,
     "sheet_stiffness": StepName.SHEET,
 }
-"""Step to repeat, by the calibration error that the self-checks of the nodes suspect."""
+"""The step to repeat, by the calibration error that the self-checks of the nodes suspect."""
 
 
 def open_laboratory(
@@ -122,7 +124,7 @@ def open_laboratory(
 
 @dataclass(slots=True)
 class Laboratory:
-    """Devices of one laboratory: simulated devices, or files with the data of real ones.
+    """The devices of one laboratory: simulated devices, or files with the data of real devices.
 
     apparatus: true parameters of simulated devices, in the world frame of the camera; None for real
     devices. data: file or folder with the captured data of each step. finger_radius_m: measured
@@ -665,7 +667,7 @@ def describe_sheet(
     width_m: float,
     mass_kg_per_m2: float | None = None,
 ) -> dict[str, float]:
-    """Return the values to store in the scene for a measured sheet, by dotted path.
+    """Return the values of a measured sheet for the scene, by dotted path.
 
     modulus_thickness_n_per_m: product of Young's modulus and thickness. width_m: width without
     tension. mass_kg_per_m2: mass per area, which determines the density at the scene's thickness;

@@ -113,7 +113,7 @@ def nodes(incomplete: str) -> list[str]:
 
 
 def node_parameters(incomplete: str) -> list[str]:
-    """Return the parameters of the running graph, as NODE.PARAMETER, that match."""
+    """Return matching parameters of the running graph, in the form NODE.PARAMETER."""
     from flexsheet.launch.commands.graph import NoGraphError, running_graph
 
     try:

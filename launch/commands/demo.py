@@ -49,7 +49,7 @@ def demo(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate strokes on the sheet, a tilted and a pushed sheet; draw the measured errors."""
+    """Simulate strokes, a tilted sheet and a pushed sheet, and draw charts of the errors."""
     from flexsheet.launch.experiments.demo import run_demo
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 

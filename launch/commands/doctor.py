@@ -90,8 +90,8 @@ def check_scene(
 ) -> None:
     """Check that both arms reach the whole working range of a scene; exit code 1 if they do not.
 
-    Samples of the contact with all tilts and depths of the range are checked, at minimum and
-    maximum stretch of the sheet. Prints the maximum finger speed that the arms can follow.
+    The command checks samples of all tilts and push depths in the range, at the minimum and the
+    maximum stretch of the sheet. It prints the maximum finger speed that the arms can follow.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
@@ -177,7 +177,7 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
         ],
     )
     for path in result["blocked_paths"]:
-        words.print(f"no path {path}")
+        words.print(f"the arms cannot move along the path {path}")
     for remedy in result["remedies"]:
         print(f"remedy: {remedy['what']}")
     if not result["reachable"] and not result["remedies"]:

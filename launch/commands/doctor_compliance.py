@@ -48,8 +48,8 @@ def compliance(
 ) -> None:
     """Check that the sheet can feel as soft as the virtual object; exit code 1 if it cannot.
 
-    For pushes at the centre up to the maximum depth of the scene, the force of the object is
-    compared with the rendered force. Also checks that hand and sheet cannot oscillate with the
+    The command compares the force of the object with the rendered force, for pushes at the centre
+    up to the maximum depth of the scene. It also checks that hand and sheet cannot oscillate at the
     given delay.
     """
     from flexsheet.launch.health.compliance import compliance_result, compute_front_curve

@@ -105,7 +105,7 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
 
 
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
-    """Return the resolved launch file, and its run on this computer; None if it is not running."""
+    """Return the resolved launch file and its run on this computer; the run is None without one."""
     from flexsheet.launch.plans.plan import load_graph
 
     if launch_file is None:

@@ -91,8 +91,8 @@ def stroke(
         typer.Option(
             min=1,
             max=1000,
-            help="Number of strokes, each in a new graph with another random seed; several give "
-            "the 95 % confidence interval of the mean.",
+            help="Number of strokes; each stroke runs in a new graph with another random seed. "
+            "Several strokes give the 95 % confidence interval of the mean.",
         ),
     ] = 1,
     ablations: Annotated[
@@ -104,7 +104,8 @@ def stroke(
         ),
     ] = False,
     radii: Annotated[
-        bool, typer.Option("--radii", help="Also measure on a cylinder of twice the radius.")
+        bool,
+        typer.Option("--radii", help="Also measure strokes on a cylinder of twice the radius."),
     ] = False,
     workers: WorkersOption = 1,
     scheduler: SchedulerOption = None,
@@ -130,7 +131,7 @@ def stroke(
     """
     given = with_scene(settings, scene)
     if radii and scene is not None:
-        raise CommandError("--radii measures the shipped cylinder scenes only; remove --scene")
+        raise CommandError("--radii uses the cylinder scenes of the package; remove --scene")
     if repeats > 1 or ablations or radii:
         from flexsheet.launch.experiments import stroke_table
 
@@ -186,7 +187,7 @@ def tilt(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure image errors on an inclined sheet (Furukawa et al. 2007, section VI-B, Fig. 11)."""
+    """Measure image errors on a tilted sheet (Furukawa et al. 2007, section VI-B, Fig. 11)."""
     from flexsheet.launch.experiments.image import TILT
 
     bag = make_result_folder(output, "tilt") / "tilt.mcap"
@@ -222,7 +223,7 @@ def push(
         typer.Option(
             "--tilt",
             metavar="DEG",
-            help="Contact angle around the axis of the cylinder, degrees; it inclines the sheet.",
+            help="Contact angle around the axis of the cylinder, degrees; it tilts the sheet.",
         ),
     ] = 0.0,
     map_file: MapOption = None,
@@ -236,8 +237,8 @@ def push(
 ) -> None:
     """Measure image errors on a pushed sheet (Furukawa et al. 2007, section VI-C, Fig. 13).
 
-    As in that paper, the arms do not move the sheet back under the finger, so the whole push
-    deflects the sheet. `--set planner.compliance_mode=force_curve` makes it yield.
+    As in the paper, the arms hold the edges of the sheet still while the finger pushes. With
+    `--set planner.compliance_mode=force_curve`, the arms move the sheet away from the finger.
     """
     from flexsheet.launch.experiments.image import make_push_series
     from flexsheet.launch.experiments.run import make_settings
@@ -401,7 +402,7 @@ def gestures(
         typer.Option(
             "--gesture",
             metavar="NAME",
-            help="Name of a gesture to run, or CSV file with a fingertip path; repeat for several; "
+            help="Name of a gesture, or CSV file with a fingertip path; repeat for several; "
             "default: all gestures.",
             autocompletion=complete.gestures,
         ),
@@ -455,9 +456,9 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
 
 
 def print_followed(results: list[dict[str, Any]]) -> None:
-    """Print how well the sheet followed the finger during contact, one line per fingertip path.
+    """Print how well the sheet followed the finger during contact: one line per fingertip path.
 
-    Δd and Δθ are the distance and angle errors of the true sheet to the true finger.
+    Δd and Δθ are the distance and the angle between the true sheet and the true finger.
     """
 
     def shown(values: dict[str, float] | None) -> list[str]:
@@ -574,7 +575,9 @@ def stability(
     from flexsheet.nodes.planner.sheet_force import make_force_model
 
     if (graph or apparatus is not None) and not (gestures and graph):
-        raise CommandError("--graph requires --gestures, and --apparatus requires both")
+        raise CommandError(
+            "--graph requires --gestures, and --apparatus requires --gestures and --graph; add them"
+        )
     given = with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")

@@ -47,14 +47,22 @@ def jnd(
     participant: Annotated[
         str,
         typer.Option(
-            "--participant", metavar="CODE", help="Random code of the participant, not a name."
+            "--participant",
+            metavar="CODE",
+            help="Random code that identifies the participant; do not use a name.",
         ),
     ] = "p1",
     seed: Annotated[
         int, typer.Option("--seed", metavar="N", min=0, help="Random seed of the order of objects.")
     ] = 1,
     trials: Annotated[
-        int, typer.Option(metavar="N", min=20, max=2000, help="Number of trials, one pair each.")
+        int,
+        typer.Option(
+            metavar="N",
+            min=20,
+            max=2000,
+            help="Number of trials; in each trial, the participant compares two objects.",
+        ),
     ] = 240,
     reference_pa: Annotated[
         float | None,
@@ -100,7 +108,9 @@ def jnd(
     if not re.fullmatch(r"[A-Za-z0-9_-]{1,32}", participant):
         raise CommandError(f'--participant "{participant}": use 1 to 32 letters, digits, - and _')
     if repeats > 1 and not simulated:
-        raise CommandError("--repeats requires --simulated-participant")
+        raise CommandError(
+            "--repeats requires --simulated-participant; add it, or remove --repeats"
+        )
     given = with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "jnd")

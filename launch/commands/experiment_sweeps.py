@@ -67,8 +67,8 @@ def robustness(
         typer.Option(
             "--seeds",
             metavar="A-B",
-            help="Range of random seeds, one apparatus each; 0-99 are for development, higher ones "
-            "for reports.",
+            help="Range of random seeds; each seed sets the errors of one simulated hardware. "
+            "Seeds 0-99 are for development, higher seeds for reports.",
         ),
     ],
     profile: ProfileOption = "modern",
@@ -77,7 +77,7 @@ def robustness(
         bool,
         typer.Option(
             "--commissioned",
-            help="Commission each simulated laboratory first, as `flexsheet commission` does, and "
+            help="Calibrate each simulated hardware first, as `flexsheet commission` does, and "
             "evaluate it in simulated time.",
         ),
     ] = False,
@@ -96,8 +96,8 @@ def robustness(
     """Measure errors of sheet, fingertip, image and force with randomly inaccurate hardware.
 
     For each seed, the true parameters of the simulated hardware are sampled within tolerances. A
-    separate process runs a graph with one stroke; image and force are evaluated at rest, without a
-    graph. To continue an interrupted command, repeat it with the same --output.
+    separate process runs a graph with one stroke. The errors of image and force are computed at
+    rest, without a graph. To continue an interrupted command, repeat it with the same --output.
     """
     from flexsheet.launch.experiments import robustness as experiment
     from flexsheet.nodes.twin.tolerance_table import Profile
@@ -143,7 +143,7 @@ def robustness(
 
 
 def _print_predictions(found: dict[str, Any]) -> None:
-    """Print how often the reports of the laboratories agree with their true errors."""
+    """Print how often the errors that the reports predict agree with the true errors."""
     cases = ("good_and_within", "good_but_exceeded", "doubted_but_within", "doubted_and_exceeded")
     every = {"all": {**found["confusion"], "stated_over_true": {"median": None}}}
     print_table(
@@ -162,7 +162,7 @@ def sensitivity(
         typer.Option(
             "--parameter",
             metavar="KEY",
-            help="Parameter in the table of tolerances; repeat for several; default: all.",
+            help="Parameter in the table of tolerances; repeat the option; default: all.",
         ),
     ] = None,
     with_graph: Annotated[
@@ -186,8 +186,9 @@ def sensitivity(
 ) -> None:
     """Measure the errors that each inaccurate hardware parameter causes alone.
 
-    Each parameter deviates by 1 and 3 standard deviations in both directions. Without --graph, all
-    are evaluated at rest. To continue an interrupted command, repeat it with the same --output.
+    Each parameter deviates by 1 and 3 standard deviations in both directions. Without --graph, the
+    errors are computed at rest only. To continue an interrupted command, repeat it with the same
+    --output.
     """
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments import sensitivity as experiment
@@ -274,8 +275,8 @@ def follow(
 ) -> None:
     """Measure how well the sheet follows a recorded finger, and compare with a lower bound.
 
-    The bound is the minimum mean error that the limits of the arms allow, if the whole recording is
-    known in advance.
+    The bound is the minimum mean error that arms with the given limits can reach if the whole
+    recording is known in advance.
     """
     from flexsheet.launch.experiments import follow as experiment
     from flexsheet.launch.experiments.gestures import finger_path as load_path

@@ -32,12 +32,12 @@ PACKAGES = ("messages", "nodes", "launch")
 MAX_ENTRIES = 3
 MIN_WORD_LETTERS = 3
 MIN_SHARED_WORDS = 2
-"""Minimum number of words that a text and an inexact match have in common."""
+"""The minimum number of common words of a text and an explanation that matches inexactly."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Explanation of one kind of error or note.
+    """An explanation of one kind of error or note.
 
     name: name of the error class, or empty. phrase: text that all notes of this kind contain, or
     empty.
@@ -97,7 +97,7 @@ def _meaning(kind: type[FlexsheetError]) -> str:
 
 
 def find_entries(text: str) -> list[Entry]:
-    """Return the explanations for a code, a class name or an error text, the best match first.
+    """Return the explanations of a code, a class name or an error text; the best match is first.
 
     An error text matches entries whose class name or phrase it contains. If there are none, it
     matches entries with at least MIN_SHARED_WORDS common words; rare words have more weight.
@@ -133,7 +133,10 @@ def _words(text: str) -> set[str]:
     )
 )
 def explain(
-    message: Annotated[str, typer.Argument(help="Text, code or class name of an error or note.")],
+    message: Annotated[
+        str,
+        typer.Argument(help="Text, code or class name of an error, or text of a note of a node."),
+    ],
     as_json: JsonOption = False,
 ) -> None:
     """Print the meaning and the remedy of an error or note; docs/errors.md lists all of them."""

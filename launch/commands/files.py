@@ -16,7 +16,7 @@ app = make_app()
 
 
 class FileKind(StrEnum):
-    """Kind of data file in the package."""
+    """A kind of data file in the package."""
 
     LAUNCH = "launch"
     SCENE = "scene"
@@ -34,7 +34,7 @@ PATTERNS = {
     FileKind.SYSTEMD: "systemd/*",
     FileKind.DOCKER: "../docker/[!.]*",
 }
-"""File pattern (glob) of each kind, relative to the folder of the launch files."""
+"""The file pattern (glob) of each kind, relative to the folder of the launch files."""
 
 
 @app.command(epilog=examples("flexsheet files", "flexsheet files docker --json"))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class NoGraphError(CommandError):
-    """No graph is running on this computer."""
+    """Error: no graph is running on this computer."""
 
     code = "no-graph"
     remedy = "Start a graph with `flexsheet launch FILE`, or name the directory of its run (--run)."
@@ -27,7 +27,7 @@ class NoGraphError(CommandError):
 
 
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
-    """Return the graph and the run in a run directory; default: those of the newest running graph.
+    """Return the graph and the run of a run directory; None: those of the newest running graph.
 
     Raises CommandError if the directory contains no plan, and NoGraphError if no graph is running.
     """
@@ -95,7 +95,7 @@ async def receive_until(
 
 
 def run_interruptible(work: Coroutine[Any, Any, int]) -> int:
-    """Run `work` in an event loop and return its result; SIGINT and SIGTERM cancel it, result 0."""
+    """Run a coroutine and return its exit code; return 0 if SIGINT or SIGTERM cancels it."""
 
     async def guarded() -> int:
         task = asyncio.ensure_future(work)

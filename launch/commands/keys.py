@@ -23,7 +23,7 @@ app = make_app("Manage the key pairs by which hosts authenticate each other.")
 
 
 class KeyCommand(TyperCommand):
-    """Command that accepts a key that starts with "-" as its last argument."""
+    """A command that accepts a key that starts with "-" as its last argument."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert "--" in front of a key that starts with "-"; it would be parsed as an option."""

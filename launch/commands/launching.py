@@ -79,13 +79,16 @@ def launch(
         typer.Option(
             "--without",
             metavar="NODE",
-            help="Node that is not started, because `flexsheet run NODE` starts it; repeat for "
-            "several.",
+            help="Node to omit, so that `flexsheet run NODE` can start it; repeat the option for "
+            "several nodes.",
         ),
     ] = None,
     record: Annotated[
         Path | None,
-        typer.Option(metavar="BAG", help="Bag file to record the logged topics to."),
+        typer.Option(
+            metavar="BAG",
+            help="Bag file to which the topics that are marked as logged are recorded.",
+        ),
     ] = None,
     console: Annotated[
         bool,
@@ -96,8 +99,8 @@ def launch(
 ) -> None:
     """Start the nodes of a launch file and supervise them until Ctrl-C.
 
-    With --json, one line about the run is printed when all nodes are ready. With --dry-run, it is
-    the resolved graph.
+    With --json, the command prints one line about the run when all nodes are ready. With --json
+    and --dry-run, it prints the resolved graph.
 
     Exit codes: 0 stopped on request, 1 a node failed, 2 the input is invalid.
     """
@@ -135,7 +138,7 @@ def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, A
 
 
 def warn_of_loop_risk(plan: ResolvedGraph) -> None:
-    """Print a warning if the scene asks the loop of sheet and hand for more than is stable."""
+    """Print a warning if the sheet and the hand that touches it may oscillate in this scene."""
     from flexsheet.launch.health.compliance import check_graph
 
     finding = check_graph(plan)
@@ -144,7 +147,7 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
 
 
 def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
-    """On the planner's host, start `warn_of_loop_risk` in a thread; it takes half a second."""
+    """On the planner's host, start `warn_of_loop_risk` in a thread, which takes half a second."""
     if any(
         issubclass(node_class(node.type), node_class("planner")) for node in plan.nodes_on(host)
     ):
@@ -152,7 +155,10 @@ def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:
-    """Print the nodes of the launch file that were not started, with the reason for each."""
+    """Print the nodes of the launch file that the graph omits, and the reason for each.
+
+    host: host whose nodes are printed; None for all hosts.
+    """
     from flexsheet.launch.plans.needed_nodes import REASON_TEXTS
 
     for one in plan.omitted:
@@ -188,7 +194,7 @@ async def run_graph(
 
 
 def _list_end_signals() -> list[int]:
-    """Return the signals that stop a graph; SIGHUP only if `nohup` has not disabled it."""
+    """Return the signals that stop a graph: SIGINT, SIGTERM, and SIGHUP unless it is ignored."""
     hung_up = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
     return [signal.SIGINT, signal.SIGTERM, *hung_up]
 
@@ -245,7 +251,7 @@ def _print_log_line(node: str, line: str) -> None:
 
 
 def format_log_line(line: str) -> tuple[str, str]:
-    """Return the colour style and the text of a log line; convert JSON of structlog into text."""
+    """Return the colour style and the readable text of a log line, which may be JSON."""
     style, text = "", line
     if line.startswith("{"):
         try:

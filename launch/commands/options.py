@@ -16,7 +16,7 @@ from flexsheet.launch.commands import complete
 from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file
 
 DEMO, CYLINDER = Path("demo"), Path("cylinder")
-"""Names of the shipped launch file and of the shipped scene that commands use by default."""
+"""The names of the launch file and of the scene that commands use by default."""
 
 FORMER_NAMES = {
     "also": "include",
@@ -35,7 +35,10 @@ FORMER_NAMES = {
     "service": "systemd",
     "stand-down": "disable",
 }
-"""Current name of each renamed option and command; former names still work but are not shown."""
+"""The current name of each renamed option and command, by its former name.
+
+Former names still work, but the help does not show them.
+"""
 
 
 def make_app(text: str | None = None) -> typer.Typer:
@@ -44,12 +47,12 @@ def make_app(text: str | None = None) -> typer.Typer:
 
 
 def find_launch_file(given: Path | None) -> Path | None:
-    """Return the path of a launch file, which is given as a path or as a shipped file's name."""
+    """Return the path of a launch file; the argument is a path or a name in the package."""
     return None if given is None else find_file(given, LAUNCH_FILES)
 
 
 def find_scene(given: Path | None) -> Path | None:
-    """Return the path of a scene file, which is given as a path or as a shipped file's name."""
+    """Return the path of a scene file; the argument is a path or a name in the package."""
     return None if given is None else find_file(given, SCENES)
 
 
@@ -57,7 +60,7 @@ LaunchArgument = Annotated[
     Path,
     typer.Argument(
         metavar="LAUNCH_FILE",
-        help="Path of a launch file, or name of a shipped one such as demo.",
+        help="Path of a launch file, or name of one in the package, such as demo.",
         autocompletion=complete.launch_files,
         callback=find_launch_file,
     ),
@@ -67,7 +70,7 @@ LaunchOption = Annotated[
     typer.Option(
         "--launch",
         metavar="LAUNCH_FILE",
-        help="Launch file of the graph: path, or name of a shipped one such as demo.",
+        help="Path of a launch file, or name of one in the package, such as demo.",
         autocompletion=complete.launch_files,
         callback=find_launch_file,
     ),
@@ -76,7 +79,7 @@ SceneArgument = Annotated[
     Path,
     typer.Argument(
         metavar="SCENE",
-        help="Path of a scene file, or name of a shipped one such as organ.",
+        help="Path of a scene file, or name of one in the package, such as organ.",
         autocompletion=complete.scenes,
         callback=find_scene,
     ),
@@ -86,7 +89,7 @@ SceneOption = Annotated[
     typer.Option(
         "--scene",
         metavar="SCENE",
-        help="Path of a scene file, or name of a shipped one.",
+        help="Path of a scene file, or name of one in the package, such as cylinder.",
         autocompletion=complete.scenes,
         callback=find_scene,
     ),
@@ -96,7 +99,7 @@ OtherSceneOption = Annotated[
     typer.Option(
         "--scene",
         metavar="SCENE",
-        help="Scene that replaces the scene of the launch file.",
+        help="Scene to use instead of the scene that the launch file names.",
         autocompletion=complete.scenes,
         callback=find_scene,
     ),
@@ -106,7 +109,7 @@ SettingsOption = Annotated[
     typer.Option(
         "--set",
         metavar="NODE.PARAM=VALUE",
-        help="Override a parameter of the launch file; repeat for several.",
+        help="Value that replaces a parameter of a node; repeat the option for several parameters.",
     ),
 ]
 ApparatusOption = Annotated[
@@ -114,8 +117,8 @@ ApparatusOption = Annotated[
     typer.Option(
         "--apparatus",
         metavar="FILE|seed:N",
-        help="True parameters of the simulated hardware: a file, or a random sample such as "
-        "seed:7,paper,calibrated; default: equal to the scene.",
+        help="File with the true parameters of the simulated hardware, or a random sample such as "
+        "seed:7,paper,calibrated; default: the parameters of the scene.",
     ),
 ]
 TwinApparatusOption = Annotated[
@@ -123,8 +126,9 @@ TwinApparatusOption = Annotated[
     typer.Option(
         "--apparatus",
         metavar="FILE|seed:N",
-        help="With --twin: true parameters of the simulated hardware, a file or a random sample; "
-        "default: equal to the scene, or for arms and projector deviations drawn with --seed.",
+        help="With --twin: file with the true parameters of the simulated hardware, or a random "
+        "sample. Default: the parameters of the scene; for arms and projector, random deviations "
+        "from the scene, which --seed determines.",
     ),
 ]
 RunOption = Annotated[
@@ -159,7 +163,7 @@ TopicsOption = Annotated[
     typer.Option(
         "--topic",
         metavar="TOPIC",
-        help="Topic to use; repeat for several; default: all.",
+        help="Topic to include; repeat the option for several topics; default: all topics.",
         autocompletion=complete.topics,
     ),
 ]
@@ -198,7 +202,7 @@ ProfileOption = Annotated[
     Literal["modern", "paper"],
     typer.Option(
         "--profile",
-        help="Equipment that is simulated; modern: 60 Hz camera; paper: 30 Hz camera.",
+        help="Simulated equipment: modern has a camera of 60 Hz, paper has one of 30 Hz.",
     ),
 ]
 CalibratedOption = Annotated[
@@ -218,12 +222,12 @@ def output_file(text: str, metavar: str = "FILE") -> Any:
 
 
 def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
-    """Return the values of --set, preceded by the setting that corresponds to --scene."""
+    """Return the setting that corresponds to --scene, followed by the values of --set."""
     return [*([] if scene is None else [f"scene={scene}"]), *(settings or ())]
 
 
 def split_names(given: list[str] | None) -> list[str]:
-    """Return the values of a repeated option.  The former comma-separated form "A,B" also works.
+    """Return the values of a repeated option, also from its former form "A,B".
 
     Raises BadParameter if the option is given but contains no name.
     """

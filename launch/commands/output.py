@@ -1,7 +1,4 @@
-"""Output of all commands: data goes to stdout, messages for the user to stderr.
-
-Defines the exit codes too.
-"""
+"""Print data of commands on stdout and messages for the user on stderr; define exit codes."""
 
 from __future__ import annotations
 
@@ -36,13 +33,13 @@ class CommandError(FlexsheetError):
 
 
 def check_folder(option: str, file: Path) -> None:
-    """Raise CommandError, which names the option, if the folder of an output file is missing."""
+    """Raise CommandError if the folder of the output file of an option does not exist."""
     if not file.resolve().parent.is_dir():
         raise CommandError(f"{option} {file}: the folder {file.parent} does not exist; create it")
 
 
 class Words:
-    """Printer of messages for the user on stderr.
+    """A printer of messages for the user on stderr.
 
     Colours and status lines are used only in terminals; NO_COLOR disables colours. The module rich
     is imported with the first message, so that commands start fast.
@@ -66,7 +63,7 @@ class Words:
         self.console.print(text, markup=markup, style=style)
 
     def status(self, text: str) -> Status:
-        """Return a context that shows a status line while it is active, in terminals only."""
+        """Return a context manager that shows a status line, if stderr is a terminal."""
         return self.console.status(text)
 
 
@@ -121,7 +118,7 @@ def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
 
 
 def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace each inner mapping by its values, with joined names such as "interval_ms p50"."""
+    """Replace each inner mapping by its values, and join the names, such as "interval_ms p50"."""
     flat: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, Mapping):

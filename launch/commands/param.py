@@ -30,7 +30,10 @@ if TYPE_CHECKING:
 app = make_app("List, get and set parameters of the running graph.")
 
 STATUS_TIMEOUT_S = 3.0
-"""Maximum time to wait for statuses, which contain changed parameters and appear once a second."""
+"""The maximum time to wait for statuses, in seconds.
+
+A status contains the changed parameters of a node and is published once a second.
+"""
 
 ParameterArgument = Annotated[
     str,
@@ -165,7 +168,7 @@ def _live(node: ResolvedNode) -> frozenset[str]:
 
 
 def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, dict[str, Any]]:
-    """Return the parameters (name: value) that were changed since the start, by node."""
+    """Return the parameters that were changed since the start: values by name, by node."""
     found: dict[str, dict[str, Any]] = {}
     if nodes:
         run_interruptible(_await_statuses(plan, run, lambda: nodes <= found.keys(), found))

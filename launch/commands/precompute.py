@@ -38,8 +38,8 @@ def precompute(
         typer.Option(
             "--skin-spacing",
             metavar="METRES",
-            help="Also compute the nonlinear table of the soft body (minutes), with this spacing "
-            "of surface nodes, m.",
+            help="Also compute the nonlinear table of the soft body, with this spacing of surface "
+            "nodes, m; the computation takes minutes.",
         ),
     ] = None,
     scheduler: SchedulerOption = None,

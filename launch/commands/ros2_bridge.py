@@ -23,7 +23,7 @@ app = make_app()
 
 
 class ExternalTopic(StrEnum):
-    """Topic that ROS nodes may publish for flexsheet."""
+    """A topic that ROS nodes may publish for flexsheet."""
 
     EYE = "eye"
     FINGERTIP = "fingertip"
@@ -77,8 +77,8 @@ def ros2_bridge(
 ) -> None:
     """Publish the topics of the running graph to ROS 2, and accept external inputs.
 
-    Arms, sheet and fingertip then appear in RViz and `ros2 bag record`. By default the bridge uses
-    the loopback interface. It never commands the arms.
+    RViz can then show the arms, the sheet and the fingertip, and `ros2 bag record` can record them.
+    The bridge never commands the arms. By default it uses the loopback interface.
     """
     from flexsheet.launch.ros2.bridge import list_default_topics
     from flexsheet.launch.ros2.dds import MAX_DOMAIN, RosParticipant

@@ -22,7 +22,7 @@ app = make_app("Export the apparatus of a scene to other tools.")
 
 
 class ModelFormat(StrEnum):
-    """File format of an exported model of the apparatus."""
+    """A file format of an exported model of the apparatus."""
 
     URDF = "urdf"
     GLTF = "gltf"

@@ -48,7 +48,10 @@ if TYPE_CHECKING:
 status_app, logs_app, stop_app, run_app = (make_app() for _ in range(4))
 
 STATUS_TIMEOUT_S = 3.0
-"""Maximum time to wait for the statuses of all nodes, which are published once a second."""
+"""The maximum time to wait for the statuses of all nodes, in seconds.
+
+Each node publishes its status once a second.
+"""
 
 STOP_TIMEOUT_S = 20.0
 POLL_PERIOD_S = 0.05
@@ -63,8 +66,8 @@ NodeArgument = Annotated[
 def status(run: RunOption = None, as_json: JsonOption = False) -> None:
     """Show the nodes of the running graph with message rates, lost messages and notes.
 
-    Also shows problems that the nodes' self-checks suspect. Exit code 1 if there is such a problem,
-    or if a node does not report its status.
+    The command also prints the problems that the self-checks of the nodes suspect. The exit code
+    is 1 if there is such a problem, or if a node does not report its status.
     """
     plan, found = running_graph(run)
     statuses: dict[str, Status] = {}
@@ -119,7 +122,7 @@ async def _collect_statuses(
 
 
 def _describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
-    """Return the status of a node as a table row; values are null if it does not report."""
+    """Return the status of a node as a table row; values are None if the node does not report."""
     row: dict[str, Any] = {"node": node.name, "host": node.host, "state": "silent"}
     if status is None:
         none: dict[str, Any] = {
@@ -168,7 +171,7 @@ def logs(
         typer.Option("-n", "--lines", metavar="N", min=0, help="Print the last N lines only."),
     ] = None,
     follow: Annotated[
-        bool, typer.Option("-f", "--follow", help="Print further lines until Ctrl-C.")
+        bool, typer.Option("-f", "--follow", help="Continue to print new lines until Ctrl-C.")
     ] = False,
     run: RunOption = None,
     as_json: JsonOption = False,
@@ -196,7 +199,7 @@ def logs(
 
 
 def _newest_run(directory: Path | None) -> Run:
-    """Return the run in a directory; default: the newest running one, else the newest one."""
+    """Return the run in a directory; None: the newest running graph, or else the newest run."""
     from flexsheet.launch.running.runs import Run, list_live_runs, list_runs
 
     if directory is not None:
@@ -240,7 +243,7 @@ def stop(
     live = list_live_runs()
     chosen = [one for one in live if run is None or one.directory == run.resolve()]
     if not chosen:
-        raise NoGraphError("no graph is running")
+        raise NoGraphError("no graph is running on this computer that could be stopped")
     if not stop_all:
         del chosen[1:]
     for each in chosen:

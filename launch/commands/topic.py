@@ -42,10 +42,10 @@ WindowOption = Annotated[
     typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement, s.", min=0.1),
 ]
 REPORT_DELAY_S = 3.0
-"""Time without a message after which the command reports that none has arrived."""
+"""The time without a message after which the command reports that none has arrived, in seconds."""
 
 SHORT_ARRAY = 36
-"""Maximum number of elements of an array that is printed in full."""
+"""The maximum number of elements of an array that is printed in full."""
 
 
 @app.command(
@@ -186,8 +186,9 @@ def delay(
 ) -> None:
     """Measure the age of a topic's data when it arrives at this command.
 
-    The age is counted from the source timestamp, for instance the camera exposure. Messages with
-    timestamps of another computer's clock are ignored, because their age is not known here.
+    The age is the time since the source timestamp, for instance since the exposure of an image. The
+    command ignores messages with timestamps of another computer, because it does not know the
+    difference of the clocks.
     """
     from flexsheet.messages.clock import SystemClock
 
@@ -222,17 +223,16 @@ def pub(
             help="Rate at which the message is repeated, Hz; default: send it once.",
         ),
     ] = None,
-    once: Annotated[
-        bool, typer.Option("-1", "--once", help="Send one message, which is the default.")
-    ] = False,
+    once: Annotated[bool, typer.Option("-1", "--once", help="Send one message (default).")] = False,
     count: CountOption = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Publish a message to the running graph.
 
-    The topic must allow several writers, or be listed under `external_topics` in the launch file. A
-    latched message reaches subscribers that connect later only while this command runs.
+    The topic must allow several writers, or be listed under `external_topics` in the launch file.
+    Subscribers that connect later receive a message of a latched topic only while this command
+    runs.
     """
     found = _find_topic(topic)
     built = _parse_message(found, message)
@@ -263,7 +263,10 @@ def make_silence_error(topic: str, duration_s: float) -> CommandError:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """Message received during a measurement; `received_ns` is a time of this computer's clock."""
+    """A message that arrives during a measurement.
+
+    received_ns: time of arrival on the clock of this computer, ns.
+    """
 
     header: Header
     size_bytes: int
@@ -271,7 +274,7 @@ class Arrival:
 
 
 def _by_writer(arrivals: Sequence[Any], header: Callable[[Any], Header]) -> list[list[Any]]:
-    """Group messages by writer and by start of the writer, since a restart resets its counts."""
+    """Group messages by writer and its starts; a restart resets the sequence numbers."""
     groups: dict[tuple[str, int], list[Any]] = {}
     for one in arrivals:
         groups.setdefault((header(one).writer, header(one).epoch), []).append(one)

@@ -50,9 +50,9 @@ def try_it(
 ) -> None:
     """Simulate the display, and touch a virtual object with the mouse in the browser.
 
-    Starts the demo graph with a console, prints the address of the console page, and runs until
-    Ctrl-C. To use it from another computer, run ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER there, and
-    open the same address.
+    The command starts the demo graph with a console, prints the address of the console page, and
+    runs until Ctrl-C. To open the page on another computer, first run there:
+    ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER
     """
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.precompute import precompute_graph

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
-"""Exit code if a method family has no method within the tolerance; the best one is chosen."""
+"""The exit code if no method of a family meets the tolerance, so that the best one is chosen."""
 
 
 app = make_app()
@@ -45,7 +45,7 @@ def tune(
         typer.Option(
             "--family",
             metavar="NAME",
-            help="Method family to tune; repeat for several; default: all.",
+            help="Method family to tune; repeat the option for several; default: all.",
             autocompletion=complete.tuned_families,
         ),
     ] = None,
@@ -83,11 +83,12 @@ def tune(
 ) -> None:
     """Choose the fastest methods that meet the tolerances of a scene; write them into the scene.
 
-    Each method family is measured on this computer over the working range of the scene, which first
-    takes seconds to minutes. Then the errors of combined methods are predicted, and the fastest
-    promising configuration is tested in a graph. It is accepted if all tolerances are met,
-    including latency and force. With --family, only those families are chosen, each separately.
-    Nodes use the chosen method if their parameter is `auto`. Exit code 3: a tolerance is not met.
+    The command measures each method family on this computer over the working range of the scene,
+    which takes seconds to minutes. It then predicts the errors of combined methods, and tests the
+    fastest promising configuration in a graph. It accepts a configuration that meets all
+    tolerances, including those of latency and force. With --family, it chooses only the methods of
+    these families, and each family separately. Nodes use the chosen method if their parameter is
+    `auto`. The exit code is 3 if a tolerance is not met.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts, tune

@@ -46,8 +46,9 @@ def view(
     """Serve the running graph to the viewers Foxglove and Lichtblick, until Ctrl-C.
 
     In the viewer, open a connection of the type "Foxglove WebSocket" with the printed address, and
-    import the printed layout file. The server is read-only and listens on this computer only. On
-    another computer, first run there: ssh -L 8765:127.0.0.1:8765 THIS_COMPUTER
+    import the printed layout file. The server is read-only and accepts only connections from this
+    computer. To use a viewer on another computer, first run there:
+    ssh -L 8765:127.0.0.1:8765 THIS_COMPUTER
     """
     try:
         import foxglove  # noqa: F401

@@ -48,6 +48,7 @@ from flexsheet.messages.types import (
     TwinEye,
     TwinFinger,
 )
+from flexsheet.nodes import NodeRole
 
 Floats = NDArray[np.float64]
 Progress = Callable[[float, float], None]
@@ -66,6 +67,15 @@ MODES = (
 )  # fmt: skip
 FINGER_STATES = ("tracking", "acquiring", "coasting", "lost")
 FAULTY = ("fault", "estop", "disconnected", "stopping")
+FAULTY_AT_END = ("disconnected", "stopping")
+"""The faulty modes that an arm also enters at the end of a session."""
+
+MOVING = ("follow", "hold", "relax")
+MAX_END_S = 2.0
+"""The maximum time between the end of an arm's controller and the end of its bridge, in seconds.
+
+An arm that is lost in this time, and does not move again, was stopped at the end of the session.
+"""
 
 
 @dataclass(slots=True)
@@ -185,6 +195,8 @@ class Arm:
         self.tool_speed, self.edge_force = Range(grid), Range(grid)
         self.cycle = Spread(Grid(0, 1.0, 1))
         self.faults: tuple[str, ...] = ()
+        self.bridge = ""
+        self.undecided: list[tuple[float, str, str]] = []
         self._recent: deque[tuple[int, Floats, Floats]] = deque()
 
     def add(self, arm: ArmState, source_ns: int, index: int) -> None:
@@ -251,6 +263,7 @@ class Session:
         self._table = ClockTable(self.clock_id)
         self._exposures: dict[str, int] = {}
         self._restarts: dict[str, int] = {}
+        self._stopped_s: dict[str, float] = {}
         self._finger_text = ""
         self._late_before: int | None = None
 
@@ -280,7 +293,7 @@ class Session:
         self.errors.add(message, header.source_ns)
         match message:
             case ArmState():
-                self._add_arm(message, header.source_ns, log_ns)
+                self._add_arm(message, header, log_ns)
             case SheetTarget():
                 self._add_target(message, log_ns)
             case Fingertip():
@@ -322,16 +335,57 @@ class Session:
                 self.events.add(self.seconds(flow.last_ns), "gap", text)
         flow.last_ns = log_ns
 
-    def _add_arm(self, arm: ArmState, source_ns: int, log_ns: int) -> None:
-        mine = self.arms[arm.side]
+    def finish(self) -> None:
+        """Complete the summary after the last message."""
+        self.errors.finish()
+        for arm in self.arms.values():
+            ends_s = [
+                self._stopped_s[node]
+                for node in (arm.bridge, *self._list_simulators(arm.bridge))
+                if node in self._stopped_s
+            ]
+            for seconds, kind, text in arm.undecided:
+                at_end = bool(ends_s) and seconds >= min(ends_s) - MAX_END_S
+                self.events.add(seconds, "end" if at_end else kind, text)
+
+    def _list_simulators(self, bridge: str) -> list[str]:
+        """Return the nodes that simulate the arm of a bridge; empty for a real arm."""
+        nodes = {} if self.plan is None else self.plan.nodes
+        if bridge not in nodes or nodes[bridge].device_address is None:
+            return []
+        host, address = nodes[bridge].host, str(nodes[bridge].device_address)
+        port = int(address.rpartition(":")[2])
+        return [
+            node.name
+            for node in nodes.values()
+            if node.role is NodeRole.ARM_SIMULATOR
+            and node.host == host
+            and port in node.listen_ports
+        ]
+
+    def _add_arm(self, arm: ArmState, header: Header, log_ns: int) -> None:
+        mine, seconds = self.arms[arm.side], self.seconds(log_ns)
+        mine.bridge = header.writer
+        if arm.mode in MOVING:
+            for event in mine.undecided:
+                self.events.add(*event)
+            mine.undecided.clear()
+        found = []
         if mine.modes.add(self.fine.index(log_ns), log_ns, arm.mode) and arm.mode in FAULTY:
             text = f"{arm.side} arm: {arm.mode}" + (f", {arm.reason}" if arm.reason else "")
-            self.events.add(self.seconds(log_ns), "arm", text)
+            found.append((arm.mode in FAULTY_AT_END, "arm", text))
+        # In the mode `disconnected`, the new fault is the reason of the lost connection.
+        lost = arm.mode == "disconnected" and not arm.estop_engaged
         for fault in arm.faults:
             if fault not in mine.faults:
-                self.events.add(self.seconds(log_ns), "fault", f"{arm.side} arm: {fault}")
+                found.append((lost, "fault", f"{arm.side} arm: {fault}"))
+        for undecided, kind, text in found:
+            if undecided:
+                mine.undecided.append((seconds, kind, text))
+            else:
+                self.events.add(seconds, kind, text)
         mine.faults = arm.faults
-        mine.add(arm, source_ns, self.grid.index(log_ns))
+        mine.add(arm, header.source_ns, self.grid.index(log_ns))
 
     def _add_target(self, target: SheetTarget, log_ns: int) -> None:
         fine = self.fine.index(log_ns)
@@ -350,6 +404,9 @@ class Session:
             self.finger_path.add(fine, finger.position_world_m)
 
     def _add_status(self, status: Status, header: Header, seconds: float) -> None:
+        self._stopped_s.pop(status.node, None)
+        if status.state == "stopping":
+            self._stopped_s[status.node] = seconds
         summary = self.nodes.setdefault(status.node, NodeSummary())
         starts = summary.starts
         if summary.add(status, header.epoch):
@@ -452,7 +509,7 @@ def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -
         session.add(topic, message, header, log_ns)
         if number % 200 == 0:
             progress(session.seconds(log_ns), info.duration_s)
-    session.errors.finish()
+    session.finish()
     return session
 
 
