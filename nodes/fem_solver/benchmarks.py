@@ -17,9 +17,9 @@ from typing import Protocol
 
 import numpy as np
 import structlog
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Scene, require_material
+from flexsheet.nodes.arrays import Floats, Singles
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver import snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
@@ -40,9 +40,6 @@ from flexsheet.nodes.fem_solver.reference import (
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, SnapshotJob
 from flexsheet.nodes.methods import Family, Progress, Trial, clip_range
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
 
 LINEAR_SPACINGS_M = {"linear, coarse": 0.006, "linear, medium": 0.0045, "linear, fine": 0.003}
 TABLE_SPACINGS_M = {"nonlinear table, medium": 0.0045}
@@ -71,7 +68,7 @@ class SkinSolution(Protocol):
     """Result of a method for one push: skin displacement (s, 3), m, and force (3,), N."""
 
     @property
-    def displacement(self) -> Floats | Floats32: ...
+    def displacement(self) -> Floats | Singles: ...
 
     @property
     def force_n(self) -> Floats: ...

@@ -6,10 +6,10 @@ import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Cylinder, Geometry, Scene, require_material
 from flexsheet.messages.types import Fingertip, Skin, SoftBody
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.fem_solver.closest_contact import (
     ContactAnchor,
     locate,
@@ -24,8 +24,6 @@ from flexsheet.nodes.fem_solver.table import Table, TableSoftBody
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.shapes import Shape, make_shape
-
-Floats = NDArray[np.float64]
 
 QUICK_TABLE = "quick_table"
 """Name of the method that uses the coarse table, which is computed first from few snapshots."""

@@ -9,11 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.shapes import Shape
-
-Floats = NDArray[np.float64]
 
 MIN_CURVATURE_MARGIN = 0.3
 """Minimum distance of the fingertip from the centre of curvature, divided by the radius of

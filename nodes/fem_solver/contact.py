@@ -19,15 +19,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats, Ints, Singles
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.mesh.solid import triangle_shape_functions
 from flexsheet.nodes.models.shapes import Shape
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 PENALTY_RATIO = 40.0
 """Penalty stiffness of the contact (Pa/m), divided by (Young's modulus / finger radius)."""
@@ -66,7 +62,7 @@ class SkinResponse:
     normals: Floats
     faces: Ints
     compliance: Floats
-    influence: Floats32
+    influence: Singles
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +76,7 @@ class DragResponse:
 
     tangents: Floats
     compliance: Floats
-    influence: Floats32
+    influence: Singles
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +86,7 @@ class Response:
     The fields are described at the message `messages.SoftBody`.
     """
 
-    displacement: Floats32
+    displacement: Singles
     force_n: Floats
     stiffness_n_per_m: float
     force_curve: Floats
@@ -109,7 +105,7 @@ class SoftBodyMethod(Protocol):
     def name(self) -> str: ...
 
     @property
-    def at_rest(self) -> Floats32: ...
+    def at_rest(self) -> Singles: ...
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
         """Return the stiffness (N/m) of the touchable skin nearest to a surface point (3,)."""
@@ -428,7 +424,7 @@ class LinearSoftBody:
         self._modulus = young_modulus_pa
         self._linear, self._largest = linear_depth_m, max_depth_m
         self._bounds, self._pad2 = bounds, (PAD_RATIO * finger_radius_m) ** 2
-        self.at_rest: Floats32 = np.zeros(response.rest.shape, dtype=np.float32)
+        self.at_rest: Singles = np.zeros(response.rest.shape, dtype=np.float32)
         corners = np.unique(response.faces[:, :3])
         self._points = response.rest[response.contact_nodes[corners]]
         normals = response.normals[corners]
@@ -514,7 +510,7 @@ class LinearSoftBody:
         result: Floats = np.maximum.accumulate(np.interp(bent, solved, forces) * grown)
         return result
 
-    def _sum(self, table: Floats32, rows: Ints, forces: Floats) -> Floats32:
+    def _sum(self, table: Singles, rows: Ints, forces: Floats) -> Singles:
         """Return the skin displacement (3 s,), m, under several nodal forces.
 
         table: influence matrix. rows, forces (k,): indices of its rows and the forces (N) on them.

@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.mesh import EDGES
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MAX_POISSON_RATIO = 0.4999
 """Maximum Poisson's ratio. Closer to 0.5, the bulk modulus is so large that rounding errors destroy
@@ -130,7 +128,7 @@ def element_stiffness(
     return stiffness.reshape(-1, 30, 30)
 
 
-def require_support(nodes: Floats, fixed: NDArray[np.bool_]) -> None:
+def require_support(nodes: Floats, fixed: Bools) -> None:
     """Raise SolidMeshError if all fixed nodes are collinear, so that the body could rotate freely.
 
     nodes (n, 3): positions. fixed (n,): whether each node is fixed.

@@ -13,9 +13,9 @@ Hooke's law. The energy grows without bound as J -> 0, so no element inverts at 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.elasticity import (
     jacobians,
     lame_constants,
@@ -24,10 +24,6 @@ from flexsheet.nodes.fem_solver.elasticity import (
     shape_gradients,
 )
 from flexsheet.nodes.fem_solver.mesh import EDGES
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
 
 CORNERS = np.vstack([np.zeros(3), np.eye(3)])
 NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])

@@ -14,13 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 LEAF_ELEMENTS = 48
 MAX_RUNS = 40
@@ -99,7 +96,7 @@ class _Part:
 class NestedDissection:
     """Elimination order for a mesh with given fixed nodes."""
 
-    def __init__(self, nodes: Floats, elements: Ints, fixed: NDArray[np.bool_]) -> None:
+    def __init__(self, nodes: Floats, elements: Ints, fixed: Bools) -> None:
         """Compute the elimination order.
 
         nodes (n, 3), elements (e, k): mesh. fixed (n,): whether each node is fixed.

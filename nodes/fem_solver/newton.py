@@ -18,17 +18,15 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.contact import POINT_SPACING_RATIO, sample_triangle
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from flexsheet.nodes.fem_solver.mesh import FACES, SUBTRIANGLES, boundary_faces
 from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, NestedDissection
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Friction = Literal["none", "stick"]
 
 PENALTY_RATIO = 200.0
@@ -223,7 +221,7 @@ class NeoHookeanBody:
         self,
         nodes: Floats,
         elements: Ints,
-        fixed: NDArray[np.bool_],
+        fixed: Bools,
         faces: Ints,
         *,
         young_modulus_pa: float,

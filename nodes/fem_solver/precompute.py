@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Plane
+from flexsheet.nodes.arrays import Bools, Floats, Ints, Singles
 from flexsheet.nodes.cache import CheckpointStore, Specification, cached, encode_fields, make_digest
 from flexsheet.nodes.fem_solver.contact import DragResponse, SkinResponse
 from flexsheet.nodes.fem_solver.mesh import MeshSpec, SolidMesh, build_mesh, mesh_budget
@@ -22,9 +23,6 @@ from flexsheet.nodes.fem_solver.mesh import MeshSpec, SolidMesh, build_mesh, mes
 if TYPE_CHECKING:
     from flexsheet.nodes.fem_solver.multifrontal import Factors, NestedDissection
 
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Ints = NDArray[np.int64]
 Part = dict[str, NDArray[Any]]
 
 VERSION = 3
@@ -85,7 +83,7 @@ class SoftBodyModel:
 
     response: SkinResponse
     triangles: NDArray[np.int32]
-    bounds: NDArray[np.bool_]
+    bounds: Bools
     drag: DragResponse | None = None
 
 
@@ -225,7 +223,7 @@ def _solve_unit_loads(
     directions: Floats,
     get_part: Callable[[int, Callable[[], Part]], Part],
     advance: Callable[[int], None],
-) -> tuple[Floats32, Floats]:
+) -> tuple[Singles, Floats]:
     """Solve for unit forces on the m contact nodes, in p directions at each.
 
     directions (m, p, 3): directions of the forces. get_part: function that loads the stored part

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Cylinder, Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import (
     CheckpointStore,
     encode_fields,
@@ -38,8 +38,6 @@ from flexsheet.nodes.fem_solver.snapshot_interpolator import (
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob
 from flexsheet.nodes.fem_solver.table import CANDIDATE_FACES, END_SPAN_M, Table, fill_table
 from flexsheet.nodes.methods import Progress
-
-Floats = NDArray[np.float64]
 
 VERSION = 2
 

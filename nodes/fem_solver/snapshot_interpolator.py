@@ -12,15 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats, Ints, Singles
 from flexsheet.nodes.fem_solver.mesh.solid import SUBTRIANGLES, triangle_shape_functions
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, reflect_snapshot
 from flexsheet.nodes.models.interpolation import smoothstep
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 TRANSPORTED_RATIO, FIXED_RATIO = 2.5, 6.5
 """Distances from the sample point, in finger radii, between which the weight of the transported
@@ -107,7 +103,7 @@ class SnapshotInterpolator:
         self._points = np.array([one.sample.point for one in solved])
         self.depths_m = solved[0].snapshot.depths_m
 
-    def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Floats32, Floats, float]:
+    def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Singles, Floats, float]:
         """Interpolate the snapshots at a new sample point.
 
         rest (s, 3): undeformed skin nodes. Returns the displacement (k, s, 3) and the force (k, 3)
@@ -115,7 +111,7 @@ class SnapshotInterpolator:
         mean over the snapshots used.
         """
         weights = self.neighbour_weights(sample)
-        moved: Floats32 | None = None
+        moved: Singles | None = None
         force = np.zeros(self._solved[0].snapshot.force_n.shape)
         reached = 0.0
         for number, weight in weights:
@@ -155,7 +151,7 @@ class SnapshotInterpolator:
 
     def _transport(
         self, solved: PlacedSnapshot, sample: SamplePoint, rest: Floats
-    ) -> tuple[Floats32, Floats]:
+    ) -> tuple[Singles, Floats]:
         rotation = (
             minimal_rotation(self._user, solved.sample.normal)
             @ minimal_rotation(self._user, sample.normal).T

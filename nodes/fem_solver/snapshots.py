@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Cylinder, StripSupport
+from flexsheet.nodes.arrays import Bools, Floats, Ints, Singles
 from flexsheet.nodes.fem_solver.mesh import (
     Focus,
     MeshSpec,
@@ -24,11 +25,6 @@ from flexsheet.nodes.fem_solver.mesh import (
     boundary_faces,
     cylinder_mesh,
 )
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0.0225)
 SPACING_RATIO = 0.35
@@ -102,7 +98,7 @@ class Snapshot:
     rest: Floats
     faces: Ints
     depths_m: Floats
-    moved: Floats32
+    moved: Singles
     force_n: Floats
     reached: int
 

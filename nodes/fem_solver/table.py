@@ -21,6 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats, Ints, Singles
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import (
     CURVE_FRACTIONS,
@@ -37,10 +38,6 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator, SnapshotSet
 from flexsheet.nodes.fem_solver.snapshots import FINE_RATIO, SamplePoint, Snapshot
 from flexsheet.nodes.models.interpolation import smoothstep
-
-Floats = NDArray[np.float64]
-Floats32 = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 LINEAR_DEPTHS_M = (0.0007,)
 """Depths of the table in addition to those of the snapshots."""
@@ -71,7 +68,7 @@ class Table:
     """
 
     depths_m: Floats
-    fields: Floats32
+    fields: Singles
     force_n: Floats
     reach_m: Floats
 
@@ -105,7 +102,7 @@ class FilledNodes:
     see `SnapshotInterpolator.interpolate`. valid (n,): see `count_valid_levels`.
     """
 
-    moved: Floats32
+    moved: Singles
     force_n: Floats
     reached: Floats
     valid: Ints
@@ -210,8 +207,8 @@ def compute_force_factors(
 
 
 def _blend_levels(
-    sample: SamplePoint, linear: LinearSoftBody, depths: Floats, solved: Floats32, pushed: Floats
-) -> tuple[Floats32, Floats]:
+    sample: SamplePoint, linear: LinearSoftBody, depths: Floats, solved: Singles, pushed: Floats
+) -> tuple[Singles, Floats]:
     """Blend interpolated snapshots with the linear response at small depths.
 
     solved (k, 3 s), pushed (k, 3): displacement and force at the last k of the L depths. Returns
@@ -269,7 +266,7 @@ class CubicInterpolator:
         return self._first[level], np.array([1.0, t, t * t, t * t * t]) @ self._powers[level]
 
 
-def count_valid_levels(rest: Floats, moved: Floats32, triangles: NDArray[np.int32]) -> int:
+def count_valid_levels(rest: Floats, moved: Singles, triangles: NDArray[np.int32]) -> int:
     """Count the depths, from the shallowest, at which an interpolated skin displacement is valid.
 
     rest (s, 3): undeformed skin nodes. moved (L, s, 3): displacement at each depth. A depth is
@@ -334,7 +331,7 @@ class TableSoftBody:
         from scipy.spatial import cKDTree
 
         self._add = sgemv
-        self.at_rest: Floats32 = np.zeros(response.rest.shape, dtype=np.float32)
+        self.at_rest: Singles = np.zeros(response.rest.shape, dtype=np.float32)
         self._radius = finger_radius_m
         self._fields = table.fields
         max_depth_m = float(table.depths_m[-1])

@@ -13,13 +13,9 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Bools, Ints
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 CELL = 64
 """Length of a cell in integer coordinates; as a power of two, it can be halved six times."""

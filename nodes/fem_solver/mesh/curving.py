@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.quality import MIN_JACOBIAN_RATIO, min_jacobian_ratios
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES, boundary_faces
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 MAX_SAG_RATIO = 0.25
 """Maximum displacement of the midpoint of an edge, divided by the length of the edge. A surface

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.solid import (
     EDGES,
     SUBTRIANGLES,
@@ -24,9 +24,6 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     add_midside_nodes,
     boundary_faces,
 )
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35

@@ -16,8 +16,8 @@ The method is deterministic. Parts thinner than the smallest elements are omitte
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
 from flexsheet.nodes.fem_solver.mesh.curving import curve_edges
 from flexsheet.nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, longest_edges
@@ -34,10 +34,6 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     orient_tetrahedra,
 )
 from flexsheet.nodes.models.shapes import Shape
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 INITIAL_CELL_RATIO = 2
 """Width of the lattice cells before bisection, divided by the minimum element size."""

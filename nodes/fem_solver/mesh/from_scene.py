@@ -10,7 +10,6 @@ import json
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import (
     BaseSupport,
@@ -23,6 +22,7 @@ from flexsheet.messages.scene import (
     Support,
     require_support,
 )
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.cylinder import cylinder_mesh
 from flexsheet.nodes.fem_solver.mesh.fitted import fit_mesh, limit_sizes_by_curvature
 from flexsheet.nodes.fem_solver.mesh.grading import Grading
@@ -40,9 +40,6 @@ from flexsheet.nodes.models import rigid
 from flexsheet.nodes.models.shapes import GEOMETRIES, Shape, make_shape
 from flexsheet.nodes.models.shapes.triangles import volume_m3
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 Vector = tuple[float, float, float]
 
 VERSION = 1

@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35

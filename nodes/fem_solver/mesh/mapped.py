@@ -15,9 +15,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Plane
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
 from flexsheet.nodes.fem_solver.mesh.curving import curve_edges
 from flexsheet.nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, longest_edges
@@ -33,10 +33,6 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     orient_tetrahedra,
 )
 from flexsheet.nodes.models.shapes import CuboidMap, Shape
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 COARSENINGS = (8.0, 4.0, 2.0, 1.0, 0.85, 0.7)
 """Widths of the lattice cells before bisection, divided by the minimum element size; all are tried.

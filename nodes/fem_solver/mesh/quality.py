@@ -5,10 +5,8 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from flexsheet.nodes.arrays import Floats, Ints
 
 MIN_RADIUS_RATIO = 0.1
 """Minimum radius ratio of an accepted mesh."""

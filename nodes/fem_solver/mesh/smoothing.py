@@ -14,13 +14,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
 from flexsheet.nodes.models.shapes import Shape
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 Surface = Callable[[Floats], tuple[Floats, Floats]]
 """Function that maps points (n, 3) to the nearest surface points and outward normals there."""

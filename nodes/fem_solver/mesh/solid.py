@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 """Corners of the edges whose midpoints are the nodes 4 to 9 of a tetrahedron."""
@@ -50,7 +47,7 @@ class SolidMesh:
     nodes: Floats
     elements: Ints
     slab: Ints
-    fixed: NDArray[np.bool_]
+    fixed: Bools
     skin: Ints
     skin_triangles: NDArray[np.int32]
     contact_nodes: Ints

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import (
     BaseSupport,
@@ -12,10 +11,8 @@ from flexsheet.messages.scene import (
     StripSupport,
     Support,
 )
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.fem_solver.mesh.solid import UnfitMeshError
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 TOLERANCE_M = 1e-9
 
