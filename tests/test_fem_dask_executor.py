@@ -145,7 +145,7 @@ def test_jobs_of_a_lost_worker_move_to_others_and_a_lost_scheduler_is_reported(
             if count == 2:
                 lab.scheduler.kill()
 
-        with pytest.raises(LostWorkersError, match="continues from the finished"):
+        with pytest.raises(LostWorkersError, match="loads the finished snapshots"):
             solve_all([*jobs, job(0.002)], executor, parts, leave)
 
 

@@ -46,26 +46,26 @@ TABLE_SPACINGS_M = {"nonlinear table, medium": 0.0045}
 NEWTON = "neo-Hookean Newton, 0.1 mm further"
 NEWTON_RATIO = 0.64
 FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
-"""Distances between skin nodes of the reference meshes, from the most to the least accurate.
-Focused meshes are fine only near the finger (spacing in finger radii); even meshes have the same
-spacing everywhere (m)."""
+"""The distances between skin nodes of the reference meshes, from the most to the least accurate.
+Focused meshes are fine only near the finger, and their spacing is in finger radii. Even meshes have
+the same spacing everywhere, in metres."""
 SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
 DEPTHS_M = (*SHALLOW_M, 0.020, 0.0225, 0.025, 0.0275, 0.030, 0.040, 0.050)
 NEWTON_DEPTHS_M = (0.003, 0.010, 0.015)
 NEWTON_STEP_M = 1e-4
 SAMPLE_OFFSET_M = np.array([0.004, 0.003, 0.0])
-"""Offset of the pushed point from the point nearest to the user. It ensures that the pushed point
-is not a node of any mesh, which would favour a method."""
+"""The offset of the pushed point from the point nearest to the user. With this offset, the pushed
+point is not a node of any mesh. A push at a node would favour a method."""
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 RIM_RATIO = 1.5
-"""Distance from the push, in finger radii, within which displacement errors are ignored, because
-the finger hides the skin there."""
+"""The distance from the push, in finger radii, within which displacement errors are ignored,
+because the finger hides the skin."""
 FORCE = "force_error_percent"
 MAX_DISPLACEMENT = "largest_move_mm"
 
 
 class SkinSolution(Protocol):
-    """Result of a method for one push: skin displacement (s, 3), m, and force (3,), N."""
+    """The result of a method for one push: skin displacement (s, 3), m, and force (3,), N."""
 
     @property
     def displacement(self) -> Floats | Singles: ...
@@ -76,11 +76,12 @@ class SkinSolution(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyBenchmark:
-    """Benchmark of the soft-body methods for one push of the object of a scene.
+    """A benchmark of the soft-body methods for pushes at one point of the object of a scene.
 
     depths_m: push depths. linear_m, table_m: skin spacing (m) for each name of a linear or table
     method. newton_m: depths at which full Newton solutions are timed. focused: skin spacings of the
-    focused reference meshes, in finger radii. even_m: skin spacings of the even ones, m.
+    reference meshes that are fine only near the finger, in finger radii. even_m: skin spacings of
+    the even reference meshes, m.
     """
 
     scene: Scene
@@ -122,7 +123,7 @@ class SoftBodyBenchmark:
         return SamplePoint(found.point, found.normal)
 
     def reference_jobs(self) -> list[tuple[str, SnapshotJob]]:
-        """Return names and inputs (jobs) of the reference solutions, the most accurate first."""
+        """Return names and jobs of the reference solutions, in order of decreasing accuracy."""
         body, sample = self.coarsest(), self.sample()
         jobs = []
         for focused, even in zip(self.focused, self.even_m, strict=True):
@@ -135,7 +136,7 @@ class SoftBodyBenchmark:
         return jobs
 
     def local_tables(self) -> dict[str, LocalTable]:
-        """Return a table for the skin near the push, for each method without a cached table."""
+        """Return a table for the skin near the push for each method whose table is not cached."""
         found = {}
         for name, spacing in self.table_m.items():
             body, model = self.linear(spacing)
@@ -144,7 +145,7 @@ class SoftBodyBenchmark:
         return found
 
     def prepare(self, on_progress: Progress) -> None:
-        """Solve and cache all references and table snapshots; the first call takes minutes."""
+        """Solve and cache all references and table snapshots. The first call takes minutes."""
         jobs = [job for _, job in self.reference_jobs()]
         for table in self.local_tables().values():
             jobs += table.jobs
@@ -163,8 +164,8 @@ class SoftBodyBenchmark:
     def trials(self) -> Iterator[Trial]:
         """Yield one trial (a measured case) for each method and push depth.
 
-        The error of a trial is the maximum displacement error of the skin nodes outside the
-        contact, mm. The force error is an additional metric.
+        The error of a trial is the maximum displacement error of the skin nodes that the finger
+        does not hide, in mm. The force error is an additional metric.
         """
         sample, references = self.sample(), self.reference_set()
         bodies = {name: self.linear(spacing)[0] for name, spacing in self.linear_m.items()}
@@ -188,7 +189,7 @@ class SoftBodyBenchmark:
     def _newton_trials(self, references: ReferenceSet) -> Iterator[Trial]:
         """Yield one trial of the full Newton method for each depth in `newton_m`.
 
-        Each trial is one load step that starts `NEWTON_STEP_M` above its depth.
+        Each trial is one load step of the length `NEWTON_STEP_M` to its depth.
         """
         if not self.newton_m:
             return
@@ -227,7 +228,7 @@ class SoftBodyBenchmark:
 
 
 class ReferenceSet:
-    """Reference solutions of one push, the most accurate first."""
+    """The reference solutions of pushes at one point, in order of decreasing accuracy."""
 
     def __init__(
         self, references: Sequence[ReferenceSolution], sample: SamplePoint, scene: Scene
@@ -247,8 +248,8 @@ class ReferenceSet:
     ) -> Trial:
         """Return the trial of a method at one push depth.
 
-        rest (s, 3): undeformed skin nodes. run: function that computes the solution. in_range:
-        whether the depth is in the valid range of the method. The error is NaN where no reference
+        rest (s, 3): undeformed skin nodes, m. run: function that computes the solution. in_range:
+        whether the depth is in the valid range of the method. The error is NaN if no reference
         converged at the depth.
         """
         off_finger = np.linalg.norm(rest - self.sample.point, axis=1) > self._rim_m
@@ -290,7 +291,7 @@ class ReferenceSet:
 
 
 def _ignore_progress(done: int, total: int) -> None:
-    """Ignore progress, for calls that find all results in the cache."""
+    """Ignore the progress of calls that find all results in the cache."""
 
 
 def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
@@ -309,12 +310,12 @@ def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
 
 
 def linear_benchmark(scene: Scene) -> SoftBodyBenchmark:
-    """Return the benchmark of the linear methods only, which need no long precomputation."""
+    """Return a benchmark of the linear methods only, which needs no long precomputation."""
     return replace(make_benchmark(scene), table_m={}, newton_m=())
 
 
 def table_benchmark(scene: Scene) -> SoftBodyBenchmark:
-    """Return the benchmark of the nonlinear tables only, which take minutes to precompute."""
+    """Return a benchmark of the nonlinear tables only, which take minutes to precompute."""
     return replace(make_benchmark(scene), linear_m={}, newton_m=())
 
 

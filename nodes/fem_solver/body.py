@@ -26,11 +26,11 @@ from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.shapes import Shape, make_shape
 
 QUICK_TABLE = "quick_table"
-"""Name of the method that uses the coarse table, which is computed first from few snapshots."""
+"""The name of the method that uses the coarse table, which is computed first from few snapshots."""
 LINEAR_ERROR_RATIO, TABLE_ERROR_RATIO, UNCORRECTED_RATIO, QUICK_EXTRA_RATIO = 0.25, 0.03, 0.15, 0.07
-"""Stated relative errors of the force at depths above 1 mm and 95 % of the touchable nodes: of the
-linear method, of the complete table with and without correction by a push on a fine mesh, and the
-additional error of the coarse table (docs/soft-body-verification.md)."""
+"""The stated relative errors of the force of the linear method and of the complete table with and
+without correction by a push on a fine mesh, and the additional error of the coarse table. They hold
+at depths above 1 mm for 95 % of the touchable nodes (docs/soft-body-verification.md)."""
 
 
 def state_force_error_ratio(method: str, geometry: Geometry) -> float:
@@ -48,14 +48,13 @@ def make_soft_body_spec(
     """Return the inputs of the precomputation for the object of a scene.
 
     skin_spacing_m: distance between skin nodes. sticking: whether the finger sticks to the skin.
-    Raises ValueError like `mesh_spec`, and if the skin spacing exceeds the radius of the fingertip.
-    Such a skin would be too stiff: the force is twice as large as it should be at a spacing of 1.7
-    radii, and seven times at 7 radii.
+    Raise ValueError if the skin spacing exceeds the radius of the fingertip, because the force
+    would be too large, or if the axis of a cylinder points to the user.
     """
     if skin_spacing_m > scene.finger.radius_m:
         raise ValueError(
             f"skin_spacing_m: {skin_spacing_m:g} is more than finger.radius_m "
-            f"({scene.finger.radius_m:g}), which would make the force far too large; reduce "
+            f"({scene.finger.radius_m:g}), and the force would be far too large; reduce "
             "skin_spacing_m to the radius or less"
         )
     mesh = mesh_spec(scene, skin_spacing_m)
@@ -68,9 +67,9 @@ def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
 
 
 def find_front_point(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
-    """Return the surface point (3,) nearest to the user, mesh frame.
+    """Return the surface point (3,) nearest to the user, m, mesh frame.
 
-    rest (s, 3): undeformed skin nodes.
+    rest (s, 3): undeformed skin nodes, m.
     """
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
     away = 2.0 * float(np.ptp(rest, axis=0).max())
@@ -79,12 +78,13 @@ def find_front_point(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SceneBody:
-    """Soft body of a scene with its pose in the world.
+    """A soft body of a scene, in its pose in the world.
 
-    method: method that computes the response. front (3,): surface point nearest to the user, mesh
-    frame. rest (s, 3): undeformed skin nodes, mesh frame. linear_depth_m: maximum depth of the
-    linear method, at which the stiffness is evaluated. friction_ratio: friction coefficient; with
-    0 the finger slides freely. force_error_ratio: stated relative error of the force.
+    method: method that computes the response. shape, spec, skin: surface, inputs and skin mesh.
+    front (3,): surface point nearest to the user, m, mesh frame. world_from_mesh (4, 4): pose. rest
+    (s, 3): undeformed skin nodes, m, mesh frame. linear_depth_m: maximum depth of the linear
+    method, at which the stiffness is evaluated. friction_ratio: friction coefficient; 0 means that
+    the finger slides freely. force_error_ratio: stated relative error of the force.
     """
 
     method: SoftBodyMethod
@@ -101,9 +101,9 @@ class SceneBody:
     def respond(
         self, point_world: Floats, anchor: ContactAnchor | None
     ) -> tuple[Response, ContactAnchor | None]:
-        """Return the response to a fingertip at `point_world` (3,) and the new contact anchor.
+        """Return the response to a fingertip at `point_world` (3,), m, and the new contact anchor.
 
-        anchor: contact anchor that the previous call returned, or None. Raises ValueError for a
+        anchor: contact anchor that the previous call returned, or None. Raise ValueError for a
         point that is not finite.
         """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
@@ -126,10 +126,8 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response if there is no contact; the stiffness is that at the front.
-
-        The front is the surface point that faces the user.
-        """
+        """Return the response without contact, with the stiffness at the point nearest to the
+        user."""
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -142,10 +140,10 @@ class SceneBody:
     def message(
         self, response: Response, *, horizon_s: float = 0.0, force_error_ratio: float | None = None
     ) -> SoftBody:
-        """Convert a response to a message, in the world frame.
+        """Convert a response to a message in the world frame.
 
-        horizon_s: time from the camera exposure to the predicted fingertip position, s.
-        force_error_ratio: stated error of the force; None for that of the method.
+        horizon_s: time from the camera exposure to the predicted fingertip position.
+        force_error_ratio: stated relative error of the force; None for the error of the method.
         """
         rotation = self.world_from_mesh[:3, :3]
         rotated = response.displacement @ rotation.T.astype(np.float32)
@@ -176,8 +174,10 @@ def build_scene_body(
 ) -> SceneBody:
     """Build the soft body of a scene from its precomputed model.
 
-    The other arguments are described at `LinearSoftBody` and `SceneBody`. Raises ValueError for
-    invalid depths, and for an invalid pose of the object, see `world_from_mesh`.
+    linear_depth_m: maximum depth at which the linear method is valid. max_depth_m: depth that
+    limits the displacement. friction_ratio: friction coefficient between finger and skin. Raise
+    ValueError unless 0 < linear_depth_m < max_depth_m, and if the axis of a cylinder points to the
+    user.
     """
     pose = world_from_mesh(scene)
     shape = make_shape(dict(scene.object.geometry))
@@ -218,7 +218,7 @@ def attach_table(
 ) -> SceneBody:
     """Return a copy of the body that uses the nonlinear table as its method.
 
-    quick: whether it is the coarse table of few snapshots.
+    quick: whether the table is the coarse one of few snapshots.
     """
     method = TableSoftBody(
         model.response,
@@ -235,9 +235,10 @@ def attach_table(
 
 
 def blend_responses(old: Response, new: Response, weight: float) -> Response:
-    """Return the weighted mean of two responses; weight: weight of the new response, 0 to 1.
+    """Return the weighted mean of two responses.
 
-    The other fields, and the depths of the force curve, are those of the new response.
+    weight: weight of the new response, from 0 to 1. Fields that cannot be averaged, and the depths
+    of the force curve, are those of the new response.
     """
     depths = new.force_curve[:, 0]
     before = np.interp(depths, old.force_curve[:, 0], old.force_curve[:, 1])
@@ -254,10 +255,10 @@ def blend_responses(old: Response, new: Response, weight: float) -> Response:
 
 
 def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:
-    """Return the response to show `lost_s` seconds after the finger was last measured.
+    """Return the response at a time `lost_s` after the finger was last measured.
 
-    It is the last response for a time `hold_s`, and then decays exponentially with the time
-    constant `relax_s`.
+    The last response is unchanged for a time `hold_s`, and then decays exponentially with the time
+    constant `relax_s`. response: last response before the finger was lost.
     """
     if lost_s <= hold_s:
         return response
@@ -271,7 +272,8 @@ def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: 
 
 
 def predict_position(fingertip: Fingertip, horizon_s: float) -> Floats:
-    """Return the predicted fingertip position (3,), m, world, `horizon_s` after the exposure."""
+    """Return the predicted fingertip position (3,), m, world frame, for a time after the
+    exposure."""
     return interpolate_path(
         fingertip.predicted_path_world_m, fingertip.prediction_step_s, horizon_s
     )[0]

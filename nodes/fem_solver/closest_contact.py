@@ -1,7 +1,7 @@
-"""Find the contact point of a fingertip on a smooth shape, even if the fingertip is deep inside it.
+"""Find the contact point of a fingertip on a smooth shape.
 
-Deep inside, the nearest surface point is ambiguous. The choice therefore depends on the previous
-contact point, called the anchor.
+If the fingertip is deep inside the shape, the nearest surface point is ambiguous. The choice
+therefore depends on the previous contact point, called the anchor.
 """
 
 from __future__ import annotations
@@ -14,18 +14,19 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.shapes import Shape
 
 MIN_CURVATURE_MARGIN = 0.3
-"""Minimum distance of the fingertip from the centre of curvature, divided by the radius of
-curvature. Closer to the centre, the nearest point is ill-conditioned, so the anchor is kept."""
+"""The minimum distance of the fingertip from the centre of curvature, divided by the radius of
+curvature. At smaller distances, the nearest point is ill-conditioned, and the anchor is used
+instead."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContactQuery:
-    """Contact of a fingertip with the undeformed object.
+    """The contact of a fingertip with the undeformed object.
 
-    surface (3,), normal (3,): pushed surface point and its outward normal. depth_m: depth of the
-    fingertip below that point along the normal, negative outside. beyond_m: distance of the
-    fingertip past the end of the surface. drag_m (3,): displacement of the fingertip along the
-    surface since it started to stick to that point; None for a sliding finger.
+    surface (3,), normal (3,): pushed surface point, m, and its outward normal. depth_m: depth of
+    the fingertip below this point along the normal, which is negative outside the object. beyond_m:
+    distance of the fingertip past the edge of the surface. drag_m (3,): displacement of the
+    fingertip along the surface since it started to stick to the point; None for a sliding finger.
     """
 
     surface: Floats
@@ -37,7 +38,7 @@ class ContactQuery:
 
 @dataclass(frozen=True, slots=True)
 class ContactAnchor:
-    """Surface point (3,) that the finger pushes, and its outward normal (3,)."""
+    """A surface point (3,), m, that the finger pushes, and its outward normal (3,)."""
 
     point: Floats
     normal: Floats
@@ -46,16 +47,17 @@ class ContactAnchor:
 def locate(
     shape: Shape, point: Floats, anchor: ContactAnchor | None
 ) -> tuple[ContactQuery, ContactAnchor | None]:
-    """Return the contact of a fingertip at `point` (3,) and the anchor for the next call.
+    """Return the contact of a fingertip at `point` (3,), m, and the anchor for the next call.
 
-    anchor: the anchor that the previous call returned, or None. The contact point is the nearest
-    surface point, with two exceptions in which it is the anchor. These are a fingertip near the
-    centre of curvature, and a nearest point on the far side of the body. A finger pushed through a
-    body therefore stays in contact with the side that it entered. Raises ValueError for a point
-    that is not finite.
+    anchor: anchor that the previous call returned, or None. The contact point is usually the
+    nearest surface point. It is the anchor if the fingertip is near the centre of curvature, or if
+    the nearest point is on the far side of the body. A finger pushed through a body therefore stays
+    in contact with the side that it entered. Raise ValueError for a point that is not finite.
     """
     if not np.isfinite(point).all():
-        raise ValueError(f"fingertip position {point} is not finite; check the fingertip messages")
+        raise ValueError(
+            f"the fingertip position {point} is not finite; check the fingertip messages"
+        )
     found = shape.closest(point, previous=None if anchor is None else anchor.point)
     height = float(found.height_m)
     if height > 0.0:
@@ -71,10 +73,10 @@ def locate(
 def locate_sticking(
     shape: Shape, point: Floats, anchor: ContactAnchor | None
 ) -> tuple[ContactQuery, ContactAnchor | None]:
-    """Return the contact of a fingertip at `point` (3,) that sticks to its first contact point.
+    """Return the contact of a sticking fingertip at `point` (3,), m, and the next anchor.
 
-    anchor: that point, as returned by the previous call, or None. Also returns the anchor for the
-    next call. Raises ValueError like `locate`.
+    anchor: first contact point, to which the fingertip sticks, or None before contact. Pass the
+    returned anchor to the next call. Raise ValueError for a point that is not finite.
     """
     query, new_anchor = locate(shape, point, anchor)
     if new_anchor is None or anchor is None:
@@ -92,7 +94,8 @@ def slide_anchor(
 ) -> ContactAnchor:
     """Return the anchor after the finger has slid over the surface.
 
-    drag (3,): displacement of the finger from the anchor. fraction: part of it that remains.
+    drag (3,): displacement of the finger from the anchor, m. fraction: fraction of this
+    displacement that remains after the slide.
     """
     found = shape.closest(anchor.point + (1.0 - fraction) * drag, previous=anchor.point)
     return ContactAnchor(found.point, found.normal)
@@ -101,7 +104,10 @@ def slide_anchor(
 def _make_query(
     point: Floats, surface_point: Floats, normal: Floats, on_edge: bool
 ) -> ContactQuery:
-    """Return the contact of a fingertip at `point` with the tangent plane at a surface point."""
+    """Return the contact of a fingertip at `point` (3,) with the tangent plane of a surface point.
+
+    on_edge: whether the surface point is on the edge of the surface.
+    """
     depth = float((surface_point - point) @ normal)
     surface = point + depth * normal
     return ContactQuery(

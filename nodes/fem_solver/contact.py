@@ -26,35 +26,37 @@ from flexsheet.nodes.fem_solver.mesh.solid import triangle_shape_functions
 from flexsheet.nodes.models.shapes import Shape
 
 PENALTY_RATIO = 40.0
-"""Penalty stiffness of the contact (Pa/m), divided by (Young's modulus / finger radius)."""
+"""The penalty stiffness of the contact, in Pa/m, divided by the ratio of Young's modulus to the
+finger radius."""
 POINT_SPACING_RATIO = 0.4
-"""Maximum spacing of the contact points, in finger radii."""
+"""The maximum spacing of the contact points, in finger radii."""
 FLANK_RATIO = 0.9
-"""Distance from the push axis, in finger radii, beyond which the finger's surface is the tangent
-cone of the sphere instead of the sphere."""
+"""The distance from the push axis, in finger radii, beyond which the finger is modelled as the
+tangent cone of its sphere instead of the sphere."""
 FACING = (0.2, 0.6)
-"""Range of the cosine between skin normal and contact normal over which the weight of the
-penetration rises from 0 to 1."""
+"""The range of the cosine of the angle between skin normal and contact normal in which the weight
+of the penetration rises from 0 to 1."""
 PAD_RATIO = 1.1
-"""Half width of the contact patch at the end of the linear range, in finger radii."""
+"""The half width of the contact patch at the end of the linear range, in finger radii."""
 TANGENTIAL_COMPLIANCE_RATIO = 0.004
-"""Tangential displacement of a sticking contact point if its tangential force equals its normal
+"""The tangential displacement of a sticking contact point whose tangential force equals its normal
 force, in finger radii."""
 FULL_STEPS = 8
 MAX_ITERATIONS = 40
 CURVE_FRACTIONS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
-"""Depths of the force curve within the linear range, as fractions of that range."""
+"""The depths of the force curve within the linear range, as fractions of that range."""
 
 
 @dataclass(frozen=True, slots=True)
 class SkinResponse:
-    """Response of a linear body to unit normal forces on its skin, for a Young's modulus of 1 Pa.
+    """The response of a linear body to unit normal forces on its skin.
 
-    rest (s, 3): undeformed positions of the skin nodes, m, mesh frame. contact_nodes (m,): indices
-    into `rest` of the nodes that the finger can touch. normals (m, 3): outward normals at these
-    nodes. faces (f, 6): six-node triangles, as indices into `contact_nodes`. compliance (m, m):
-    inward displacement of node i (m) per inward force on node j (N); symmetric. influence (m, 3 s)
-    float32: displacement of the whole skin per inward force on each contact node.
+    Young's modulus is 1 Pa. rest (s, 3): undeformed positions of the skin nodes, m, mesh frame.
+    contact_nodes (m,): indices into `rest` of the nodes that the finger can touch. normals (m, 3):
+    outward normals at these nodes. faces (f, 6): six-node triangles, as indices into
+    `contact_nodes`. compliance (m, m): inward displacement of node i (m) per inward force on node j
+    (N); symmetric. influence (m, 3 s) float32: displacement of the whole skin per inward force on
+    each contact node.
     """
 
     rest: Floats
@@ -67,11 +69,11 @@ class SkinResponse:
 
 @dataclass(frozen=True, slots=True)
 class DragResponse:
-    """Response of a linear body to unit tangential forces on its skin, for a modulus of 1 Pa.
+    """The response of a linear body to unit tangential forces on its skin.
 
-    tangents (m, 2, 3): two directions along the skin at each contact node. compliance (2m, 2m):
-    displacement along direction i (m) per force along direction j (N). influence (2m, 3 s)
-    float32: displacement of the whole skin per force along each direction.
+    Young's modulus is 1 Pa. tangents (m, 2, 3): two directions along the skin at each contact node.
+    compliance (2m, 2m): displacement along direction i (m) per force along direction j (N).
+    influence (2m, 3 s) float32: displacement of the whole skin per force along each direction.
     """
 
     tangents: Floats
@@ -81,9 +83,12 @@ class DragResponse:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """Response of a soft body to one finger position, in the mesh frame.
+    """The response of a soft body to one finger position, in the mesh frame.
 
-    The fields are described at the message `messages.SoftBody`.
+    displacement (s, 3): displacement of the skin nodes, m. force_n (3,): force on the finger.
+    stiffness_n_per_m: force per depth at the end of the linear range. force_curve (n, 2): depth (m)
+    and force (N). push_depth_m: depth of the push. in_range: whether the method is valid for the
+    push.
     """
 
     displacement: Singles
@@ -95,9 +100,9 @@ class Response:
 
 
 class SoftBodyMethod(Protocol):
-    """Interface of the methods that compute the response of a soft body to the finger.
+    """The interface of the methods that compute the response of a soft body to the finger.
 
-    name: name of the method in messages. at_rest: displacement (n, 3) of the skin without contact,
+    name: name of the method in messages. at_rest (s, 3): displacement of the skin without contact,
     which is zero.
     """
 
@@ -125,11 +130,12 @@ class SoftBodyMethod(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NormalContact:
-    """Solution of a frictionless contact.
+    """The solution of a frictionless contact.
 
-    nodes (k,): indices of the loaded contact nodes. forces (k,): inward forces on them, N. force_n
-    (3,): total force on the finger, N. weights (q, k), normals (q, 3), pressed_n (q,): shape
-    functions, skin normals and normal forces (N) at the q contact points under pressure.
+    nodes (k,): indices of the loaded contact nodes. forces (k,): inward forces on these nodes, N.
+    force_n (3,): total force on the finger. The other fields describe the q contact points under
+    pressure. weights (q, k): shape functions of the nodes. normals (q, 3): skin normals. pressed_n
+    (q,): normal forces.
     """
 
     nodes: Ints
@@ -142,7 +148,7 @@ class NormalContact:
 
 @dataclass(frozen=True, slots=True)
 class Drag:
-    """Tangential contact forces between skin and finger.
+    """The tangential contact forces between skin and finger.
 
     nodes (k,): indices of the loaded contact nodes. forces (k, 2): forces along the two tangents of
     each of these nodes, N. force_n (3,): total tangential force on the finger, N.
@@ -168,7 +174,7 @@ def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
 def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
     """Return the depths (m) at which a force curve is sampled.
 
-    They are dense up to `linear_m`, and increase geometrically from there to the larger of
+    The depths are dense up to `linear_m`. From there, they increase geometrically to the larger of
     `largest_m` and `push_m`.
     """
     max_push_m = largest_m if push_m is None else max(push_m, largest_m)
@@ -191,7 +197,7 @@ def sample_triangle(divisions: int) -> tuple[Floats, Floats]:
 
 
 class SphereContact:
-    """Solver of the contact between a linear body and a spherical fingertip, without state."""
+    """A solver of the contact between a linear body and a spherical fingertip, without state."""
 
     def __init__(
         self,
@@ -203,7 +209,7 @@ class SphereContact:
     ) -> None:
         """Sample the contact points of the skin.
 
-        shape: smooth surface that the triangles in `response` approximate, in the mesh frame.
+        shape: smooth surface that the triangles in `response` approximate, mesh frame.
         """
         self._response = response
         self._radius = finger_radius_m
@@ -226,13 +232,13 @@ class SphereContact:
     def penetration(
         self, points: Floats, normals: Floats, centre: Floats, direction: Floats
     ) -> Floats:
-        """Return how deep skin points are inside the rigid finger (q,), m; negative outside.
+        """Return the penetration (q,) of skin points into the rigid finger, m.
 
-        points, normals (q, 3): skin points and their outward normals. centre (3,): centre of the
-        sphere. direction (3,): outward surface normal at the contact. Skin that faces away from
-        this direction has no penetration, see `FACING`. Beyond `FLANK_RATIO` of its radius, the
-        sphere is replaced by its tangent cone, so that each value is finite and has a continuous
-        slope.
+        The penetration is negative outside the finger. points, normals (q, 3): skin points and
+        their outward normals. centre (3,): centre of the sphere. direction (3,): outward surface
+        normal at the contact. Skin that faces away from this direction has no penetration. Beyond
+        `FLANK_RATIO` of its radius, the sphere is replaced by its tangent cone. Each value is
+        therefore finite and has a continuous slope.
         """
         offset = centre - points
         along = np.einsum("qi,qi->q", offset, normals)
@@ -246,9 +252,9 @@ class SphereContact:
         return result
 
     def solve(self, query: ContactQuery, depth_m: float) -> NormalContact | None:
-        """Solve the contact of a finger pushed `depth_m` below the surface point `query.surface`.
+        """Solve the contact of a finger at a depth (m) below the surface point of a query.
 
-        Returns None if the finger touches no contact point.
+        Return None if the finger touches no contact point. The depth in the query is ignored.
         """
         centre = query.surface + (self._radius - depth_m) * query.normal
         limit = FLANK_RATIO * self._radius
@@ -287,11 +293,11 @@ class SphereContact:
 
 
 class DragContact:
-    """Solver of the tangential contact of a finger that sticks to the skin.
+    """A solver of the tangential contact of a finger that sticks to the skin.
 
     Tangential springs connect the contact points to the finger. The stiffness of a spring is
-    proportional to the normal force at its point, so that contact starts and ends continuously. The
-    tangential forces do not affect the normal forces.
+    proportional to the normal force at its point. The tangential forces therefore start and end at
+    zero. They do not affect the normal forces.
     """
 
     def __init__(
@@ -325,12 +331,13 @@ class DragContact:
 def solve_penalty_contact(
     weights: Floats, compliance: Floats, penalty: Floats, depths: Floats
 ) -> Floats:
-    """Return the nodal forces (k,) that minimise the contact energy (see the module docstring).
+    """Return the nodal forces (k,), N, that minimise the contact energy.
 
-    The arguments are the symbols of that energy: weights W (q, k), compliance C (k, k), penalty d
-    (q,) and depths t (q,). Newton's method starts from Hertz's estimate that points deeper than
-    half of the maximum depth are in contact. It usually converges in two to five full steps; after
-    `FULL_STEPS` a line search damps it. Raises ArithmeticError if it does not converge.
+    With weights W (q, k), compliance C (k, k), m/N, penalty d (q,), N/m, and depths t (q,), m, the
+    energy of the forces f is 1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2. Newton's method
+    starts from Hertz's estimate that points deeper than half of the maximum depth are in contact.
+    After `FULL_STEPS` steps, a line search damps the method. Raise ArithmeticError if it does not
+    converge.
     """
     compliance_at_points = weights @ compliance
     identity = np.eye(len(compliance))
@@ -352,17 +359,18 @@ def solve_penalty_contact(
             return forces
         active = now
     raise ArithmeticError(
-        f"the contact solution with {len(penalty)} contact points did not "
-        "converge; reduce the push depth or skin_spacing_m"
+        f"the contact forces at {len(penalty)} contact points did not converge; reduce the push "
+        "depth or skin_spacing_m"
     )
 
 
 def _search_step(
     forces: Floats, target: Floats, problem: tuple[Floats, Floats, Floats, Floats]
 ) -> float:
-    """Return the fraction (1, 1/2, 1/4...) of the step from `forces` to `target` to be taken.
+    """Return the largest fraction (1, 1/2, 1/4...) of a step that decreases the contact energy.
 
-    It is the largest of these fractions for which the energy decreases.
+    forces, target (k,): nodal forces at the start and at the end of the full step, N. problem:
+    compliance, compliance at the contact points, penalty and depths, as in `solve_penalty_contact`.
     """
     compliance, compliance_at_points, penalty, depths = problem
 
@@ -377,11 +385,11 @@ def _search_step(
 
 
 class LinearSoftBody:
-    """Linear soft-body method, based on the precomputed response to unit forces.
+    """The linear soft-body method, which superposes precomputed responses to unit forces.
 
-    Each push needs one contact solution and one product with the influence matrix. The method is
-    valid up to `linear_depth_m`. Deeper pushes are reported as out of range: the displacement is
-    limited to that at `max_depth_m`, and the force grows in proportion to the depth.
+    The method is valid up to the depth `linear_depth_m`. Deeper pushes are reported as out of
+    range. Their displacement is limited to that at `max_depth_m`, and their force grows in
+    proportion to the depth.
     """
 
     name = "linear"
@@ -401,15 +409,15 @@ class LinearSoftBody:
     ) -> None:
         """Precompute the force curves of all touchable mesh corners.
 
-        bounds (b, 3): positions of skin nodes that must not be touched. Pushes next to them are
-        reported as out of range. push_depth_m: depth at which the force curve ends; None for
-        `max_depth_m`. drag: tangential response for a sticking finger; None for no friction. Raises
+        bounds (b, 3): positions of skin nodes that must not be touched. Pushes next to these nodes
+        are reported as out of range. push_depth_m: depth at which the force curve ends; None for
+        `max_depth_m`. drag: tangential response for a sticking finger; None for no friction. Raise
         ValueError unless 0 < linear_depth_m < max_depth_m.
         """
         if not 0.0 < linear_depth_m < max_depth_m:
             raise ValueError(
-                f"linear_depth_m: {linear_depth_m:g} must be positive and less than "
-                f"max_depth_m: {max_depth_m:g}"
+                f"linear_depth_m: {linear_depth_m:g} must be positive and less than max_depth_m "
+                f"({max_depth_m:g}); reduce linear_depth_m"
             )
         self.contact = SphereContact(
             response, shape, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
@@ -467,35 +475,35 @@ class LinearSoftBody:
         )
 
     def _clears_bounds(self, surface: Floats) -> bool:
-        """Return whether the contact patch around a surface point has touchable skin only."""
+        """Return whether all skin near a surface point (3,) is touchable."""
         if not len(self._bounds):
             return True
         return bool(np.square(self._bounds - surface).sum(axis=1).min() >= self._pad2)
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return force / depth (N/m) at the end of the linear range, near the point `surface` (3,).
+        """Return the force per depth (N/m) at the end of the linear range near a point (3,).
 
-        The value does not depend on the current push, so it is available before contact.
+        The value does not depend on the current push and is available before contact.
         """
         forces = self._weights(surface) @ self._corner_forces
         return float(forces[len(CURVE_FRACTIONS)]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force curve near the point `surface` (3,).
+        """Return the force-depth curve (n, 2) near a surface point (3,).
 
-        It is a weighted mean of the force curves of the mesh corners.
+        The columns are depth (m) and force (N). The force is a weighted mean over the mesh corners.
         """
         return np.column_stack([self._depths, self._weights(surface) @ self._corner_forces])
 
     def _weights(self, surface: Floats) -> Floats:
-        """Return Gaussian weights of the mesh corners for a point (3,); their sum is 1."""
+        """Return Gaussian weights of the mesh corners for a point (3,), normalized to sum 1."""
         squared = np.square(self._points - surface).sum(axis=1)
         weights = np.exp((squared.min() - squared) / (0.5 * self._smoothing2))
         result: Floats = weights / weights.sum()
         return result
 
     def _forces(self, point: Floats, normal: Floats) -> Floats:
-        """Return the normal force (n,), N, at the depths of the force curve; it never decreases."""
+        """Return the normal force (n,), N, at the depths of the force curve, without decreases."""
         shallow = self._depths[: len(CURVE_FRACTIONS) + 1]
         solved = np.append(shallow, [0.5 * (self._linear + self._largest), self._largest])
         forces = np.zeros(len(solved))
@@ -513,7 +521,7 @@ class LinearSoftBody:
     def _sum(self, table: Singles, rows: Ints, forces: Floats) -> Singles:
         """Return the skin displacement (3 s,), m, under several nodal forces.
 
-        table: influence matrix. rows, forces (k,): indices of its rows and the forces (N) on them.
+        table: influence matrix. rows, forces (k,): row indices and forces (N).
         """
         scaled = (forces / self._modulus).astype(np.float32)
         total = np.zeros(table.shape[1], dtype=np.float32)

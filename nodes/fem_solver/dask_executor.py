@@ -18,16 +18,16 @@ import distributed
 from flexsheet.nodes.fem_solver import precompute_table
 
 untyped: Any = distributed
-"""The module `distributed`, hidden from the type checker because it has no annotations."""
+"""The module `distributed` with the type Any, because the module has no annotations."""
 
 CONNECT_S = 10.0
-"""Timeout for the connection to a scheduler and for its first worker, s."""
+"""The timeout for the connection to a scheduler and for its first worker, in seconds."""
 TRIES = 3
-"""Maximum number of repetitions of a job whose worker was lost."""
+"""The maximum number of repetitions of a job whose worker was lost."""
 
 
 class SchedulerError(precompute_table.WorkersError):
-    """Raised if the workers of a dask scheduler cannot be used."""
+    """An error that is raised if the workers of a dask scheduler cannot be used."""
 
     code = "scheduler"
     remedy = "Check the scheduler's address, and that its workers run the same version."
@@ -40,7 +40,7 @@ class SchedulerError(precompute_table.WorkersError):
 
 
 class DaskExecutor(Executor):
-    """Executor on the workers of a dask scheduler, which can also stop running functions."""
+    """An executor on the workers of a dask scheduler that can also stop running functions."""
 
     def __init__(self, client: distributed.Client) -> None:
         self._client = client
@@ -53,7 +53,11 @@ class DaskExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Shut down as `Executor.shutdown` does; `cancel_futures` also stops running functions."""
+        """Shut down the executor.
+
+        wait: whether to wait for the pending functions. cancel_futures: whether to cancel pending
+        functions and stop running functions, without waiting.
+        """
         # Workers of a lost scheduler cannot be notified.
         if cancel_futures and self._client.status == "running":
             self._stop.set()
@@ -64,9 +68,9 @@ class DaskExecutor(Executor):
 def connect_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[Executor]:
     """Connect to a scheduler and yield an executor on its workers.
 
-    address: address of the scheduler, such as tcp://host:8786. connect_s: timeout, s. Leaving the
-    context stops the running jobs. Raises SchedulerError if the scheduler does not answer, has no
-    worker, or a worker has another version of this project.
+    The running jobs are stopped at the end of the context. address: address of the scheduler, such
+    as tcp://host:8786. connect_s: timeout. Raise SchedulerError if the scheduler does not answer or
+    has no worker, or if a worker has another version of this project.
     """
     try:
         # Test the connection first, because closing a client that failed to connect is slow.
@@ -110,7 +114,10 @@ def _require_same_code(client: distributed.Client, address: str) -> None:
 
 
 def _run_stoppable(name: str, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-    """Run a function in a worker; `stop_requested` returns true once the event `name` is set."""
+    """Run a function in a worker so that a dask event can stop it.
+
+    name: name of the event. If it is set, `precompute_table.stop_requested` returns true.
+    """
     stop_event = untyped.Event(name)
     token = precompute_table.stop_requested.set(stop_event.is_set)
     try:

@@ -1,24 +1,25 @@
-"""Select the best of several methods that is fast enough to meet a deadline."""
+"""Select a method that is fast enough to meet a deadline."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 LATE_STEPS = 5
-"""Number of consecutive late responses after which another method is selected."""
+"""The number of consecutive late responses after which another method is selected."""
 RETRY_STEPS = 600
-"""Number of responses by another method after which the best method is tried again."""
+"""The number of responses by another method after which the best method is tried again."""
 SMOOTHING = 0.1
-"""Weight of the newest duration in the exponentially smoothed mean duration."""
+"""The weight of the newest duration in the exponentially smoothed mean duration."""
 
 
 class DeadlineFallback:
-    """Selector of a method, based on the durations of recent responses."""
+    """A selector that chooses a method by the durations of recent responses."""
 
     def __init__(self, names: Sequence[str], budget_s: float) -> None:
         """Select the first method.
 
-        names: names of the methods, the best first. budget_s: maximum duration of a response, s.
+        names: names of the methods, in order of decreasing quality. budget_s: maximum duration of a
+        response.
         """
         self._names, self._budget = tuple(names), budget_s
         self._mean: dict[str, float] = {}
@@ -31,7 +32,7 @@ class DeadlineFallback:
         return self.name != self._names[0]
 
     def record(self, seconds: float) -> bool:
-        """Record the duration of a response, s, and return whether the method changed."""
+        """Record the duration of a response, in seconds, and return whether the method changed."""
         mean = self._mean.get(self.name, seconds)
         self._mean[self.name] = mean + SMOOTHING * (seconds - mean)
         self._late = self._late + 1 if seconds > self._budget else 0

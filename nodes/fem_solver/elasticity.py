@@ -15,25 +15,25 @@ from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.mesh import EDGES
 
 MAX_POISSON_RATIO = 0.4999
-"""Maximum Poisson's ratio. Closer to 0.5, the bulk modulus is so large that rounding errors destroy
+"""The maximum Poisson's ratio. For larger ratios, rounding errors destroy
 the solution."""
 MIN_VOLUME_RATIO = 1e-6
-"""Minimum ratio of an element's Jacobian to the cube of its edge length. For flatter elements,
-rounding errors destroy the solution."""
+"""The minimum ratio of an element's Jacobian determinant to the cube of its edge length. For
+flatter elements, rounding errors destroy the solution."""
 
 
 class SolidMeshError(FlexsheetError, ValueError):
-    """Raised for a mesh with inverted elements or a body without sufficient support."""
+    """An error that is raised for a mesh with inverted elements or insufficient support."""
 
     code = "solid-mesh"
     remedy = "Increase skin_spacing_m, or fix more of the object; see docs/soft-body-reference.md."
 
 
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
-    """Return Lame's constants (lambda, mu), Pa.
+    """Return Lame's constants lambda and mu, Pa.
 
-    Raises ValueError unless Young's modulus is positive and Poisson's ratio is in the range
-    -1 < nu <= 0.4999.
+    Raise ValueError unless Young's modulus is positive and Poisson's ratio is above
+    -1 and at most 0.4999.
     """
     if not (np.isfinite(young_modulus_pa) and young_modulus_pa > 0.0):
         raise ValueError(
@@ -51,7 +51,7 @@ def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float
 def quadrature() -> tuple[Floats, Floats]:
     """Return quadrature points (8, 3) and positive weights (8,) on the unit tetrahedron.
 
-    The rule is exact to degree 3, which the patch test on curved elements requires. It is a conical
+    The rule is exact for polynomials up to degree 3. Source: conical
     product of Gauss-Jacobi rules (Stroud, "Approximate Calculation of Multiple Integrals").
     """
     from scipy.special import roots_jacobi
@@ -80,18 +80,19 @@ def shape_gradients(points: Floats) -> Floats:
 
 
 def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Floats]:
-    """Return Jacobian matrices (e, q, 3, 3) of the map from the unit tetrahedron to each element.
+    """Return Jacobian matrices (e, q, 3, 3) and their determinants (e, q).
 
-    local (q, 10, 3): gradients of the shape functions at q points. Also returns the determinants
-    (e, q). Raises SolidMeshError if an element is inverted or flat, or the coordinates of a node
-    are not finite.
+    The matrices belong to the map from the unit tetrahedron to each element. nodes (n, 3), m,
+    elements (e, 10): mesh. local (q, 10, 3): gradients of the shape functions at q points. Raise
+    SolidMeshError if an element is inverted or flat, or if the coordinates of a node are not
+    finite.
     """
     corners = nodes[elements]
     invalid = ~np.isfinite(corners).all(axis=(1, 2))
     if invalid.any():
         raise SolidMeshError(
-            f"{int(invalid.sum())} of {len(elements)} elements have nodes that are not finite; the "
-            f"first is the element with index {int(np.argmax(invalid))}"
+            f"{int(invalid.sum())} of {len(elements)} elements have node positions that are not "
+            f"finite; the first of these elements has the index {int(np.argmax(invalid))}"
         )
     jacobian: Floats = corners.transpose(0, 2, 1)[:, None] @ local
     determinant: Floats = np.linalg.det(jacobian)
@@ -99,8 +100,9 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     bad = determinant.min(axis=1) <= MIN_VOLUME_RATIO * size**3
     if bad.any():
         raise SolidMeshError(
-            f"{int(bad.sum())} of {len(elements)} elements are inverted or flat; the first has the "
-            f"index {int(np.argmax(bad))} (minimum determinant {determinant.min():.3g} m^3)"
+            f"{int(bad.sum())} of {len(elements)} elements are inverted or flat; the first of "
+            f"these elements has the index {int(np.argmax(bad))} (minimum determinant "
+            f"{determinant.min():.3g} m^3)"
         )
     return jacobian, determinant
 
@@ -110,7 +112,8 @@ def element_stiffness(
 ) -> Floats:
     """Return the element stiffness matrices (e, 30, 30), N/m.
 
-    Raises SolidMeshError and ValueError like `jacobians` and `lame_constants`.
+    nodes (n, 3), m, elements (e, 10): mesh. Raise SolidMeshError for inverted or flat elements, and
+    ValueError for an invalid material.
     """
     lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
     points, weights = quadrature()
@@ -129,9 +132,9 @@ def element_stiffness(
 
 
 def require_support(nodes: Floats, fixed: Bools) -> None:
-    """Raise SolidMeshError if all fixed nodes are collinear, so that the body could rotate freely.
+    """Raise SolidMeshError if all fixed nodes are collinear, because the body could rotate freely.
 
-    nodes (n, 3): positions. fixed (n,): whether each node is fixed.
+    nodes (n, 3): positions, m. fixed (n,): whether each node is fixed.
     """
     fixed_nodes = nodes[fixed]
     extent = np.ptp(nodes, axis=0).max()
@@ -154,6 +157,6 @@ def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:
 
 
 def scatter_add(indices: Ints, values: Floats, size: int) -> Floats:
-    """Return an array (size,) of zeros to which values (k,) are added at their indices (k,)."""
+    """Add values (k,) at their indices (k,) to an array (size,) of zeros, and return the array."""
     result: Floats = np.bincount(indices, values, size).astype(np.float64, copy=False)
     return result

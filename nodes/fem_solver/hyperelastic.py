@@ -27,26 +27,26 @@ from flexsheet.nodes.fem_solver.mesh import EDGES
 
 CORNERS = np.vstack([np.zeros(3), np.eye(3)])
 NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
-"""Coordinates (10, 3) of the nodes of an element on the unit tetrahedron."""
+"""The coordinates (10, 3) of the nodes of an element on the unit tetrahedron."""
 
 
 class InvertedElementError(FlexsheetError, ArithmeticError):
-    """Raised for a displacement that inverts an element."""
+    """An error that is raised for a displacement that inverts an element."""
 
     code = "inverted-element"
     remedy = "Use smaller load steps. Deep pushes may have no solution."
 
 
 class NeoHookeanSolid:
-    """Solid of neo-Hookean material; the argument `displacement` is that of its nodes (n, 3), m."""
+    """A solid of neo-Hookean material, meshed with 10-node tetrahedra."""
 
     def __init__(
         self, nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
     ) -> None:
         """Precompute the shape function gradients and the volumes of the elements.
 
-        nodes (n, 3), elements (e, 10): mesh. Raises SolidMeshError and ValueError
-        like `jacobians` and `lame_constants`.
+        nodes (n, 3), m, elements (e, 10): mesh. Raise SolidMeshError for inverted elements, and
+        ValueError for an invalid material.
         """
         self.nodes, self.elements = nodes, elements
         self._lame, self._mu = lame_constants(young_modulus_pa, poisson_ratio)
@@ -66,7 +66,11 @@ class NeoHookeanSolid:
         return float(self._volumes.sum())
 
     def deformation(self, displacement: Floats) -> tuple[Floats, Floats]:
-        """Return F (e, 8, 3, 3) and J (e, 8) at the quadrature points; see the module docstring."""
+        """Return the deformation gradient F (e, 8, 3, 3) and its determinant J (e, 8).
+
+        Both are evaluated at the quadrature points. displacement (n, 3): displacement of the nodes,
+        m.
+        """
         moved = displacement[self.elements].transpose(0, 2, 1)
         gradient = moved[:, None] @ self._gradients
         gradient[..., 0, 0] += 1.0
@@ -75,7 +79,10 @@ class NeoHookeanSolid:
         return gradient, determinants(gradient)
 
     def energy(self, displacement: Floats) -> float:
-        """Return the elastic energy, J; infinite where an element is inverted."""
+        """Return the elastic energy in joules, which is infinite if an element is inverted.
+
+        displacement (n, 3): displacement of the nodes, m.
+        """
         gradient, volume_ratio = self.deformation(displacement)
         if volume_ratio.min() <= 0.0:
             return float("inf")
@@ -87,7 +94,8 @@ class NeoHookeanSolid:
     def forces(self, displacement: Floats) -> Floats:
         """Return the elastic nodal forces (n, 3), N, which are the gradient of the energy.
 
-        Raises InvertedElementError if an element is inverted.
+        displacement (n, 3): displacement of the nodes, m. Raise InvertedElementError if an element
+        is inverted.
         """
         gradient, inverse, log = self._state(displacement)
         stress = (self._lame * log - self._mu)[..., None, None] * inverse.transpose(0, 1, 3, 2)
@@ -99,10 +107,11 @@ class NeoHookeanSolid:
     def tangents(self, displacement: Floats) -> Floats:
         """Return the tangent stiffness of each element (e, 30, 30), N/m.
 
-        This is the second derivative of the energy. For the nodes a and b of an element, let g_a
-        and g_b be the gradients of their shape functions, and h = F^-T g. The block of these nodes
-        is the integral of mu (g_a . g_b) I + lambda h_a h_b^T + (mu - lambda ln J) h_b h_a^T.
-        Raises InvertedElementError like `forces`.
+        The tangent stiffness is the second derivative of the energy. For the nodes a and b of an
+        element, let g_a and g_b be the gradients of their shape functions, and h = F^-T g. The
+        block of these nodes is the integral of mu (g_a . g_b) I + lambda h_a h_b^T + (mu - lambda
+        ln J) h_b h_a^T. displacement (n, 3): displacement of the nodes, m. Raise
+        InvertedElementError if an element is inverted.
         """
         _, inverse, log = self._state(displacement)
         count = len(self.elements)
@@ -121,8 +130,8 @@ class NeoHookeanSolid:
     def stiffen(self, matrices: Floats, weight: float) -> None:
         """Add a positive definite stiffness to element matrices (e, 30, 30), in place.
 
-        It is the Laplacian of the displacement times `weight` and the shear modulus. It regularizes
-        a tangent stiffness that is not positive definite.
+        The added stiffness is the Laplacian of the displacement times `weight` and the shear
+        modulus. It regularizes a tangent stiffness that is not positive definite.
         """
         blocks = matrices.reshape(-1, 10, 3, 10, 3)
         for axis in range(3):
@@ -131,9 +140,9 @@ class NeoHookeanSolid:
     def min_volume_ratio(self, displacement: Floats) -> float:
         """Return the minimum volume ratio J over all quadrature points and nodes.
 
-        It is 1 without deformation, and at most 0 if an element is inverted. Nodes are included
-        because a corner of a quadratic element can invert while J is positive at all quadrature
-        points.
+        The ratio is 1 without deformation, and at most 0 if an element is inverted. A corner of a
+        quadratic element can invert while J is positive at all quadrature points. displacement (n,
+        3): displacement of the nodes, m.
         """
         local = shape_gradients(NODE_COORDINATES)
         rest, moved = (
@@ -146,8 +155,8 @@ class NeoHookeanSolid:
         gradient, volume_ratio = self.deformation(displacement)
         if volume_ratio.min() <= 0.0:
             raise InvertedElementError(
-                f"{int((volume_ratio.min(axis=1) <= 0).sum())} elements of the mesh are inverted "
-                f"(minimum volume ratio {volume_ratio.min():.3g})"
+                f"{int((volume_ratio.min(axis=1) <= 0).sum())} elements of the deformed mesh are "
+                f"inverted (minimum volume ratio {volume_ratio.min():.3g})"
             )
         return gradient, inverses(gradient, volume_ratio), np.log(volume_ratio)
 

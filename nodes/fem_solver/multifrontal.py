@@ -25,7 +25,7 @@ NO_CHILDREN: tuple[int, ...] = ()
 
 
 class IndefiniteError(FlexsheetError, ArithmeticError):
-    """Raised for a stiffness matrix that is not positive definite."""
+    """An error that is raised for a stiffness matrix that is not positive definite."""
 
     code = "indefinite"
     remedy = "Fix the body at its base. Check that Poisson's ratio is below 0.5."
@@ -33,13 +33,13 @@ class IndefiniteError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class Front:
-    """Node of the elimination tree, with a dense matrix over its degrees of freedom.
+    """A node of the elimination tree, with a dense matrix over its degrees of freedom.
 
-    pivots: degrees of freedom that are eliminated here. boundary: those that are left to the
-    parent. elements: indices of the elements; empty unless the front is a leaf. scatter: position
-    in the dense matrix for each entry of the element matrices; one past its end for entries of
-    fixed nodes. children: indices of earlier fronts, with the positions of their boundaries in this
-    front.
+    pivots: degrees of freedom that are eliminated in this front. boundary: degrees of freedom that
+    the parent eliminates. elements: indices of the elements; empty unless the front is a leaf.
+    scatter: position in the dense matrix for each entry of the element matrices. Entries of fixed
+    nodes have a position past the end of the matrix. children: indices of earlier fronts, and the
+    positions of their boundaries in this front.
     """
 
     pivots: Ints
@@ -51,14 +51,17 @@ class Front:
 
 @dataclass(frozen=True, slots=True)
 class Factors:
-    """Cholesky factors L of a stiffness matrix K = L L^T, stored in the precision of K."""
+    """The Cholesky factors L of a stiffness matrix K = L L^T, stored in the precision of K."""
 
     fronts: list[Front]
     diagonal: list[Floats]
     off_diagonal: list[Floats]
 
     def solve(self, loads: Floats) -> Floats:
-        """Return the displacements of n nodes under loads (3n,) or (3n, k); 0 at fixed nodes."""
+        """Return the displacements of n nodes under loads (3n,) or (3n, k).
+
+        The result has the shape of the loads and is 0 at fixed nodes.
+        """
         (trsm,) = scipy.linalg.get_blas_funcs(("trsm",), dtype=self.diagonal[0].dtype)
         work = loads.reshape(len(loads), -1).astype(self.diagonal[0].dtype)
         for front, diagonal_block, off_block in zip(
@@ -81,10 +84,11 @@ class Factors:
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """Part of the mesh in the nested dissection.
+    """A part of the mesh in the nested dissection.
 
-    pivots: nodes that are eliminated with this part. boundary: nodes left to its parent. members:
-    indices of the elements, if it is a leaf. halves: indices of its two parts; empty for a leaf.
+    pivots: nodes that are eliminated with this part. boundary: nodes that the parent eliminates.
+    members: indices of the elements; empty unless the part is a leaf. halves: indices of the two
+    halves; empty for a leaf.
     """
 
     pivots: Ints
@@ -94,12 +98,12 @@ class _Part:
 
 
 class NestedDissection:
-    """Elimination order for a mesh with given fixed nodes."""
+    """The elimination order for a mesh with given fixed nodes."""
 
     def __init__(self, nodes: Floats, elements: Ints, fixed: Bools) -> None:
         """Compute the elimination order.
 
-        nodes (n, 3), elements (e, k): mesh. fixed (n,): whether each node is fixed.
+        nodes (n, 3), m, elements (e, k): mesh. fixed (n,): whether each node is fixed.
         """
         self._elements, self._fixed = elements, fixed
         self._centres = nodes[elements].mean(axis=1)
@@ -123,10 +127,10 @@ class NestedDissection:
         self.fronts = [self._front(part) for part in self._parts]
 
     def factor(self, matrices: Floats) -> Factors:
-        """Factor the stiffness matrix that is the sum of element matrices (e, 3k, 3k).
+        """Factor the stiffness matrix that is the sum of symmetric element matrices (e, 3k, 3k).
 
-        The matrices are symmetric, float64 or float32. float32 takes half of the time and memory;
-        solutions then have about four digits. Raises IndefiniteError if the sum is not positive
+        float32 matrices need half of the time and memory of float64 matrices, but their
+        solutions have only about four digits. Raise IndefiniteError if the sum is not positive
         definite.
         """
         dtype = matrices.dtype
@@ -164,10 +168,10 @@ class NestedDissection:
         return Factors(self.fronts, diagonal, off_diagonal)
 
     def _split(self, members: Ints) -> tuple[int, Ints, Ints]:
-        """Divide some elements recursively, and append the parts, halves before their parent.
+        """Divide elements recursively, and append each part after its halves to the list of parts.
 
-        Returns the index of the last part, its free nodes (k,), and how many of its elements use
-        each of these nodes (k,).
+        members: indices of the elements. Return the index of the last part, its free nodes (k,),
+        and the number of its elements (k,) that use each of these nodes.
         """
         if len(members) <= LEAF_ELEMENTS:
             present, counts = np.unique(self._elements[members], return_counts=True)
@@ -187,7 +191,8 @@ class NestedDissection:
         return len(self._parts) - 1, present, counts
 
     def _bisect(self, members: Ints) -> tuple[Ints, Ints]:
-        """Divide some elements into two halves along the axis for which they share fewest nodes."""
+        """Divide elements into two halves along the axis for which the halves share fewest
+        nodes."""
         cuts = []
         for axis in range(3):
             order = members[np.argsort(self._centres[members, axis], kind="stable")]
@@ -224,9 +229,10 @@ class NestedDissection:
 
 
 def _add_block(dense: Floats, part: Floats, positions: Ints) -> None:
-    """Add the lower triangle of the matrix `part` to that of `dense`, at increasing `positions`.
+    """Add the lower triangle of a matrix to the lower triangle of a larger matrix.
 
-    Entries above the diagonal are undefined and are never read.
+    dense: larger matrix, which is changed. part (k, k): added matrix. positions (k,): rows and
+    columns in `dense`, in increasing order. Entries above the diagonal are undefined.
     """
     starts = np.concatenate([[0], np.flatnonzero(np.diff(positions) != 1) + 1, [len(positions)]])
     if len(starts) > MAX_RUNS:

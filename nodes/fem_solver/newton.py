@@ -30,24 +30,27 @@ from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, Ne
 Friction = Literal["none", "stick"]
 
 PENALTY_RATIO = 200.0
-"""Penalty stiffness of the contact (Pa/m), divided by (Young's modulus / finger radius)."""
+"""The penalty stiffness of the contact, in Pa/m, divided by the ratio of Young's modulus to the
+finger radius."""
 ROUNDING_RATIO = 0.005
-"""Depth over which the penalty pressure rises quadratically from zero, in finger radii."""
+"""The penetration up to which the penalty pressure rises quadratically, in finger radii."""
 POINTS_PER_EDGE = 4
 MAX_STEP_RATIO = 0.35
-"""Maximum displacement of the finger per load step, in finger radii."""
+"""The maximum displacement of the finger per load step, in finger radii."""
 MIN_STEP_FRACTION = 1.0 / 16.0
-"""Minimum fraction of a load step. Steps are halved until they converge or reach this fraction."""
+"""The minimum fraction of a load step. A step that does not converge is halved down to this
+fraction."""
 MAX_ITERATIONS = 25
 REGULARIZATIONS = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.3), (0.0, 2.0), (0.0, 15.0))
-"""Successive attempts to make the tangent stiffness positive definite. Each is a pair: weight of
-the geometric stiffness of the contact, and added stiffness in units of the shear modulus."""
+"""The successive attempts to make the tangent stiffness positive definite. Each pair contains the
+weight of the geometric stiffness of the contact, and the added stiffness in units of the shear
+modulus."""
 TOLERANCE = 1e-8
-"""Maximum residual force at convergence, as a fraction of the largest force in the body."""
+"""The maximum residual force at convergence, as a fraction of the largest nodal force."""
 
 
 class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
-    """Raised for a load step that does not converge."""
+    """An error that is raised if a load step does not converge."""
 
     code = "newton"
     remedy = "Reduce the push, refine the mesh, or choose the linear method."
@@ -55,12 +58,12 @@ class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class EquilibriumState:
-    """Equilibrium of the body with the finger.
+    """The equilibrium of the body with the finger.
 
     displacement (n, 3): displacement of the nodes, m. force_n (3,): force of the body on the
-    finger, N. centre (3,): centre of the sphere, m. min_volume_ratio: minimum ratio of deformed to
-    undeformed volume. reached: whether the solution for the target position converged; otherwise
-    `centre` is the last position that converged.
+    finger. centre (3,): centre of the sphere, m. min_volume_ratio: minimum ratio of deformed to
+    undeformed volume. iterations: number of Newton iterations. reached: whether the solution for
+    the target position converged. If it did not, `centre` is the last position that converged.
     """
 
     displacement: Floats
@@ -73,10 +76,11 @@ class EquilibriumState:
 
 @dataclass(frozen=True, slots=True)
 class _StickState:
-    """Contact points that stick to the finger.
+    """The contact points that stick to the finger.
 
-    points (k,): indices of the contact points. offsets (k, 3): where they stick to the finger,
-    relative to its centre, m. normals (k, 3): unit normals of the sphere at the points.
+    points (k,): indices of the contact points. offsets (k, 3): positions on the finger at which the
+    points stick, relative to its centre, m. normals (k, 3): unit normals of the sphere at the
+    points.
     """
 
     points: Ints
@@ -88,7 +92,7 @@ NO_STICK = _StickState(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((
 
 
 class SphereObstacle:
-    """Penalty contact between the skin of a body and the spherical finger."""
+    """The penalty contact between the skin of a body and the spherical finger."""
 
     def __init__(
         self, nodes: Floats, elements: Ints, faces: Ints, *, modulus_pa: float, radius_m: float
@@ -113,15 +117,16 @@ class SphereObstacle:
         self.parents, self._local = _find_parents(elements, faces)
 
     def points(self, positions: Floats) -> Floats:
-        """Return the positions (q, 3) of the contact points, given those (n, 3) of the nodes."""
+        """Return the contact points (q, 3) for node positions (n, 3), m."""
         result: Floats = (self._shape @ positions[self._faces]).reshape(-1, 3)
         return result
 
     def inside(self, positions: Floats, centre: Floats) -> tuple[Ints, Floats, Floats, Floats]:
         """Find the contact points inside the sphere.
 
-        Returns their indices (k,), penetrations (k,), outward normals of the sphere (k, 3) and
-        distances from the centre (k,).
+        positions (n, 3): nodes, m. centre (3,): centre of the sphere, m. Return four arrays for k
+        points: indices (k,), penetrations (k,), m, outward normals of the sphere (k, 3), and
+        distances from the centre (k,), m.
         """
         offset = self.points(positions) - centre
         distance = np.linalg.norm(offset, axis=1)
@@ -130,7 +135,10 @@ class SphereObstacle:
         return inner, self.radius_m - away, offset[inner] / away[:, None], away
 
     def energy(self, positions: Floats, centre: Floats, stick: _StickState) -> float:
-        """Return the contact energy (J): that of the penalty and of the tangential springs."""
+        """Return the energy (J) of the penalty pressure and of the tangential springs.
+
+        positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
+        """
         inner, depth, _, _ = self.inside(positions, centre)
         d = self._rounding
         low = depth < d
@@ -142,7 +150,10 @@ class SphereObstacle:
         return total
 
     def forces(self, positions: Floats, centre: Floats, stick: _StickState) -> Floats:
-        """Return the gradient of `energy` (n, 3), N: the force of each node on the finger."""
+        """Return the force (n, 3), N, of each node on the finger, the gradient of the energy.
+
+        positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
+        """
         inner, depth, normals, _ = self.inside(positions, centre)
         per_point = np.zeros((len(self._penalty), 3))
         per_point[inner] = -(self._penalty[inner] * self._pressure(depth))[:, None] * normals
@@ -168,9 +179,9 @@ class SphereObstacle:
     ) -> None:
         """Add the contact stiffness to the element matrices (e, 30, 30), in place.
 
-        The contact stiffness is the second derivative of `energy`. geometric_stiffness_weight: 1
-        for the exact derivative. A smaller weight reduces the part that results from the curvature
-        of the sphere and can make the stiffness indefinite.
+        The contact stiffness is the second derivative of the contact energy.
+        geometric_stiffness_weight: 1 for the exact derivative. A smaller weight reduces the part
+        that results from the curvature of the sphere and can make the stiffness indefinite.
         """
         inner, depth, normals, away = self.inside(positions, centre)
         slope = np.where(depth < self._rounding, depth / self._rounding, 1.0)
@@ -195,7 +206,8 @@ class SphereObstacle:
     def update_stick(self, positions: Floats, centre: Floats, stick: _StickState) -> _StickState:
         """Return the points that stick to the finger after a new equilibrium was found.
 
-        Points under pressure stick where the finger first touched them; other points are released.
+        Points under pressure stick where the finger first touched them. Other points are released.
+        positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
         """
         inner, _, normals, _ = self.inside(positions, centre)
         offsets = self.points(positions)[inner] - centre
@@ -215,7 +227,7 @@ class SphereObstacle:
 
 
 class NeoHookeanBody:
-    """Neo-Hookean (hyperelastic) body with fixed nodes that a finger pushes."""
+    """A neo-Hookean (hyperelastic) body with fixed nodes that a finger pushes."""
 
     def __init__(
         self,
@@ -235,11 +247,12 @@ class NeoHookeanBody:
     ) -> None:
         """Prepare the solver.
 
-        fixed (n,): whether each node is fixed. faces (f, 6): six-node triangles that the finger can
-        touch, ordered so that their normals point outward. tolerance, min_step_fraction,
-        max_step_ratio: see `TOLERANCE`, `MIN_STEP_FRACTION` and `MAX_STEP_RATIO`. factor_dtype:
-        precision of the factors of the tangent stiffness; it affects only the search direction.
-        Raises the errors of `NeoHookeanSolid`.
+        nodes (n, 3), elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
+        six-node triangles that the finger can touch, with outward normals. tolerance: maximum
+        residual force, relative to the largest nodal force. min_step_fraction: minimum fraction of
+        a load step. max_step_ratio: maximum load step, in finger radii. factor_dtype: precision of
+        the factors of the tangent stiffness; it affects only the search direction. Raise
+        SolidMeshError for inverted elements and ValueError for an invalid material.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
@@ -257,12 +270,12 @@ class NeoHookeanBody:
     def solve_load_steps(
         self, centres: Iterable[Floats], *, start: tuple[Floats, Floats] | None = None
     ) -> Iterator[EquilibriumState]:
-        """Move the finger to each of `centres` (3,) in a straight line and yield the equilibria.
+        """Move the finger to each centre (3,) in a straight line and yield the equilibria.
 
-        start: displacement and sphere centre of a known frictionless equilibrium. If it is None,
-        the sphere at the first centre must not touch the body. If a step does not converge, the
-        last equilibrium is yielded with `reached` false for all remaining centres. Inverted
-        elements and a sphere inside the body count as not converged. Raises ValueError for a centre
+        start: displacement and sphere centre of a known frictionless equilibrium. Without it, the
+        sphere at the first centre must not touch the body. If a step does not converge, the last
+        equilibrium is yielded with `reached` false for all remaining centres. A step with inverted
+        elements or with the sphere inside the body has not converged. Raise ValueError for a centre
         that is not finite.
         """
         displacement, position = start or (np.zeros_like(self.solid.nodes), None)
@@ -271,7 +284,7 @@ class NeoHookeanBody:
         for centre in centres:
             if not np.isfinite(centre).all():
                 raise ValueError(
-                    f"finger centre {centre} is not finite; check the push point and depth"
+                    f"the finger centre {centre} is not finite; check the push point and depth"
                 )
             iterations = 0
             if position is None:
@@ -316,9 +329,10 @@ class NeoHookeanBody:
     ) -> tuple[Floats, int, Factors | None]:
         """Find the equilibrium with the sphere at `centre` (3,) by Newton's method.
 
-        The iteration starts at `guess` (n, 3) if that has less energy than `displacement` (n, 3).
-        Returns the displacement (n, 3) at equilibrium, the number of iterations, and the last
-        factors of the tangent stiffness. Raises NewtonNotConvergedError.
+        The iteration starts at `displacement` (n, 3) or at `guess` (n, 3), m, whichever has less
+        energy. Return the displacement (n, 3) at equilibrium, the number of iterations, and the
+        last factors of the tangent stiffness. Raise NewtonNotConvergedError if the iteration does
+        not converge.
         """
         nodes = self.solid.nodes
         if self._energy(guess, centre, stick) < self._energy(displacement, centre, stick):
@@ -354,8 +368,7 @@ class NeoHookeanBody:
     def _check_validity(self, displacement: Floats, centre: Floats) -> None:
         """Raise NewtonNotConvergedError for inverted elements or a sphere centre inside the body.
 
-        The sphere is checked because no penalty acts on a finger that is completely inside the
-        body.
+        No penalty acts on a finger that is completely inside the body.
         """
         ratio = self.solid.min_volume_ratio(displacement)
         if ratio <= 0.0:
@@ -380,7 +393,7 @@ class NeoHookeanBody:
         stick: _StickState,
         factors: Factors | None,
     ) -> Floats:
-        """Predict the displacement (n, 3), to first order, for a finger that moves to `target`."""
+        """Predict the displacement (n, 3) to first order for a finger that moves to `target`."""
         if factors is None:
             return displacement
         positions, fraction = self.solid.nodes + displacement, 1e-3 * (target - position)
@@ -390,9 +403,9 @@ class NeoHookeanBody:
         return displacement - factors.solve(500.0 * change.ravel()).reshape(-1, 3)
 
     def _factorize(self, displacement: Floats, centre: Floats, stick: _StickState) -> Factors:
-        """Factor the tangent stiffness; regularize it if it is not positive definite.
+        """Factor the tangent stiffness, regularized if it is not positive definite.
 
-        Raises NewtonNotConvergedError if none of `REGULARIZATIONS` makes it positive definite.
+        Raise NewtonNotConvergedError if no regularization makes it positive definite.
         """
         positions = self.solid.nodes + displacement
         elastic = self.solid.tangents(displacement)
@@ -416,11 +429,11 @@ class NeoHookeanBody:
 
 
 def winding_number(triangles: Floats) -> float:
-    """Return the winding number of a closed surface about the origin: 1 if that is inside, else 0.
+    """Return the winding number of a closed surface about the origin.
 
-    triangles (t, 3, 3): corners, counter-clockwise seen from outside. The winding number is the sum
-    of the solid angles, divided by 4 pi (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30,
-    1983).
+    The number is 1 if the origin is inside the surface, and 0 if it is outside. triangles (t, 3,
+    3): corners, counter-clockwise seen from outside. Source: van Oosterom & Strackee, IEEE Trans.
+    Biomed. Eng. 30, 1983.
     """
     a, b, c = triangles.transpose(1, 0, 2)
     x, y, z = np.linalg.norm(triangles, axis=2).T
@@ -432,8 +445,8 @@ def winding_number(triangles: Floats) -> float:
 def _find_parents(elements: Ints, faces: Ints) -> tuple[Ints, Ints]:
     """Find the element of each face (f, 6).
 
-    Returns the indices (f,) of the elements, and the indices (f, 6) of the nodes of each face
-    within its element (0 to 9).
+    Return the indices (f,) of the elements, and the local indices (f, 6), from 0 to 9, of the face
+    nodes in their element.
     """
     sides = elements[:, FACES]
     keys = np.sort(sides[..., :3], axis=2).reshape(-1, 3)

@@ -31,14 +31,14 @@ T = TypeVar("T")
 
 POLL_S = 0.05
 BLEND_S = 5.0
-"""Duration of the gradual change from the responses of one method to those of a better one."""
+"""The duration of the gradual change between the responses of two methods, in seconds."""
 
 
 class FemSolver(Node):
-    """Node that publishes the undeformed skin of the object, and its displacement by the finger.
+    """The node that publishes the undeformed skin of the object and its displacement by the finger.
 
-    The skin is the surface of the object. It is published once for each scene, and the displacement
-    for each fingertip message.
+    The skin is the surface of the object. The node publishes it once for each scene, and the
+    displacement once for each fingertip message.
     """
 
     live_parameters: ClassVar[frozenset[str]] = frozenset(
@@ -77,10 +77,10 @@ class FemSolver(Node):
         self._anchor: ContactAnchor | None = None
 
     def _set_bodies(self, bodies: list[body.SceneBody]) -> None:
-        """Set the soft bodies that compute responses, one per method, the best first.
+        """Set the soft bodies that compute responses, and start a gradual change of the responses.
 
-        The list is empty until a scene has arrived. If the bodies replace others of the same scene,
-        the responses change gradually.
+        bodies: one body per method, of which the first is the best; an empty list if there is no
+        scene yet.
         """
         if bodies and self._bodies:
             self._replaced.append((self._bodies[self._fallback.name], self.clock.now_ns()))
@@ -92,13 +92,13 @@ class FemSolver(Node):
             self.note = f"soft body ready, {self._describe(bodies[0])}"
 
     def _describe(self, current: body.SceneBody) -> str:
-        """Return a text for the node's status: method in use, its force error, and skin nodes."""
+        """Return the method in use, its force error and its number of skin nodes as a text."""
         nodes = len(current.skin.vertices_world_m)
         percent = 100.0 * self._force_error_ratio(current)
         return f"{current.method.name}, force within {percent:.0f} %, {nodes} skin nodes"
 
     def _force_error_ratio(self, current: body.SceneBody) -> float:
-        """Return the stated relative error of the force, including that of replaced bodies."""
+        """Return the largest stated relative force error of the current and the replaced bodies."""
         return max(one.force_error_ratio for one in (current, *(old for old, _ in self._replaced)))
 
     async def close(self) -> None:
@@ -143,7 +143,7 @@ class FemSolver(Node):
     async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
         """Compute the nonlinear table in the background and use it when it is finished.
 
-        Until then, the responses come from the linear method, and later from a coarse table.
+        Until then, the linear method and later a coarse table compute the responses.
         """
         loop = asyncio.get_running_loop()
         stop = self._stop
@@ -164,7 +164,7 @@ class FemSolver(Node):
                 on_quick,
             )
         except precompute.Interrupted:
-            self.note = "nonlinear table interrupted; the next start continues it"
+            self.note = "the nonlinear table was interrupted; the next start continues it"
         except Exception as error:
             self.report_error("nonlinear_table", error)
         else:
@@ -223,7 +223,7 @@ class FemSolver(Node):
     def _blend_in(
         self, response: Response, respond: Callable[[body.SceneBody], Response]
     ) -> Response:
-        """Return the response as a weighted mean with those of recently replaced bodies."""
+        """Return the weighted mean of a response and the responses of recently replaced bodies."""
         if not self._replaced:
             return response
         now_ns = self.clock.now_ns()
@@ -239,12 +239,12 @@ async def run_unless_superseded(
     progress: Callable[..., None],
     is_superseded: Callable[[], bool],
 ) -> T:
-    """Run `compute` in a thread and return its result, unless that is no longer needed.
+    """Run a function in a thread and return its result, unless a newer request arrives.
 
-    compute: function that receives `progress`, bound to a stop event as the first argument.
-    is_superseded: function that returns true if a newer request has arrived. In this case,
-    Interrupted is raised. The thread is not awaited, because meshing takes up to 8 s, and its
-    errors are ignored.
+    compute: function that receives a progress callback. progress: this callback, with a stop event
+    as an additional first argument. is_superseded: function that returns true if a newer request
+    has arrived. Raise Interrupted in this case. The thread then ends later, and its errors are
+    ignored.
     """
     stop = Event()
     task = asyncio.create_task(asyncio.to_thread(compute, partial(progress, stop)))

@@ -16,13 +16,13 @@ class FemSolverParameters(NodeParameters):
     method: MethodChoice = Field(
         default="auto",
         description="Method that computes the deformation. auto: the method that the scene "
-        "specifies, or else nonlinear_table. nonlinear_table: if the table is not cached, it is "
-        "computed in the background: first a coarse one in about a minute, then the complete one.",
+        "specifies, or nonlinear_table if the scene specifies none. nonlinear_table: a missing "
+        "table is computed in the background. A coarse table is ready after about a minute.",
     )
     skin_spacing_m: Positive | Literal["auto"] = Field(
         default="auto",
         description="Distance between mesh nodes on the touchable surface. auto: the value that "
-        "the scene specifies, or 0.003.",
+        "the scene specifies, or 0.003 if the scene specifies none.",
     )
     compute_table: bool = Field(
         default=True,
@@ -31,12 +31,13 @@ class FemSolverParameters(NodeParameters):
     )
     linear_depth_m: Positive = Field(
         default=0.006,
-        description="Maximum push depth of the linear method; deeper pushes are reported as out of "
-        "range.",
+        description="Maximum push depth of the linear method. Deeper pushes are reported as out "
+        "of range.",
     )
     max_depth_m: Positive = Field(
         default=0.010,
-        description="Push depth that limits the deformation with the linear method.",
+        description="Maximum push depth for the deformation with the linear method. Deeper pushes "
+        "deform the object no further.",
     )
     friction_ratio: NonNegative = Field(
         default=0.0,
@@ -46,7 +47,7 @@ class FemSolverParameters(NodeParameters):
     step_budget_s: Positive = Field(
         default=0.004,
         description="Maximum duration of the computation for one fingertip message. After five "
-        "consecutive longer ones, another method is used.",
+        "consecutive computations that take longer, another method is used.",
     )
     workers: int = Field(
         default=0,

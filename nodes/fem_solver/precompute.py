@@ -1,7 +1,8 @@
 """Compute and cache the response of the skin to a unit force on every touchable node.
 
-The skin is the surface of the soft body. The cache file is named by a digest of the inputs. Young's
-modulus is not one of them: the response is inversely proportional to it and is stored for 1 Pa.
+The skin is the surface of the soft body. The name of the cache file contains a digest of the
+inputs. Young's modulus is no input. The response is stored for 1 Pa, because it is inversely
+proportional to Young's modulus.
 """
 
 from __future__ import annotations
@@ -26,33 +27,38 @@ if TYPE_CHECKING:
 Part = dict[str, NDArray[Any]]
 
 VERSION = 3
-"""Version of the computation. Increase it when results for the same specification change."""
+"""The version of the computation. Increase it when results for the same specification change."""
 CHUNK_LOADS = 128
 ELEMENT_BYTES = 30 * 30 * 8
 MESH_STEPS, FACTOR_STEPS = 1, 4
-"""Duration of meshing, and of factoring the stiffness, in durations of one load; for progress."""
+"""The durations of meshing and of factoring the stiffness, in units of the duration of one load.
+They are used for progress reports."""
 
 Progress = Callable[[int, int, "WorkBudget"], None]
-"""Callback that receives the steps done, their total and the required resources. It is first called
-before the work starts, and may raise `Interrupted` to stop the work."""
+"""A callback that receives the number of finished steps, the total number and the required
+resources. It is first called before the work starts, and may raise `Interrupted` to stop the
+work."""
 
 
 class WorkBudget(Protocol):
-    """Interface of an estimate of the resources that a computation needs."""
+    """The interface of an estimate of the resources that a computation needs."""
 
     def text(self) -> str: ...
 
 
 class Interrupted(Exception):
-    """Raised when a computation is stopped on request; its stored parts remain."""
+    """An exception that is raised when a computation is stopped on request.
+
+    Finished parts remain stored.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoftBodySpec:
-    """Inputs of a precomputation.
+    """The inputs of a precomputation of the linear response.
 
     sticking: whether the response to tangential forces is also computed, for a finger that sticks
-    to the skin; it takes three times the memory.
+    to the skin. Both responses together need three times the memory.
     """
 
     mesh: MeshSpec
@@ -74,11 +80,11 @@ class SoftBodySpec:
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyModel:
-    """Precomputed elastic response of a soft body and its skin mesh.
+    """The precomputed elastic response of a soft body and its skin mesh.
 
-    response: response to normal forces. triangles (t, 3): skin triangles, ordered for outward
-    normals. bounds (s,): whether each skin node must not be touched; false also for nodes on end
-    faces. drag: response to tangential forces, or None.
+    response: response to normal forces. triangles (t, 3): skin triangles with outward normals.
+    bounds (s,): true for skin nodes of the curved surface that the finger must not touch, and false
+    for nodes on end faces. drag: response to tangential forces, or None.
     """
 
     response: SkinResponse
@@ -89,9 +95,10 @@ class SoftBodyModel:
 
 @dataclass(frozen=True, slots=True)
 class ResponseBudget:
-    """Estimate of the resources of a precomputation.
+    """An estimate of the resources that a precomputation needs.
 
-    loads: number of unit forces. working_bytes, table_bytes: memory for computing and for results.
+    loads: number of unit forces. working_bytes, table_bytes: memory for the computation and for its
+    results.
     """
 
     skin_nodes: int
@@ -109,7 +116,7 @@ class ResponseBudget:
         """Raise MemoryError if the machine has too little free memory."""
         require_memory(
             self.working_bytes + self.table_bytes,
-            f"precomputing {self.loads} loads on {self.skin_nodes} skin nodes",
+            f"the precomputation of {self.loads} loads on {self.skin_nodes} skin nodes",
             f"increase skin_spacing_m above {skin_spacing_m:g}",
         )
 
@@ -117,7 +124,10 @@ class ResponseBudget:
 def compute_budget(
     mesh: SolidMesh, order: NestedDissection, loads_per_node: int = 1
 ) -> ResponseBudget:
-    """Return the resources that `compute` needs for a given mesh and elimination order."""
+    """Return the resources of a precomputation with a given mesh and elimination order.
+
+    loads_per_node: number of unit forces on each touchable node.
+    """
     factors = sum(len(f.pivots) * (len(f.pivots) + len(f.boundary)) for f in order.fronts) * 8
     stiffness = len(mesh.elements) * ELEMENT_BYTES * 3
     chunk = 3 * len(mesh.nodes) * CHUNK_LOADS * 8 * 4
@@ -127,9 +137,9 @@ def compute_budget(
 
 
 def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
-    """Estimate the resources of `compute` within a factor of two, without building the mesh.
+    """Estimate the resources of a precomputation within a factor of two, without building the mesh.
 
-    Raises UnfitMeshError under the same conditions as `mesh_budget`.
+    Raise UnfitMeshError if the skin spacing does not fit the object or requires too many nodes.
     """
     nodes = mesh_budget(spec.mesh)
     # Empirical numbers of skin nodes, and of touchable nodes among them.
@@ -148,9 +158,9 @@ def compute(
 ) -> SoftBodyModel:
     """Mesh the object, factor its stiffness and solve for one unit force per touchable node.
 
-    checkpoints: store in which finished parts are kept, so that an interrupted computation can
-    continue. Raises SolidMeshError for a body without sufficient support and ValueError for an
-    invalid material or size. Raises MemoryError, before any allocation, without enough memory.
+    checkpoints: store of finished parts, from which an interrupted computation can
+    continue. Raise SolidMeshError for a body without sufficient support, ValueError for an
+    invalid material or size, and MemoryError if the free memory is insufficient.
     """
     from flexsheet.nodes.fem_solver.elasticity import (
         element_stiffness,
@@ -224,11 +234,12 @@ def _solve_unit_loads(
     get_part: Callable[[int, Callable[[], Part]], Part],
     advance: Callable[[int], None],
 ) -> tuple[Singles, Floats]:
-    """Solve for unit forces on the m contact nodes, in p directions at each.
+    """Solve for unit forces in p directions on each of m contact nodes.
 
-    directions (m, p, 3): directions of the forces. get_part: function that loads the stored part
-    with an index, or computes and stores it. Returns displacements per force, m/N: those of the s
-    skin nodes (m p, 3 s), and those of the contact nodes along each direction (m p, m p).
+    directions (m, p, 3): unit vectors. get_part: function that loads the stored part with an index,
+    or computes and stores it. advance: function that receives the number of newly finished loads.
+    Return displacements per force, m/N, of the s skin nodes (m p, 3 s), and of the contact nodes
+    along each direction (m p, m p).
     """
     each = directions.shape[1]
     loads = len(mesh.contact_nodes) * each
@@ -268,20 +279,21 @@ def make_tangents(normals: Floats) -> Floats:
 def require_memory(required_bytes: int, what: str, remedy: str) -> None:
     """Raise MemoryError if the machine has less free memory than required.
 
-    what, remedy: subject and advice for the error text.
+    what: computation that needs the memory, for the error text. remedy: advice for the error text.
     """
     import psutil
 
     free = psutil.virtual_memory().available
     if required_bytes > free:
         raise MemoryError(
-            f"{what} needs {required_bytes / 2**30:.1f} GiB of memory, but {free / 2**30:.1f} GiB "
-            f"are free on this machine; {remedy}"
+            f"{what} needs {required_bytes / 2**30:.1f} GiB of memory, but only "
+            f"{free / 2**30:.1f} GiB are free on this machine; {remedy}"
         )
 
 
 STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""Names in the cache file, for the fields whose name differs from it."""
+"""The names in the cache file, by field name, for fields whose names differ from those in the
+file."""
 
 
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
@@ -309,6 +321,10 @@ def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
 
 
 def load_or_compute(spec: SoftBodySpec, cache_dir: Path, progress: Progress) -> SoftBodyModel:
-    """Load the cached model, or compute and store it; raises the errors of both functions."""
+    """Load the cached model, or compute and store it.
+
+    Raise SolidMeshError for a body without sufficient support, ValueError for an invalid material
+    or size, and MemoryError if the free memory is insufficient.
+    """
     entry = response_cache(spec)
     return cached(entry, cache_dir, lambda: compute(spec, progress, entry.checkpoints(cache_dir)))

@@ -2,7 +2,8 @@
 
 Snapshots (`snapshots`) are solutions for pushes at single points. They are independent of each
 other and take most of the time. They are solved by an executor of `concurrent.futures`: processes
-of this machine or the workers of a cluster (`dask_executor`). Each is stored when it is solved.
+of this machine or the workers of a cluster (`dask_executor`). Each snapshot is stored when it is
+solved.
 """
 
 from __future__ import annotations
@@ -52,22 +53,23 @@ from flexsheet.nodes.models.shapes import make_shape
 T = TypeVar("T")
 
 VERSION = 4
-"""Version of the computation. Increase it when results for the same specification change."""
+"""The version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
-"""Number of progress steps that a snapshot, and a node of the table, count for."""
+"""The numbers of progress steps for a snapshot and for a node of the table."""
 POLL_S = 0.2
-"""Period of progress reports and stop checks while snapshots are solved."""
+"""The period of progress reports and stop checks while snapshots are solved, in seconds."""
 SNAPSHOT_BYTES = 600_000_000
-"""Approximate memory for solving one snapshot."""
+"""The approximate memory that the solution of one snapshot needs, in bytes."""
 
 Progress = Callable[[int, int, "TableBudget"], None]
-"""Callback that receives the steps done, their total and the required resources. It is first called
-before the work starts, and may raise `precompute.Interrupted` to stop the work."""
+"""A callback that receives the number of finished steps, the total number and the required
+resources. It is first called before the work starts, and may raise `precompute.Interrupted` to stop
+the work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableSpec:
-    """Inputs of a nonlinear table."""
+    """The inputs of a nonlinear table."""
 
     body: SoftBodySpec
     finger_radius_m: float
@@ -79,9 +81,10 @@ class TableSpec:
 
 @dataclass(frozen=True, slots=True)
 class TableBudget:
-    """Estimate of the resources that the computation of a table needs.
+    """An estimate of the resources that the computation of a table needs.
 
-    nodes: number of nodes of the table. bytes: memory. coarse: whether it is the coarse table.
+    snapshots, nodes: number of snapshots, and of nodes of the table. bytes: memory. coarse: whether
+    the table is the coarse one, which is computed first.
     """
 
     snapshots: int
@@ -100,7 +103,7 @@ class TableBudget:
 def local_processes(count: int) -> Iterator[Executor]:
     """Yield an executor with `count` processes of this machine.
 
-    If an exception leaves the context, the processes are stopped without finishing their jobs.
+    If an exception leaves the context, the processes stop without finishing their jobs.
     """
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
@@ -115,7 +118,7 @@ def local_processes(count: int) -> Iterator[Executor]:
 
 
 stop_requested: ContextVar[Callable[[], bool]] = ContextVar("stop_requested", default=lambda: False)
-"""Function that returns whether a worker must stop its current job."""
+"""A function that returns whether a worker must stop its current job."""
 
 
 def _init_worker(stop: Event) -> None:
@@ -126,10 +129,10 @@ def _init_worker(stop: Event) -> None:
 
 
 def _exit_on(stop: Event) -> None:
-    """Exit the worker process when `stop` is set.
+    """Exit the worker process when an event is set.
 
-    This is necessary because a job checks for a stop only after each push depth, which takes up to
-    a minute. Finished results are not lost, because the parent process stores them.
+    A job checks for a stop only after each push depth, which may take a minute. The parent process
+    stores finished results.
     """
     stop.wait()
     os._exit(0)
@@ -140,21 +143,21 @@ def _solve(job: snapshots.SnapshotJob) -> snapshots.Snapshot:
 
 
 class WorkersError(FlexsheetError, RuntimeError):
-    """Raised when the workers for snapshots cannot be used."""
+    """An error that is raised if the workers for snapshots cannot be used."""
 
     code = "workers"
     remedy = "Follow the remedy in the text."
 
 
 class LostWorkersError(WorkersError):
-    """Raised when the workers were lost; finished snapshots are stored."""
+    """An error that is raised if the workers are lost. Finished snapshots are stored."""
 
     code = "lost-workers"
     remedy = "Start the workers again and repeat the command. Finished results are stored."
 
 
 def code_version() -> str:
-    """Return the version of the code that computes snapshots, from the versions of its parts."""
+    """Return the version of the code that computes snapshots."""
     return f"{VERSION}.{precompute.VERSION}.{mesh_version}"
 
 
@@ -177,10 +180,10 @@ def compute_table(
 ) -> Table:
     """Load the cached table, or compute and store it.
 
-    model: linear response of the same body. workers: how many workers of the executor run on this
-    machine. on_quick: called with a coarse table of `snapshots.QUICK_COUNT` snapshots, which is
-    ready much earlier; None: it is not computed. Raises MemoryError, before any snapshot is solved,
-    if this machine has too little memory for them, and the errors of `cached` and `solve_all`.
+    model: linear response of the same body. workers: number of workers of the executor on this
+    machine. on_quick: function that receives a coarse table, which is ready much earlier than the
+    complete one; None to omit the coarse table. Raise MemoryError if this machine has too little
+    memory. Raise LostWorkersError if the executor loses its workers.
     """
     entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
@@ -232,7 +235,7 @@ def _compute_table(
         ]
         names = [f"{name}-{number:04d}" for number in range(len(jobs))]
         if fine_job is not None:
-            # Both stages need it; the second one loads it from the checkpoints.
+            # Both stages need the fine push. The second stage loads it from the checkpoints.
             jobs, names = [fine_job, *jobs], ["fine", *names]
         solving = SNAPSHOT_STEPS * len(jobs)
         need = TableBudget(len(jobs), loads, 2 * table + workers * SNAPSHOT_BYTES, coarse=coarse)
@@ -243,7 +246,7 @@ def _compute_table(
         report(0)
         precompute.require_memory(
             need.bytes,
-            f"computing the nonlinear table of the soft body ({need.text()})",
+            f"the computation of the nonlinear table of the soft body ({need.text()})",
             f"increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "
             '"linear"',
         )
@@ -270,9 +273,9 @@ def _compute_table(
 def _interpolate_by(
     executor: Executor, on_progress: Callable[[int], None], jobs: Sequence[FillJob]
 ) -> list[FilledNodes]:
-    """Interpolate the nodes of jobs in an executor.
+    """Interpolate the snapshots at the nodes of all jobs in an executor.
 
-    on_progress: called with the number of finished nodes.
+    on_progress: function that receives the number of finished nodes.
     """
     filled: dict[int, FilledNodes] = {}
     _collect(
@@ -288,11 +291,11 @@ def _collect(
     on_result: Callable[[int, T], None],
     on_progress: Callable[[], None],
 ) -> None:
-    """Wait for all futures; cancel the remaining ones after an exception.
+    """Wait for all futures, and cancel the pending futures after an exception.
 
-    waiting: indices by future. on_result: called with the index and the result of each future.
-    on_progress: called periodically.
-    Raises LostWorkersError if the executor loses its workers, and the errors of the futures.
+    waiting: indices by future. on_result: function that receives the index and the result of each
+    future. on_progress: function that is called periodically. Raise LostWorkersError if the
+    executor loses its workers, and the errors of the futures.
     """
     try:
         while waiting:
@@ -304,8 +307,8 @@ def _collect(
                 except CancelledError as error:
                     raise LostWorkersError(
                         "the worker processes that solve snapshots for the soft body's table were "
-                        "lost; restart them and repeat the command, which continues from the "
-                        "finished snapshots"
+                        "lost; restart them and repeat the command, which loads the finished "
+                        "snapshots and solves the missing ones"
                     ) from error
                 on_result(number, result)
             on_progress()
@@ -322,11 +325,11 @@ def solve_all(
     *,
     names: Sequence[str] = (),
 ) -> list[snapshots.Snapshot]:
-    """Return the snapshots of the jobs, loaded from `checkpoints` or solved and stored there.
+    """Load the snapshots of jobs from a store, or solve and store them.
 
-    on_progress: called with the number of finished snapshots; it may raise an exception to cancel
-    the pending jobs. names: names of the stored snapshots; empty for "push-0000" and so on. Raises
-    LostWorkersError if the executor loses its workers, and the errors of the jobs.
+    on_progress: function that receives the number of finished snapshots. It may raise an exception
+    to cancel the pending jobs. names: names of the stored snapshots; empty for "push-0000" and so
+    on. Raise LostWorkersError if the executor loses its workers, and the errors of the jobs.
     """
     names = names or [f"push-{number:04d}" for number in range(len(jobs))]
     solved: dict[int, snapshots.Snapshot] = {}

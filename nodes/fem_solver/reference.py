@@ -44,9 +44,9 @@ VERSION = 2
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSolution:
-    """Solution of a push on one mesh.
+    """A reference solution of pushes at one sample point, on one mesh.
 
-    name: description of the mesh. locator: search structure for points on its surface.
+    name: description of the mesh. locator: search structure for points on the surface of the mesh.
     """
 
     name: str
@@ -60,9 +60,10 @@ class ReferenceSolution:
         return bool((np.abs(depths - depth_m) < 1e-9).any())
 
     def evaluate(self, depth_m: float, points: Floats) -> tuple[Floats, float]:
-        """Return the displacement (q, 3) of skin points (q, 3) and the normal force for 1 Pa.
+        """Return the displacement (q, 3), m, of skin points (q, 3) and the normal force, N, for 1
+        Pa.
 
-        depth_m: push depth, one of those of the snapshot.
+        depth_m: push depth, which must be one of the depths of the snapshot.
         """
         level = int(np.abs(self.snapshot.depths_m - depth_m).argmin())
         nodes, weights = self.locator.weights(points)
@@ -73,21 +74,17 @@ class ReferenceSolution:
 def select_references(
     references: Sequence[ReferenceSolution], depth_m: float
 ) -> list[ReferenceSolution]:
-    """Return the references that converged at a push depth, the most accurate first.
-
-    Errors of methods are measured against the first one. Its difference from the second one is
-    taken as its uncertainty.
-    """
+    """Return the references that converged at a push depth, in order of decreasing accuracy."""
     return [reference for reference in references if reference.reaches(depth_m)]
 
 
 def make_focused_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, ratio: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job for a push, with a skin spacing of `ratio` finger radii near the finger.
+    """Return the job for pushes on a mesh that is fine near the finger.
 
-    If the shape does not support meshes that are fine only near the finger, all touchable skin has
-    this spacing.
+    ratio: skin spacing near the finger, in finger radii. If the shape does not support meshes that
+    are fine only near the finger, all touchable skin has this spacing.
     """
     spacing = ratio * scene.finger.radius_m
     spec = replace(body.spec.mesh, skin_spacing_m=spacing)
@@ -105,7 +102,7 @@ def make_focused_job(
 def make_even_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
-    """Return the job for a push, on a mesh with the same spacing on all touchable skin."""
+    """Return the job for pushes on a mesh with the same spacing on all touchable skin."""
     mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
     return snapshots.make_job_on_mesh(
         mesh,
@@ -119,9 +116,10 @@ def make_even_job(
 def solve_cached_jobs(
     jobs: Sequence[SnapshotJob], cache_dir: Path, on_progress: Progress
 ) -> list[Snapshot]:
-    """Return the snapshots of the jobs, from the cache or solved.
+    """Load the snapshots of jobs from the cache, or solve and cache them.
 
-    The name of a cache file is a digest of the job.
+    on_progress: function that receives the number of finished jobs and the total number. Raise
+    OSError if a written cache file cannot be read.
     """
     cache = CheckpointStore(cache_dir)
     names = [f"soft-body-push-{_digest(job)}" for job in jobs]
@@ -144,7 +142,7 @@ def solve_cached_jobs(
 def _load_snapshot(path: Path) -> Snapshot:
     content = load_arrays(path)
     if content is None:
-        raise OSError(f"{path}: the file was written but cannot be read; check the disk")
+        raise OSError(f"{path}: the cache file was written but cannot be read; check the disk")
     return snapshots.decode_snapshot(content)
 
 
@@ -160,9 +158,10 @@ def _digest(*jobs: SnapshotJob) -> str:
 
 
 class LocalTable:
-    """Nonlinear table of a body that is filled only near one surface point.
+    """A nonlinear table of a body that is filled only near one surface point.
 
-    Its values there equal those of the full table, but it needs only the few snapshots of `jobs`.
+    Near this point, its values equal those of the full table. It needs only the few snapshots of
+    the attribute `jobs`.
     """
 
     def __init__(
@@ -196,7 +195,7 @@ class LocalTable:
         self.jobs += [] if fine_job is None else [fine_job]
 
     def body(self, solved: Sequence[Snapshot]) -> SceneBody:
-        """Build the table from the snapshots of `jobs` and return the body with it."""
+        """Return the body with the table that is built from the solved snapshots of `jobs`."""
         response, radius = self._model.response, self._scene.finger.radius_m
         linear = unit_linear_body(
             response, self._body.shape, response.rest[self._model.bounds], radius

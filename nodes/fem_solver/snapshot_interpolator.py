@@ -19,23 +19,24 @@ from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, reflect_
 from flexsheet.nodes.models.interpolation import smoothstep
 
 TRANSPORTED_RATIO, FIXED_RATIO = 2.5, 6.5
-"""Distances from the sample point, in finger radii, between which the weight of the transported
-field falls from 1 to 0."""
+"""The distances from the sample point, in finger radii, between which the weight of the transported
+displacement field decreases from 1 to 0."""
 NEIGHBOURS = 7
 CANDIDATES = 4
 RIDGE = 1e-2
-"""Relative ridge penalty on the slopes of the local fit, which may otherwise be underdetermined."""
+"""The relative ridge penalty on the slopes of the local fit, which may be underdetermined without a
+penalty."""
 FACE_COORDINATES = np.array(
     [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]
 )
-"""Local coordinates (6, 2) of the nodes of a six-node triangle."""
+"""The local coordinates (6, 2) of the nodes of a six-node triangle."""
 
 
 class SurfaceLocator:
-    """Search structure that finds the skin points of a mesh nearest to given points."""
+    """A search structure that finds the skin points of a mesh nearest to given points."""
 
     def __init__(self, rest: Floats, faces: Ints) -> None:
-        """Build the search tree for undeformed skin nodes `rest` (s, 3) and their faces (f, 6)."""
+        """Build the search tree for undeformed skin nodes (s, 3) and six-node faces (f, 6)."""
         from scipy.spatial import cKDTree
 
         self._faces = faces
@@ -48,9 +49,10 @@ class SurfaceLocator:
         self._sides, self._inverse = sides, gram @ sides
 
     def weights(self, points: Floats) -> tuple[Ints, Floats]:
-        """Find the skin nearest to points (q, 3).
+        """Find the skin points nearest to points (q, 3), m.
 
-        Returns the nodes (q, 6) of the nearest faces and the shape functions (q, 6) there.
+        Return the nodes (q, 6) of the nearest faces, and the shape functions (q, 6) at the found
+        points.
         """
         _, near = self._tree.query(points, k=CANDIDATES)
         offset = points[:, None] - self._origin[near]
@@ -69,7 +71,7 @@ class SurfaceLocator:
 def minimal_rotation(start: Floats, end: Floats) -> Floats:
     """Return the rotation (3, 3) of minimum angle from the unit vector `start` to `end` (3,).
 
-    The vectors must not be opposite.
+    The vectors must not have opposite directions.
     """
     axis = np.cross(start, end)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
@@ -78,7 +80,7 @@ def minimal_rotation(start: Floats, end: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class PlacedSnapshot:
-    """Snapshot with its sample point and a search structure for its mesh."""
+    """A snapshot with its sample point and a search structure for its mesh."""
 
     sample: SamplePoint
     snapshot: Snapshot
@@ -86,9 +88,10 @@ class PlacedSnapshot:
 
 
 class SnapshotInterpolator:
-    """Interpolator of snapshots between sample points.
+    """An interpolator of snapshots between sample points.
 
-    It combines transported displacement fields with weights from moving least squares.
+    The interpolator combines transported displacement fields with weights from moving least
+    squares.
     """
 
     def __init__(
@@ -96,7 +99,7 @@ class SnapshotInterpolator:
     ) -> None:
         """Store the solved snapshots, which must all have the same depths.
 
-        towards_user (3,): direction that is not opposite to any normal. radius_m: radius of the
+        towards_user (3,): unit vector that is not opposite to any normal. radius_m: radius of the
         finger.
         """
         self._solved, self._user, self._radius = solved, towards_user, radius_m
@@ -106,9 +109,9 @@ class SnapshotInterpolator:
     def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Singles, Floats, float]:
         """Interpolate the snapshots at a new sample point.
 
-        rest (s, 3): undeformed skin nodes. Returns the displacement (k, s, 3) and the force (k, 3)
-        for 1 Pa at k depths. The last result is the number of depths that converged, as a weighted
-        mean over the snapshots used.
+        rest (s, 3): undeformed skin nodes, m. Return the displacement (k, s, 3), m, and the force
+        (k, 3), N, for 1 Pa at k depths. The last result is the number of converged depths, as a
+        weighted mean over the snapshots used.
         """
         weights = self.neighbour_weights(sample)
         moved: Singles | None = None
@@ -125,9 +128,9 @@ class SnapshotInterpolator:
         return moved, force, reached
 
     def neighbour_weights(self, sample: SamplePoint) -> list[tuple[int, float]]:
-        """Return indices and weights of the snapshots near a sample point; the weights add up to 1.
+        """Return indices and weights of the snapshots near a sample point.
 
-        The weights are those of linear moving least squares over the surface (Lancaster &
+        The weights add up to 1. Source: linear moving least squares over the surface (Lancaster &
         Salkauskas 1981).
         """
         offset = self._points - sample.point
@@ -170,16 +173,16 @@ class SnapshotInterpolator:
 
 
 def _tangents(towards_user: Floats) -> list[int]:
-    """Return the indices of the two axes that are most nearly perpendicular to a direction."""
+    """Return the indices of the two axes with the largest angles to a direction (3,)."""
     return [axis for axis in range(3) if axis != int(np.abs(towards_user).argmax())]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SnapshotSet:
-    """Snapshots at sample points, from which a worker makes an interpolator.
+    """The snapshots at sample points, from which a worker makes an interpolator.
 
-    mirrors: symmetries of the body, see `snapshots.find_mirror_planes`. towards_user (3,),
-    radius_m: see `SnapshotInterpolator`.
+    mirrors: vectors (3,) of signs, one for each mirror symmetry of the body. towards_user (3,):
+    unit vector that is not opposite to any normal. radius_m: radius of the finger.
     """
 
     samples: Sequence[SamplePoint]
@@ -189,7 +192,7 @@ class SnapshotSet:
     radius_m: float
 
     def make_interpolator(self) -> SnapshotInterpolator:
-        """Make an interpolator of the snapshots and their mirror images."""
+        """Make an interpolator from the snapshots and their mirror images."""
         placed = place_snapshots(self.samples, self.solved, self.mirrors)
         return SnapshotInterpolator(placed, self.towards_user, self.radius_m)
 
@@ -199,7 +202,7 @@ def place_snapshots(
 ) -> list[PlacedSnapshot]:
     """Return the snapshots and their mirror images, without duplicates on planes of symmetry.
 
-    mirrors: symmetries of the body, as returned by `snapshots.find_mirror_planes`.
+    mirrors: vectors (3,) of signs, one for each mirror symmetry of the body.
     """
     placed: dict[tuple[int, ...], PlacedSnapshot] = {}
     for sample, snapshot in zip(samples, solved, strict=True):

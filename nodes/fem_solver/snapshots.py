@@ -28,41 +28,43 @@ from flexsheet.nodes.fem_solver.mesh import (
 
 DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0.0225)
 SPACING_RATIO = 0.35
-"""Distance between skin nodes near the push, in finger radii."""
+"""The distance between skin nodes near the push, in finger radii."""
 NEAR_RATIO = 1.5
-"""Distance from the push within which skin nodes have this spacing, in finger radii."""
+"""The distance from the push within which skin nodes have the spacing `SPACING_RATIO`, in finger
+radii."""
 STATIONS = (0.0, 0.4, 0.7, 0.9)
-"""Positions of the sample points along the axis of a cylinder, as fractions of half its length."""
+"""The positions of the sample points along the axis of a cylinder, as fractions of its half
+length."""
 ANGLE_STEP_RAD, RIM_RAD = 0.42, 0.25
-"""Angle between sample points around a cylinder, and angle between the last one and the edge of the
-touchable skin."""
+"""The angle between sample points around a cylinder, and the angle between the last sample point
+and the edge of the touchable skin."""
 APART_RATIO, RIM_RATIO = 2.2, 0.9
-"""For other shapes: distance between sample points, and their minimum distance from skin that
-cannot be touched, in finger radii."""
+"""The distance between sample points of shapes other than cylinders, and their minimum distance
+from skin that cannot be touched, in finger radii."""
 TOLERANCE, MAX_STEP_RATIO, MIN_STEP_FRACTION = 1e-3, 1.0, 0.25
-"""Tolerance, maximum and minimum load step, looser than for a reference solution. They change the
-force by at most 0.04 %, and halve the time."""
+"""The tolerance and the maximum and minimum load step, which are looser than for a reference
+solution. They change the force by at most 0.04 %, and halve the computation time."""
 MIN_VOLUME_RATIO = 0.2
-"""Volume ratio of the most compressed element below which a push ends. The solution at the next
-depth would not converge, and would take a third of the time of the push."""
+"""The volume ratio of the most compressed element below which a push ends, because the solution at
+the next depth would not converge."""
 QUICK_DEPTHS_M = (0.0025, 0.005, 0.010)
 QUICK_COUNT = 9
-"""Depths and number of sample points of the coarse table that is computed first."""
+"""The depths and the number of sample points of the coarse table, which is computed first."""
 FINE_DEPTHS_M = (0.0007, 0.0015, 0.003, 0.005, 0.010)
 FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
-"""Push on a fine mesh, which corrects the forces: its depths; the ratio of its skin spacing to that
-of a snapshot; the distance from the push within which it has this spacing, in finger radii; and the
-growth of the element size per distance."""
+"""The parameters of the push on a fine mesh that corrects the forces. They are the depths, the
+ratio of the skin spacing to that of a snapshot, the distance from the push within which the mesh
+has this spacing, in finger radii, and the growth of the element size per distance (m/m)."""
 SAME_RATIO = 1e-6
 
 
 class SnapshotCancelledError(Exception):
-    """Raised when the solution of a snapshot is cancelled."""
+    """An error that is raised when the solution of a snapshot is cancelled."""
 
 
 @dataclass(frozen=True, slots=True)
 class SamplePoint:
-    """Surface point (3,) and its outward normal (3,), mesh frame."""
+    """A surface point (3,), m, and its outward normal (3,), mesh frame."""
 
     point: Floats
     normal: Floats
@@ -70,10 +72,10 @@ class SamplePoint:
 
 @dataclass(frozen=True, slots=True)
 class SnapshotJob:
-    """Input of a snapshot: pushes at one sample point to several depths.
+    """The inputs of a snapshot, which describe pushes at one sample point to several depths.
 
-    nodes (n, 3), elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
-    six-node triangles that the finger can touch.
+    nodes (n, 3), m, elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
+    six-node triangles that the finger can touch. depths_m: push depths.
     """
 
     nodes: Floats
@@ -88,11 +90,12 @@ class SnapshotJob:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Solution of a job.
+    """The solution of a snapshot job.
 
-    rest (s, 3): undeformed skin nodes. faces (f, 6): six-node triangles of the skin. moved (k, s,
-    3): skin displacement at the push depths `depths_m` (k,). force_n (k, 3): force on the finger
-    for 1 Pa. reached: number of converged depths; deeper entries repeat the last converged one.
+    rest (s, 3): undeformed skin nodes, m. faces (f, 6): six-node triangles of the skin. depths_m
+    (k,): push depths. moved (k, s, 3): skin displacement at these depths, m. force_n (k, 3): force
+    on the finger for a Young's modulus of 1 Pa. reached: number of converged depths. Entries at
+    deeper depths repeat the last converged solution.
     """
 
     rest: Floats
@@ -106,8 +109,9 @@ class Snapshot:
 def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False) -> Snapshot:
     """Compute the snapshot that a job describes.
 
-    stopped: function that returns true to cancel the solution. Raises SnapshotCancelledError if it
-    does, and the errors of `NeoHookeanBody`.
+    stopped: function that returns true to cancel the solution. Raise SnapshotCancelledError if the
+    solution is cancelled, SolidMeshError for inverted elements, and ValueError for an invalid
+    material.
     """
     from flexsheet.nodes.fem_solver.newton import NeoHookeanBody  # late: scipy is slow to import
 
@@ -149,10 +153,10 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
 
 
 def find_mirror_planes(mesh: SolidMesh) -> list[Floats]:
-    """Find the mirror symmetries of a body about its planes x = 0 and y = 0.
+    """Find the mirror symmetries of a body and its support about the planes x = 0 and y = 0.
 
-    Both the body and its support must be symmetric. Returns one vector (3,) for each symmetry, with
-    -1 for mirrored coordinates; the first is the identity (1, 1, 1).
+    Return one vector (3,) for each symmetry, with
+    -1 for mirrored coordinates and 1 for the others. The first vector is the identity (1, 1, 1).
     """
     from scipy.spatial import cKDTree
 
@@ -175,7 +179,7 @@ def choose_sample_points(
 ) -> list[SamplePoint]:
     """Choose sample points that, with their mirror images, cover the touchable skin.
 
-    mirrors: symmetries, as returned by `find_mirror_planes`. radius_m: radius of the finger.
+    mirrors: vectors (3,) of signs, one for each mirror symmetry. radius_m: radius of the finger.
     """
     if isinstance(spec.geometry, Cylinder):
         return _choose_cylinder_points(spec.geometry, spec.touch_angle_rad, mirrors)
@@ -204,10 +208,11 @@ def choose_sample_points(
 def order_by_spread(
     samples: list[SamplePoint], mirrors: list[Floats], towards_user: Floats
 ) -> list[SamplePoint]:
-    """Return the sample points in an order in which the first ones cover the skin best.
+    """Order sample points so that the first points of the result cover the skin best.
 
-    The first is nearest to the centre of the side that faces the user. Each next one is farthest
-    from all previous ones and their mirror images (farthest point sampling).
+    The first point is nearest to the centre of the side that faces the user. Each next point is
+    farthest from all previous points and their mirror images (farthest point sampling). mirrors:
+    vectors (3,) of signs, one for each mirror symmetry. towards_user (3,): unit vector.
     """
     points = np.array([sample.point for sample in samples])
     images = points[:, None] * np.array(mirrors)
@@ -249,11 +254,11 @@ def make_snapshot_job(
     spacing_m: float | None = None,
     depths_m: tuple[float, ...] | None = None,
 ) -> SnapshotJob:
-    """Return the description of the pushes at a sample point, which a worker solves.
+    """Return the job for the pushes at a sample point.
 
-    If the shape supports it, the job has a new mesh that is fine near the push; otherwise it uses
-    `mesh`. spacing_m: skin spacing of the new mesh; None for that of a table. depths_m: push
-    depths; None for `DEPTHS_M`.
+    For a cylinder on a strip support, the job has a new mesh that is fine near the push. Otherwise,
+    it has the given mesh. spacing_m: skin spacing of the new mesh; None for the default of a table.
+    depths_m: push depths; None for `DEPTHS_M`.
     """
     spacing_m = spacing_m or _spacing_m(spec, finger_radius_m)
     focused = _make_focused_mesh(spec, sample, spacing_m, NEAR_RATIO * finger_radius_m, None)
@@ -271,7 +276,7 @@ def make_fine_job(
 ) -> SnapshotJob | None:
     """Return the job for a push on a fine mesh, which corrects the forces of a table.
 
-    Returns None for a shape without meshes that are fine only near the push.
+    Return None unless the body is a cylinder on a strip support.
     """
     spacing_m = FINE_RATIO * _spacing_m(spec, finger_radius_m)
     near_m = FINE_NEAR_RATIO * finger_radius_m
@@ -294,7 +299,11 @@ def _spacing_m(spec: MeshSpec, finger_radius_m: float) -> float:
 def _make_focused_mesh(
     spec: MeshSpec, sample: SamplePoint, spacing_m: float, near_m: float, growth: float | None
 ) -> SolidMesh | None:
-    """Return a mesh that is fine near a sample point; None if the shape has no such mesh."""
+    """Return a mesh that is fine near a sample point, or None for a shape without such meshes.
+
+    spacing_m: skin spacing near the point. near_m: distance within which the mesh has this spacing.
+    growth: increase of the element size per distance (m/m); None for the default.
+    """
     geometry, support = spec.geometry, spec.support
     if not (isinstance(geometry, Cylinder) and isinstance(support, StripSupport)):
         return None
@@ -321,7 +330,7 @@ def make_job_on_mesh(
     finger_radius_m: float,
     depths_m: tuple[float, ...],
 ) -> SnapshotJob:
-    """Return the job for pushes at a sample point with the given mesh."""
+    """Return the job for pushes at a sample point to several depths with a given mesh."""
     return SnapshotJob(
         nodes=mesh.nodes,
         elements=mesh.elements,
@@ -337,9 +346,9 @@ def make_job_on_mesh(
 def reflect_snapshot(
     snapshot: Snapshot, sample: SamplePoint, signs: Floats
 ) -> tuple[Snapshot, SamplePoint]:
-    """Return the mirror image of a snapshot and of its sample point.
+    """Return the mirror images of a snapshot and of its sample point.
 
-    signs (3,): -1 for the coordinates that are mirrored, otherwise 1.
+    signs (3,): -1 for mirrored coordinates, and 1 for the others.
     """
     faces = snapshot.faces
     if signs.prod() < 0.0:
@@ -355,5 +364,5 @@ def reflect_snapshot(
 
 
 def decode_snapshot(content: dict[str, NDArray[Any]]) -> Snapshot:
-    """Return the snapshot that `flexsheet.nodes.cache.encode_fields` converted to arrays."""
+    """Convert the arrays of a cached snapshot, by field name, to a snapshot."""
     return Snapshot(reached=int(content.pop("reached")), **content)

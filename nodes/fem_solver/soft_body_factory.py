@@ -20,10 +20,11 @@ from flexsheet.nodes.fem_solver import body, precompute, precompute_table
 from flexsheet.nodes.fem_solver.table import Table
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
-"""Soft-body method, or `auto`: the nonlinear table if it is cached, otherwise linear."""
+"""A soft-body method, or `auto` for the nonlinear table if it is cached, and the linear method
+otherwise."""
 
 SKIN_SPACING_M = 0.003
-"""Distance between skin nodes if neither a parameter nor the scene specifies it."""
+"""The distance between skin nodes if neither a parameter nor the scene specifies it, in metres."""
 
 
 def choose_method(
@@ -35,9 +36,9 @@ def choose_method(
 ) -> tuple[MethodChoice, float]:
     """Choose the method and the skin spacing (m) from a scene and the parameters of a node.
 
-    method, skin_spacing_m: parameters; `auto` leaves the choice to the scene. If the scene chooses
-    the linear method, it is used even if a table is cached. Otherwise `auto` uses a cached table.
-    compute_table: whether `auto` also computes a missing table, which takes minutes.
+    method, skin_spacing_m: parameters, for which `auto` leaves the choice to the scene. If the
+    scene chooses the linear method, that is used even if a table is cached. Otherwise, `auto` uses
+    a cached table. compute_table: whether a missing table is computed if the method is `auto`.
     """
     choice = scene.methods.soft_body
     by_scene_m = None if choice is None else choice.skin_spacing_m
@@ -49,11 +50,11 @@ def choose_method(
 
 @dataclass(slots=True)
 class SoftBodyFactory:
-    """Builder of soft bodies that keeps the last precomputed model in memory.
+    """A factory of soft bodies that keeps the last precomputed model in memory.
 
     workers: number of processes that compute a table; 0 means one per core. scheduler: address of a
     dask scheduler whose workers compute the table instead. If the cache in `cache_dir` is empty,
-    all methods take seconds to minutes.
+    each method takes seconds to minutes.
     """
 
     skin_spacing_m: float
@@ -68,9 +69,10 @@ class SoftBodyFactory:
     def bodies(
         self, scene: Scene, method: MethodChoice, progress: precompute.Progress
     ) -> list[body.SceneBody]:
-        """Build the soft body of a scene once for each available method, the best method first.
+        """Build the soft body of a scene for each available method, starting with the best method.
 
-        Raises the errors of `load_or_compute` and `build_scene_body`.
+        Raise SolidMeshError for a body without sufficient support, ValueError for an invalid
+        material, size or depth, and MemoryError if the free memory is insufficient.
         """
         spec = body.make_soft_body_spec(
             scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0
@@ -95,7 +97,7 @@ class SoftBodyFactory:
         return [body.attach_table(linear, scene, model, table), linear]
 
     def is_cached(self, scene: Scene) -> bool:
-        """Return whether `bodies` needs no computation that takes long."""
+        """Return whether the cache contains the linear response for a scene."""
         spec = body.make_soft_body_spec(
             scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0
         )
@@ -104,11 +106,8 @@ class SoftBodyFactory:
     def _load_model(
         self, spec: precompute.SoftBodySpec, progress: Callable[[int, int, Any], None]
     ) -> precompute.SoftBodyModel:
-        """Return the last model if it has the same inputs, otherwise load or compute it.
-
-        Another thread, whose result is no longer needed, may replace `_model` at any time.
-        Therefore it is read only once.
-        """
+        """Return the last model if it has the same inputs. Otherwise, load or compute the model."""
+        # Read `_model` only once: another thread whose result is no longer needed may replace it.
         last, key = self._model, spec.key()
         if last is None or last[0] != key:
             last = self._model = key, precompute.load_or_compute(spec, self.cache_dir, progress)
@@ -117,9 +116,9 @@ class SoftBodyFactory:
     def pending_note(
         self, scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]
     ) -> str:
-        """Return a note for the user if the scene's nonlinear table is missing, else an empty text.
+        """Return a note for the user if the nonlinear table of the scene is missing.
 
-        made: bodies that `bodies` returned.
+        The text is empty if the table is not missing. made: soft bodies of the scene.
         """
         choice = scene.methods.soft_body
         waits_for_table = (
@@ -141,8 +140,9 @@ class SoftBodyFactory:
     ) -> body.SceneBody:
         """Compute and cache the nonlinear table, and return the body that uses it.
 
-        linear: body with the linear method. on_quick: called with a body that uses a first table of
-        few snapshots; None omits it. Raises the errors of `compute_table` and `connect_workers`.
+        linear: body with the linear method. on_quick: function that receives a body with a coarse
+        table of few snapshots; None to omit the coarse table. Raise WorkersError if the workers
+        cannot be used or are lost, and MemoryError if the free memory is insufficient.
         """
         model = self._load_model(linear.spec, progress)
 
@@ -164,7 +164,8 @@ class SoftBodyFactory:
 
     @contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
-        """Yield the executor that solves snapshots, and how many of its workers run here."""
+        """Yield the executor that solves snapshots, and the number of its workers on this
+        machine."""
         if self.scheduler is not None:
             from flexsheet.nodes.fem_solver.dask_executor import (
                 connect_workers,  # late: it is slow to import
@@ -182,4 +183,4 @@ FACTORY_PARAMETERS = {one.name for one in fields(SoftBodyFactory) if one.init} -
     "cache_dir",
     "skin_spacing_m",
 }
-"""Names of the node parameters that are passed to the factory unchanged."""
+"""The names of the node parameters that are passed to the factory unchanged."""

@@ -40,31 +40,31 @@ from flexsheet.nodes.fem_solver.snapshots import FINE_RATIO, SamplePoint, Snapsh
 from flexsheet.nodes.models.interpolation import smoothstep
 
 LINEAR_DEPTHS_M = (0.0007,)
-"""Depths of the table in addition to those of the snapshots."""
+"""The depths of the table that no snapshot has."""
 BLEND_M = (0.0007, 0.0015)
-"""Range of depths over which the table changes from the linear response to the snapshots."""
+"""The range of depths in which the table changes from the linear response to the snapshots."""
 MIN_COSINE = -0.25
-"""Minimum cosine of the angle between the deformed and the undeformed normal of a skin triangle."""
+"""The minimum cosine of the angle between the deformed and the undeformed normal of a triangle."""
 END_SPAN_M = 0.00125
-"""Distance from the end of the valid range to the depth of the deepest solution. Deeper pushes
-approach the deepest solution."""
+"""The depth of the deepest solution below the end of the valid range. The responses to pushes
+beyond the valid range approach the deepest solution."""
 FADE_RATIO = 2.0
-"""Distance past the end of the touchable skin over which the displacement fades to zero, in finger
-radii."""
+"""The distance beyond the edge of the touchable skin within which the displacement decreases to
+zero, in finger radii."""
 CANDIDATE_FACES = 4
 MESH_ORDER = 2.0
-"""Order of convergence of the force with the element size."""
+"""The order of convergence of the force with the element size."""
 FILLED_NODES = 48
-"""Maximum number of contact nodes of a job that fills a table."""
+"""The maximum number of contact nodes of one job that fills a table."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Responses to pushes at m contact nodes, each to L depths, for a Young's modulus of 1 Pa.
+    """The responses to pushes at m contact nodes to L depths, for a Young's modulus of 1 Pa.
 
-    depths_m (L,): push depths; the first is 0. fields (m, L - 1, 3 s) float32: displacement of the
-    s skin nodes at all depths except 0. force_n (m, L, 3): force on the finger. reach_m (m,):
-    maximum depth with a valid solution at each contact node.
+    depths_m (L,): push depths, of which the first is 0. fields (m, L - 1, 3 s) float32:
+    displacement of the s skin nodes at all depths except 0, m. force_n (m, L, 3): force on the
+    finger. reach_m (m,): maximum depth with a valid solution at each contact node.
     """
 
     depths_m: Floats
@@ -74,18 +74,20 @@ class Table:
 
 
 def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
-    """Return the memory that a table needs, bytes.
+    """Return the memory that a table needs, in bytes.
 
-    loads: number of contact nodes. depths: number of depths of a snapshot.
+    loads: number of contact nodes. skin_nodes: number of skin nodes. depths: number of depths of a
+    snapshot.
     """
     return loads * skin_nodes * 3 * 4 * (depths + len(LINEAR_DEPTHS_M))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FillJob:
-    """Job for a worker process: interpolate snapshots at some contact nodes. It has all inputs.
+    """A job for a worker process that interpolates snapshots at some contact nodes.
 
-    samples: contact nodes. rest (s, 3): undeformed skin nodes. triangles (t, 3): skin triangles.
+    samples: contact nodes. rest (s, 3): undeformed skin nodes, m. triangles (t, 3): skin triangles.
+    source: snapshots.
     """
 
     samples: Sequence[SamplePoint]
@@ -96,10 +98,11 @@ class FillJob:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilledNodes:
-    """Interpolated snapshots at n nodes and k depths.
+    """The interpolated snapshots at n nodes and k depths.
 
     moved (n, k, 3 s): displacements of s skin nodes, m. force_n (n, k, 3): forces. reached (n,):
-    see `SnapshotInterpolator.interpolate`. valid (n,): see `count_valid_levels`.
+    mean number of depths at which the snapshots used converged. valid (n,): number of depths at
+    which the displacement is valid.
     """
 
     moved: Singles
@@ -109,7 +112,7 @@ class FilledNodes:
 
 
 def interpolate_nodes(job: FillJob) -> FilledNodes:
-    """Interpolate the snapshots (solved pushes) at each sample point of the table in `job`."""
+    """Interpolate the snapshots of a job at each of its contact nodes."""
     interpolator = job.source.make_interpolator()
     moved, force, reached = zip(
         *(interpolator.interpolate(sample, job.rest) for sample in job.samples), strict=True
@@ -125,7 +128,8 @@ def interpolate_nodes(job: FillJob) -> FilledNodes:
 
 
 Interpolate = Callable[[Sequence[FillJob]], Iterable[FilledNodes]]
-"""Function that interpolates the nodes of jobs in this or other processes, in their order."""
+"""A function that interpolates at the nodes of jobs, in this or other processes. It returns the
+results in the order of the jobs."""
 
 
 def fill_table(
@@ -137,11 +141,11 @@ def fill_table(
     fine: tuple[SamplePoint, Snapshot] | None = None,
     interpolate: Interpolate = lambda jobs: map(interpolate_nodes, jobs),
 ) -> Table:
-    """Compute the table of a body.
+    """Compute the nonlinear table of a body from snapshots.
 
-    triangles (t, 3): triangles of its skin. linear: linear method for the same response and a
-    modulus of 1 Pa; its linear range must contain all blended depths. fine: push on a fine mesh
-    with which all forces are corrected (`compute_force_factors`).
+    triangles (t, 3): triangles of the skin. linear: linear method for the same response and a
+    modulus of 1 Pa. Its linear range must contain the depths `BLEND_M`. fine: push on a fine mesh
+    with which all forces are corrected, or None. interpolate: function that processes the jobs.
     """
     interpolator = source.make_interpolator()
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
@@ -178,14 +182,13 @@ def compute_force_factors(
     interpolator: SnapshotInterpolator,
     depths: Floats,
 ) -> Floats:
-    """Return the factors (L,) that correct the table's forces at its depths (L,).
+    """Return the factors (L,) that correct the forces of a table at its depths (L,), m.
 
-    The table's meshes are too coarse for small contacts, so that its forces are too large. The
-    excess depends mainly on the depth, since contact and mesh are similar at all points. Each
-    factor is the ratio of an estimate of the true force to the table's force at the same point. The
-    estimate is extrapolated from the meshes of the table and of the fine push (Richardson, order
-    2). Where the table blends with the linear method, it is the force of the fine push. Beyond the
-    depths of the fine push, the factor is constant.
+    The table's meshes are too coarse for small contacts, and its forces are therefore too large.
+    Each factor is the ratio of an estimate of the true force to the table's force at the same
+    point. The estimate is a Richardson extrapolation of order 2 from the meshes of the table and of
+    the fine push. At depths where the table contains the linear response, the estimate is the force
+    of the fine push. Beyond the depths of the fine push, the factor is constant.
     """
     sample, push = fine
     solved_m = push.depths_m[: push.reached]
@@ -211,8 +214,8 @@ def _blend_levels(
 ) -> tuple[Singles, Floats]:
     """Blend interpolated snapshots with the linear response at small depths.
 
-    solved (k, 3 s), pushed (k, 3): displacement and force at the last k of the L depths. Returns
-    the displacement (L, 3 s) and the force (L, 3) at all depths.
+    solved (k, 3 s), pushed (k, 3): displacement (m) and force (N) at the last k of the L depths.
+    Return the displacement (L, 3 s) and the force (L, 3) at all depths.
     """
     moved = np.zeros((len(depths), solved.shape[1]), dtype=np.float32)
     force = np.zeros((len(depths), 3))
@@ -230,18 +233,21 @@ def _blend_levels(
 
 
 def _reach_m(reached: float, depths: Floats) -> float:
-    """Return the maximum depth (m) with a valid solution, from the number of converged depths."""
+    """Return the maximum depth (m) with a valid solution.
+
+    reached: number of converged depths, which may be fractional. depths (k,): depths, m.
+    """
     return float(np.interp(reached, np.arange(1, len(depths) + 1), depths))
 
 
 class CubicInterpolator:
-    """Cubic interpolator over increasing depths, with continuous slope.
+    """A cubic interpolator over increasing depths, with continuous slope.
 
     The slope at a depth is that of the parabola through its value and the two neighbouring values.
     """
 
     def __init__(self, depths_m: Floats) -> None:
-        """Precompute the cubics for at least four depths (L,)."""
+        """Precompute the cubic polynomials for at least four depths (L,), m."""
         count = len(depths_m)
         self._depths = depths_m.tolist()
         values = np.eye(count)
@@ -257,9 +263,9 @@ class CubicInterpolator:
             self._powers.append(np.array(rows)[:, first : first + 4])
 
     def weights_at(self, depth_m: float) -> tuple[int, Floats]:
-        """Return (first, weights (4,)) for the interpolation at a depth.
+        """Return the index of a first depth and four weights for the interpolation at a depth (m).
 
-        The weights apply to the table's depths `first` to `first + 3`.
+        The weights (4,) apply to the first depth and the three next depths of the table.
         """
         level = min(max(bisect_right(self._depths, depth_m) - 1, 0), len(self._depths) - 2)
         t = (depth_m - self._depths[level]) / (self._depths[level + 1] - self._depths[level])
@@ -267,11 +273,11 @@ class CubicInterpolator:
 
 
 def count_valid_levels(rest: Floats, moved: Singles, triangles: NDArray[np.int32]) -> int:
-    """Count the depths, from the shallowest, at which an interpolated skin displacement is valid.
+    """Count the depths up to the first one with an invalid interpolated skin displacement.
 
-    rest (s, 3): undeformed skin nodes. moved (L, s, 3): displacement at each depth. A depth is
-    valid if no triangle is rotated by more than the angle whose cosine is `MIN_COSINE`. The
-    interpolation of snapshots can rotate triangles farther next to an edge of the skin.
+    rest (s, 3): undeformed skin nodes, m. moved (L, s, 3): displacement at each depth, m. triangles
+    (t, 3): skin triangles. A displacement is invalid if a triangle is rotated by more than the
+    angle whose cosine is `MIN_COSINE`. This can happen at an edge of the skin.
     """
 
     def normals(points: Floats) -> Floats:
@@ -291,8 +297,8 @@ def count_valid_levels(rest: Floats, moved: Singles, triangles: NDArray[np.int32
 def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
     """Return the distance (m) between a point (3,) and the edges of a triangle.
 
-    corners (3, 3): corners of the triangle. Also returns the nearest point on the edges, in local
-    coordinates (2,) of the triangle.
+    corners (3, 3): corners of the triangle. The second result is the nearest point on the edges, in
+    local coordinates (2,) of the triangle.
     """
     starts, edge_vectors = corners, np.roll(corners, -1, axis=0) - corners
     along = np.clip(
@@ -307,7 +313,7 @@ def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
 
 
 class TableSoftBody:
-    """Soft-body method (`SoftBodyMethod`) that interpolates in a nonlinear table."""
+    """A soft-body method that interpolates in a nonlinear table."""
 
     def __init__(
         self,
@@ -323,8 +329,9 @@ class TableSoftBody:
     ) -> None:
         """Precompute the force curves of all contact nodes.
 
-        bounds (b, 3): positions of skin nodes that must not be touched. push_depth_m: depth at
-        which the force curve ends. linear_depth_m: depth at which the stiffness is evaluated.
+        bounds (b, 3): positions of skin nodes that must not be touched, m. name: name of the method
+        in messages. push_depth_m: depth at which the force curve ends. linear_depth_m: depth at
+        which the stiffness is evaluated.
         """
         self.name = name
         from scipy.linalg.blas import sgemv
@@ -395,10 +402,10 @@ class TableSoftBody:
     def project_to_surface(self, surface: Floats) -> tuple[Ints, Floats, float]:
         """Find the point of the touchable skin that is nearest to a surface point (3,).
 
-        Returns the nodes (6,) of its face, the shape functions (6,) there, and the distance (m) of
-        the surface point from the touchable skin.
+        Return the nodes (6,) of the nearest face, the shape functions (6,) at the found point, and
+        the distance (m) of the surface point from the touchable skin.
         """
-        # Squared distances, without the square of `surface`, which all have in common.
+        # The squared distances omit the square of `surface`, which is the same for all faces.
         squared = self._centre_squares - self._centres @ (2.0 * surface)
         tried = squared.argpartition(CANDIDATE_FACES)[:CANDIDATE_FACES].tolist()
         every = (self._across @ surface).reshape(-1, 2) - self._offset
@@ -421,11 +428,11 @@ class TableSoftBody:
         return self._faces[best], weights, 0.0
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return force / depth (N/m) at `linear_depth_m`, near the point `surface` (3,)."""
+        """Return the force per depth (N/m) at `linear_depth_m` near a surface point (3,)."""
         return float(self.force_curve(surface)[len(CURVE_FRACTIONS), 1]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force curve near `surface` (3,), see `SoftBodyMethod.force_curve`."""
+        """Return the force-depth curve (n, 2) near a surface point (3,): depth (m), force (N)."""
         nodes, weights, _ = self.project_to_surface(surface)
         return self._curve_at(nodes, weights)
 
@@ -435,9 +442,10 @@ class TableSoftBody:
         return result
 
     def _curve(self, number: int, normal: Floats) -> Floats:
-        """Return the normal force (N) of a contact node at the depths of the force curve.
+        """Return the normal force (n,), N, at a contact node for the depths of the force curve.
 
-        The force never decreases with depth.
+        The force never decreases with depth. number: index of the contact node. normal (3,): normal
+        of the skin at this node.
         """
         reach = float(self.reach_m[number])
         bent = np.array([saturate_depth(float(d), reach - END_SPAN_M, reach) for d in self._depths])

@@ -18,7 +18,7 @@ from flexsheet.nodes.arrays import Bools, Ints
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError
 
 CELL = 64
-"""Length of a cell in integer coordinates; as a power of two, it can be halved six times."""
+"""The length of a cell in integer coordinates, which can be halved six times."""
 MAX_TETRAHEDRA = 300_000
 _OFFSET = 1 << 20
 
@@ -26,9 +26,8 @@ _OFFSET = 1 << 20
 def make_lattice(half_cells: tuple[int, int, int]) -> tuple[Ints, Ints]:
     """Return vertices (n, 3) and tetrahedra (e, 4) of a lattice of cubic cells about the origin.
 
-    half_cells: half the number of cells along each axis. The diagonals of the cells point away from
-    the centre. The lattice is therefore symmetric about its three central planes, and no
-    tetrahedron has two boundary faces.
+    half_cells: half the number of cells along each axis. The lattice is symmetric about its three
+    central planes, and no tetrahedron has two boundary faces.
     """
     cells = np.stack(
         np.meshgrid(*(np.arange(-n, n) for n in half_cells), indexing="ij"), axis=-1
@@ -50,16 +49,18 @@ def make_lattice(half_cells: tuple[int, int, int]) -> tuple[Ints, Ints]:
 def bisect(
     vertices: Ints, tetrahedra: Ints, too_large: Callable[[Ints, Ints], Bools]
 ) -> tuple[Ints, Ints]:
-    """Bisect tetrahedra until `too_large(vertices, tetrahedra)` (e,) is false for all of them.
+    """Bisect tetrahedra (e, 4) until none of them is too large.
 
-    More tetrahedra are bisected where this is necessary for neighbours to share whole faces. Raises
-    UnfitMeshError if more than `MAX_TETRAHEDRA` or elements below 1/64 of a cell are required.
+    too_large: function that returns whether each tetrahedron is too large, for given vertices (n,
+    3) and tetrahedra. Neighbours are also bisected, so that they share whole faces. Raise
+    UnfitMeshError if more than `MAX_TETRAHEDRA` tetrahedra or edges shorter than 1/64 of a cell are
+    required.
     """
     while True:
         if len(tetrahedra) > MAX_TETRAHEDRA:
             raise UnfitMeshError(
-                f"skin_spacing_m: the mesh requires more than {MAX_TETRAHEDRA} elements; increase "
-                "skin_spacing_m"
+                f"skin_spacing_m: the mesh would have more than {MAX_TETRAHEDRA} elements; "
+                "increase skin_spacing_m"
             )
         ends = vertices[tetrahedra[:, EDGES]]
         square = np.square(ends[:, :, 0] - ends[:, :, 1]).sum(axis=2)
@@ -75,7 +76,7 @@ def bisect(
         doubled = middles[split, longest_edges[split]]
         if (doubled % 2).any():
             raise UnfitMeshError(
-                "skin_spacing_m: the value is far too small for the object; increase it"
+                "skin_spacing_m: the value is far too small for the object; increase skin_spacing_m"
             )
         count = len(vertices)
         new_points, index = np.unique(doubled // 2, axis=0, return_inverse=True)
@@ -102,7 +103,8 @@ def _keys(points: Ints) -> Ints:
 
 
 def _find(vertices: Ints, points: Ints) -> Ints:
-    """Return the index (n,) of the vertex at each point (n, 3), or -1 where there is none."""
+    """Return the index (n,) of the vertex at each point (n, 3), or -1 for a point without
+    vertex."""
     keys = _keys(vertices)
     order = np.argsort(keys)
     wanted_keys = _keys(points)

@@ -1,4 +1,4 @@
-"""Curve boundary edges: move their midpoints to the true surface if the elements remain valid."""
+"""Curve the boundary edges of a mesh by moving their midpoints to the true surface."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from flexsheet.nodes.fem_solver.mesh.quality import MIN_JACOBIAN_RATIO, min_jaco
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES, boundary_faces
 
 MAX_SAG_RATIO = 0.25
-"""Maximum displacement of the midpoint of an edge, divided by the length of the edge. A surface
-point farther away is on another side of a thin part."""
+"""The maximum displacement of the midpoint of an edge, divided by the length of the edge. A surface
+point at a larger distance is on another side of a thin part."""
 
 
 def curve_edges(nodes: Floats, elements: Ints, nearest: Callable[[Floats], Floats]) -> Floats:
-    """Return the nodes (n, 3) with midpoints of boundary edges moved to the nearest surface points.
+    """Move the midpoints of boundary edges to the nearest surface points and return all nodes (n,
+    3).
 
-    elements (e, 10): elements with straight edges. nearest: function that returns the nearest
-    surface points. The edges of an element remain straight if its Jacobian determinant would fall
-    below `MIN_JACOBIAN_RATIO` times that of the straight element.
+    nodes (n, 3), m, elements (e, 10): mesh with straight edges. nearest: function that returns the
+    nearest surface points. The edges of an element remain straight if its Jacobian determinant
+    would fall below `MIN_JACOBIAN_RATIO` times the determinant of the straight element.
     """
     middles = np.unique(boundary_faces(elements)[:, 3:])
     result = nodes.copy()

@@ -27,21 +27,22 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
-"""Increase of the element size per depth below the curved side (m/m)."""
+"""The increase of the element size per depth below the curved side (m/m)."""
 RAMP_RAD = 0.6
 FOCUS_GROWTH = 0.35
-"""Increase of the element size per distance from the focus (m/m)."""
+"""The increase of the element size per distance from the focus (m/m)."""
 MAX_SIZE_RATIO = 0.35
-"""Maximum element size of a mesh with a focus, as a fraction of the radius."""
+"""The maximum element size of a mesh with a focus, as a fraction of the radius of the cylinder."""
 SPIRAL, FLAT_RATIO = 1e-3, 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Focus:
-    """Point on the curved side around which the mesh is fine.
+    """A point on the curved side of a cylinder around which the mesh is fine.
 
     x_m: position along the axis. angle_rad: angle from +z. near_m: distance within which elements
-    have the requested size. growth: increase of the size beyond; None for `FOCUS_GROWTH`.
+    have the requested size. growth: increase of the element size per distance beyond `near_m`
+    (m/m); None for `FOCUS_GROWTH`.
     """
 
     x_m: float
@@ -61,26 +62,27 @@ def cylinder_mesh(
 ) -> SolidMesh:
     """Return the mesh of a solid cylinder.
 
-    support_angle_rad: full angle of the fixed strip, centred on -z. touch_angle_rad: half angle of
-    the touchable skin, centred on +z. Its nodes are `skin_spacing_m` apart. Elements are larger
-    with depth and up to twice as large at the back; with a focus, their size increases with the
-    distance from it. Raises ValueError for a spacing too coarse for the cylinder, or invalid
-    angles.
+    support_angle_rad: full angle of the fixed strip, which is centred on -z. touch_angle_rad: half
+    angle of the touchable skin, which is centred on +z. skin_spacing_m: distance between touchable
+    nodes. focus: point around which the mesh is fine; None for a mesh that is fine on all touchable
+    skin. Elements are larger inside and at the back of the cylinder. Raise ValueError for a spacing
+    that is too large for the cylinder, or for invalid angles.
     """
     half_support = 0.5 * support_angle_rad
     if not 0.0 < half_support < np.pi:
         raise ValueError(
-            f"object.support_angle_rad: {support_angle_rad:g} must be between 0 and 2 pi; change it"
+            f"object.support_angle_rad: {support_angle_rad:g} must be between 0 and 2 pi; change "
+            "this angle"
         )
     if touch_angle_rad <= 0.0 or touch_angle_rad > np.pi - half_support + 1e-9:
         raise ValueError(
-            f"touchable skin: its half angle {touch_angle_rad:g} rad must be positive and must end "
-            f"before the support at {np.pi - half_support:g} rad; reduce object.support_angle_rad"
+            f"touch_angle_rad: {touch_angle_rad:g} must be positive and at most "
+            f"{np.pi - half_support:g}, where the support begins; reduce object.support_angle_rad"
         )
     if not 0.0 < skin_spacing_m <= 0.25 * min(radius_m, length_m):
         raise ValueError(
             f"skin_spacing_m: {skin_spacing_m:g} must be positive and at most a quarter of the "
-            f"cylinder's radius ({radius_m:g} m) and length ({length_m:g} m); change it"
+            f"cylinder's radius ({radius_m:g} m) and length ({length_m:g} m); change skin_spacing_m"
         )
     element_m = 2.0 * skin_spacing_m
     sizes = _Sizes(element_m, touch_angle_rad, radius_m, focus)
@@ -104,7 +106,8 @@ def cylinder_mesh(
 
 @dataclass(frozen=True, slots=True)
 class _Sizes:
-    """Required edge lengths on the curved side, in the circumferential and the axial direction."""
+    """The required edge lengths on the curved side in the circumferential and the axial
+    direction."""
 
     element_m: float
     touch_angle: float
@@ -135,7 +138,8 @@ class _Sizes:
 def _stations(length_m: float, sizes: _Sizes) -> Floats:
     """Return the x coordinates of the cross-sections, including both ends of the cylinder.
 
-    With a focus, one cross-section is at the focus, and the distances are equal within `near_m`.
+    If the sizes have a focus, one cross-section is at the focus, and the distances are equal within
+    `near_m`.
     """
     half = 0.5 * length_m
     stops = [-half, half]
@@ -151,10 +155,10 @@ def _stations(length_m: float, sizes: _Sizes) -> Floats:
 
 
 def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
-    """Return the angles of points on an arc from `start` to `stop` (excluded).
+    """Return the angles (n,) of points on an arc from `start` to `stop` (excluded), rad.
 
-    The points are spaced by the required sizes. radius: radius of the arc, m. depth: depth of the
-    arc below the curved side, m.
+    The distances of the points are the required sizes. radius: radius of the arc, m. depth: depth
+    of the arc below the curved side, m.
     """
     fine = np.linspace(start, stop, 2001)
     return _sample_by_density(
@@ -163,9 +167,11 @@ def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _
 
 
 def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floats:
-    """Return points in the range of `fine`, without its end, spaced according to a density.
+    """Return increasing values whose spacing is the reciprocal of a density.
 
-    density: required number of points per unit at each of the values `fine`.
+    fine: increasing values that cover the range of the result; the result omits the end of the
+    range. density: required number of points per unit at each of these values. min_count: minimum
+    number of results.
     """
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))])
     pieces = max(min_count, round(float(total[-1])))
@@ -174,7 +180,7 @@ def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floa
 
 
 def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
-    """Yield radius and depth of each ring of points below the side, from outside inwards."""
+    """Yield the radius and the depth (m) of each ring of points, from outside inwards."""
     depth, step = 0.0, sizes.element_m
     while True:
         depth += 0.85 * step
@@ -186,9 +192,9 @@ def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
 
 
 def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
-    """Return the points (y, z) and the triangles of the cross-section.
+    """Return the points (n, 2), as (y, z), and the triangles (t, 3) of the cross-section.
 
-    The triangles are counter-clockwise seen from +x. Both ends of the support are points.
+    The triangles are counter-clockwise if seen from +x. Two points are at the ends of the support.
     """
     free = np.pi - half_support
     ends = [-free, free, 2 * np.pi - free]
@@ -210,11 +216,11 @@ def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, 
 def _focused_disc(
     radius_m: float, half_support: float, sizes: _Sizes, focus: Focus
 ) -> tuple[Floats, Ints]:
-    """Return a cross-section like that of `_disc`, symmetric about the diameter through the focus.
+    """Return the points (n, 2) and the triangles (t, 3) of a cross-section that is fine at a focus.
 
-    The mesh may be asymmetric only where the support ends. Otherwise, the force on the finger would
-    have a sideways component of a few percent of its magnitude. If there is no friction, this
-    component would move the whole body.
+    The cross-section is symmetric about the diameter through the focus, except at the ends of the
+    support. In an asymmetric mesh, the force on the finger would have a sideways component of a few
+    percent of its magnitude.
     """
     near = focus.near_m / radius_m
     inner = [(r, _sample_arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]
@@ -230,7 +236,7 @@ def _focused_disc(
         rings = [(radius_m, np.concatenate(rim)), *inner]
         off = np.concatenate([_circle(r * (1.0 + SPIRAL * p[1:]), p[1:]) for r, p in rings])
         # Triangulate points moved onto a spiral, where no four points are on a common circle. The
-        # triangulation is then unique, and both halves get the same one.
+        # triangulation is then unique, and therefore the same in both halves.
         flat = np.column_stack([0.0 * axis, axis * np.where(axis < 0.0, 1.0 + SPIRAL * np.pi, 1.0)])
         number = np.append(np.arange(len(axis)), count + np.arange(len(off)))
         true = np.concatenate([_circle(np.full(len(p) - 1, r), p[1:]) for r, p in rings])
@@ -253,7 +259,7 @@ def _circle(radius: float | Floats, angles: Floats) -> Floats:
 def _triangles(points: Floats, where: Floats) -> Ints:
     """Return counter-clockwise triangles (t, 3) of points (n, 2).
 
-    The Delaunay triangulation is computed with the points at the positions `where` (n, 2).
+    where (n, 2): positions of the points for the Delaunay triangulation.
     """
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 
@@ -267,9 +273,10 @@ def _triangles(points: Floats, where: Floats) -> Ints:
 
 
 def _extrude(points: Floats, triangles: Ints, x: Floats) -> tuple[Floats, Ints]:
-    """Return corner nodes (k, 3) and tetrahedra (e, 4) of the cross-section extruded to `x`.
+    """Extrude a cross-section to corner nodes (k, 3) and tetrahedra (e, 4).
 
-    The diagonals alternate between slices, so that the mesh has no preferred direction.
+    points (n, 2), triangles (t, 3): cross-section. x (s,): positions of the cross-sections, m. The
+    diagonals alternate between slices, so that the mesh has no preferred direction.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])
@@ -305,9 +312,9 @@ def _finish_mesh(
     half_support: float,
     touch_angle: float,
 ) -> SolidMesh:
-    """Return the mesh of 10-node elements, with curved edges on the side, and select its nodes.
+    """Build the mesh of 10-node elements, curve its edges, and find fixed and touchable nodes.
 
-    The selection concerns fixed, skin and touchable nodes.
+    layer (k,): index of the cross-section of each corner.
     """
     nodes, elements = add_midside_nodes(corners, tetrahedra)
     level = np.empty(len(nodes), dtype=np.int64)

@@ -36,26 +36,28 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 from flexsheet.nodes.models.shapes import Shape
 
 INITIAL_CELL_RATIO = 2
-"""Width of the lattice cells before bisection, divided by the minimum element size."""
+"""The width of the lattice cells before bisection, divided by the minimum element size."""
 MIN_SIZE_RATIO = 0.5
-"""Minimum element size at sharp curvature, divided by the minimum size elsewhere."""
+"""The minimum element size at sharp curvature, divided by the minimum element size elsewhere."""
 CURVATURE_SIZE_RATIO = 0.8
-"""Maximum element size, divided by the radius of curvature of the surface."""
+"""The maximum element size, divided by the radius of curvature of the surface."""
 SURFACE_DISTANCE_RATIO = 0.5
-"""Maximum distance between the surface and the nearest corner of a tetrahedron for which that
-counts as a surface element, divided by its longest edge."""
+"""The maximum distance between the surface and the nearest corner of a surface element, divided by
+the longest edge of the element."""
 CORE_DEPTH_RATIO = 0.4
-"""Minimum depth of a core vertex below the surface, divided by the shortest edge at the vertex."""
+"""The minimum depth of a core vertex below the surface, divided by the shortest edge at the
+vertex."""
 MAX_THINNED_FRACTION = 0.05
-"""Maximum fraction of core vertices that may be removed; otherwise the object is too thin."""
+"""The maximum fraction of core vertices that may be removed. If more must be removed, the object is
+too thin."""
 GOOD_RATIO = 0.2
 ATTEMPTS = 5
-"""Maximum number of fits. If the radius ratio of an element is below `GOOD_RATIO`, its core vertex
-nearest to the surface is removed and the fit is repeated; the best fit is used."""
+"""The maximum number of fits. If the radius ratio of an element is below `GOOD_RATIO`, its core
+vertex nearest to the surface is removed and the fit is repeated. The best fit is used."""
 
 
 class _SurfaceCache:
-    """Cache of the distance, normal and curvature of the surface, computed at lattice vertices."""
+    """A cache of the distance, normal and curvature of the surface at lattice vertices."""
 
     def __init__(self, shape: Shape, origin: Floats, cell_m: float) -> None:
         self.shape, self.origin, self.cell_m = shape, origin, cell_m
@@ -66,9 +68,9 @@ class _SurfaceCache:
         return self.origin + vertices * (self.cell_m / CELL)
 
     def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
-        """Return data of the surface at the points nearest to lattice vertices (n, 3).
+        """Return signed distance (n,), m, normal (n, 3) and curvature (n,), 1/m, of the surface.
 
-        These are the signed distance (n,), the normal (n, 3) and the curvature (n,).
+        The values belong to the surface points nearest to the lattice vertices (n, 3).
         """
         keys = [vertex.tobytes() for vertex in vertices]
         new = [i for i, key in enumerate(keys) if key not in self._row_numbers]
@@ -86,8 +88,8 @@ class _SurfaceCache:
 def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> tuple[Floats, Ints]:
     """Return nodes (n, 3) and elements (e, 10) of the solid inside the surface of a shape.
 
-    low_m, high_m (3,): corners of the bounding box of the shape. Raises UnfitMeshError for a shape
-    that is too thin for elements of the size that `grading` requires.
+    low_m, high_m (3,): corners of the bounding box of the shape. grading: required element sizes.
+    Raise UnfitMeshError for a shape that is too thin for elements of these sizes.
     """
     cell = INITIAL_CELL_RATIO * grading.element_m
     field = _SurfaceCache(shape, 0.5 * (low_m + high_m), cell)
@@ -133,7 +135,7 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
 def limit_sizes_by_curvature(sizes: Floats, bend: Floats, grading: Grading) -> Floats:
     """Limit element sizes (n,), m, to `CURVATURE_SIZE_RATIO` times the radius of curvature.
 
-    bend (n,): curvatures, 1/m. grading: determines the lower bound of the result.
+    bend (n,): curvatures, 1/m. grading: element sizes that determine the lower bound of the result.
     """
     finest = np.maximum(
         CURVATURE_SIZE_RATIO / np.maximum(bend, 1e-9), MIN_SIZE_RATIO * grading.element_m
@@ -142,7 +144,7 @@ def limit_sizes_by_curvature(sizes: Floats, bend: Floats, grading: Grading) -> F
 
 
 def hull_faces(tetrahedra: Ints) -> Ints:
-    """Return the boundary faces (f, 3): those that belong to one tetrahedron only.
+    """Return the faces (f, 3) that belong to only one of the tetrahedra (e, 4).
 
     The corner indices of each face are sorted.
     """
@@ -184,10 +186,11 @@ def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
 
 
 def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
-    """Return the tetrahedra (k, 4) with a core vertex, chosen so that the boundary has no pinches.
+    """Return the tetrahedra (k, 4) with a core vertex, after the removal of pinches.
 
     Vertices where the boundary touches itself are removed from `core` (n,), in place. distance
-    (n,): signed distance of the vertices from the surface.
+    (n,): signed distance of the vertices from the surface, m. Raise UnfitMeshError if the object is
+    too thin.
     """
     before = int(core.sum())
     while True:
@@ -199,16 +202,16 @@ def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
         about = about[core[about]]
         if not len(about) or core.sum() < (1.0 - MAX_THINNED_FRACTION) * before:
             raise UnfitMeshError(
-                "skin_spacing_m: the object is too thin for elements of twice this size; reduce "
-                "skin_spacing_m"
+                "skin_spacing_m: the object is too thin for elements of twice the skin spacing; "
+                "reduce skin_spacing_m"
             )
         core[about[distance[about].argmax()]] = False
 
 
 def _find_pinches(faces: Ints) -> Ints:
-    """Return the vertices at which a boundary of faces (f, 3) touches itself.
+    """Return the vertices (k,) at which a boundary of faces (f, 3) touches itself.
 
-    Such a vertex has an edge of more than two faces, or faces that form more than one fan.
+    The edges of such a vertex belong to more than two faces, or its faces form more than one fan.
     """
     edges, uses = np.unique(
         np.sort(faces[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1),

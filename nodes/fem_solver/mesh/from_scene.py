@@ -43,34 +43,38 @@ from flexsheet.nodes.models.shapes.triangles import volume_m3
 Vector = tuple[float, float, float]
 
 VERSION = 1
-"""Version of the meshing code. Increase it when the mesh for the same specification changes."""
+"""The version of the meshing code. Increase it when the mesh for the same specification changes."""
 TOUCH_MARGIN_RAD = 0.45
-"""Angle by which the touchable skin extends beyond the maximum tilt of the working range."""
+"""The angle by which the touchable skin extends beyond the maximum tilt of the working range."""
 SLAB_DEPTHS = 2.0
-"""Ratio of the depth of the slab that represents a half-space to the scene's push depth."""
+"""The ratio of the depth of the slab that represents a half-space to the push depth of the
+scene."""
 MIN_THICKNESS_SPACINGS = 4.0
-"""Minimum thickness of the object in skin spacings; four spacings are two elements."""
+"""The minimum thickness of the object in skin spacings. Four spacings correspond to two
+elements."""
 MAX_NODES = 250_000
 BYTES_PER_NODE = 6000
-"""Peak memory while meshing, per node; `benchmarks.meshing` measures it."""
+"""The peak memory per node while meshing, as measured by `benchmarks.meshing`."""
 SAMPLES = 16
-"""Sample points along each side of the bounding box for the estimate of the number of nodes."""
+"""The number of sample points along each side of the bounding box, with which the number of nodes
+is estimated."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
 CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
-"""Measured ratios of the number of nodes to the estimates that `_budget` computes. The first two
-hold for inner and skin nodes; the others correct the sum for a cylinder and for a mesh file."""
+"""The measured ratios of the number of nodes to an estimate by integration. The first two apply to
+inner and skin nodes. The other two apply to the sum, for a cylinder and for a mesh file."""
 MAX_LOST_FRACTION = 0.1
-"""Maximum fraction of an object's volume that its mesh may omit."""
+"""The maximum fraction of an object's volume that its mesh may omit."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeshSpec:
-    """All inputs that determine a mesh.
+    """The inputs that determine a mesh.
 
-    touch_angle_rad: maximum angle between a touchable normal and the direction to the user.
-    towards_user: unit vector to the user, mesh frame. down: downward direction for a base
-    support, object frame. rotation_rad: rotation of the mesh frame of a cylinder about the x axis
-    of the object. slab_depth_m: depth of the slab that represents a half-space.
+    touch_angle_rad: maximum angle between the normal of touchable skin and the direction to the
+    user. skin_spacing_m: distance between skin nodes. towards_user: unit vector to the user, mesh
+    frame. down: downward direction for a base support, object frame. rotation_rad: rotation of the
+    mesh frame of a cylinder about the x axis of the object. slab_depth_m: depth of the slab that
+    represents a half-space.
     """
 
     geometry: Geometry
@@ -102,14 +106,18 @@ class MeshSpec:
 
 @dataclass(frozen=True, slots=True)
 class MeshBudget:
-    """Approximate number of nodes of a mesh, and memory (bytes) that meshing needs."""
+    """The approximate number of nodes of a mesh, and the memory that meshing needs, in bytes."""
 
     nodes: int
     bytes: int
 
 
 def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
-    """Return the specification of the mesh of a scene; raises ValueError like `world_from_mesh`."""
+    """Return the specification of the mesh of a scene.
+
+    skin_spacing_m: distance between skin nodes. Raise ValueError if the axis of a cylinder points
+    to the user.
+    """
     body = scene.object
     object_from_world = rigid.inverse(_world_from_object(scene))[:3, :3]
     mesh_from_world = rigid.inverse(world_from_mesh(scene))[:3, :3]
@@ -135,9 +143,9 @@ def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
 def world_from_mesh(scene: Scene) -> Floats:
     """Return the pose (4, 4) of the mesh frame in the world.
 
-    It is the pose of the object. For a cylinder it is rotated about the axis so that z points to
-    the user. Raises ValueError if the axis of a cylinder points to the user, because its side
-    cannot be touched then.
+    The pose is that of the object. For a cylinder, it is also rotated about the axis so that z
+    points to the user. Raise ValueError if the axis of a cylinder points to the user, because its
+    side cannot be touched.
     """
     world_from_object = _world_from_object(scene)
     if not isinstance(scene.object.geometry, Cylinder):
@@ -161,16 +169,17 @@ def _cylinder_rotation_rad(scene: Scene) -> float:
 
 
 def _rounded(vector: Floats) -> Vector:
-    """Round a vector, so that small numerical differences do not change `MeshSpec.key`."""
+    """Round a vector, so that small numerical differences do not change a digest of it."""
     # Adding zero converts -0.0 to 0.0.
     x, y, z = (float(value) + 0.0 for value in np.round(vector, 12))
     return x, y, z
 
 
 def mesh_budget(spec: MeshSpec) -> MeshBudget:
-    """Estimate the resources that `build_mesh` needs, in at most a second.
+    """Estimate the resources for building a mesh, in at most a second.
 
-    Raises the errors of `_budget`.
+    Raise UnfitMeshError for a skin spacing that does not fit the object or requires more than
+    `MAX_NODES` nodes.
     """
     return _budget(spec, make_shape(dict(spec.geometry)))
 
@@ -179,10 +188,10 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     """Estimate the number of nodes of the mesh, within a factor of two.
 
     Nodes are half an element size apart. The number of inner nodes is therefore about the integral
-    of (2 / element size)^3 over the volume. That of skin nodes is about the integral of (2 /
-    element size)^2 over the surface. Measured factors such as `INNER_FACTOR` correct both.
-
-    Raises UnfitMeshError for a skin spacing that does not fit the object, or more than `MAX_NODES`.
+    of (2 / element size)^3 over the volume. The number of skin nodes is about the integral of (2 /
+    element size)^2 over the surface. Measured factors such as `INNER_FACTOR` correct both numbers.
+    Raise UnfitMeshError for a skin spacing that does not fit the object or requires more than
+    `MAX_NODES` nodes.
     """
     low, high = _box(spec)
     spacing, thickness = spec.skin_spacing_m, float((high - low).min())
@@ -191,7 +200,7 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     if not 0.0 < spacing <= thickness / MIN_THICKNESS_SPACINGS * (1.0 + 1e-9):
         raise UnfitMeshError(
             f"skin_spacing_m: {spacing:g} must be positive and at most a quarter of the object's "
-            f"minimum extent ({thickness:g} m); change it"
+            f"minimum extent ({thickness:g} m); change skin_spacing_m"
         )
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -217,23 +226,24 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     if nodes > MAX_NODES:
         raise UnfitMeshError(
             f"skin_spacing_m: {spacing:g} requires about {nodes} nodes "
-            f"({budget.bytes / 2**30:.1f} GiB of memory), the maximum is {MAX_NODES}; "
-            "increase the spacing"
+            f"({budget.bytes / 2**30:.1f} GiB of memory), but the maximum is {MAX_NODES}; "
+            "increase skin_spacing_m"
         )
     return budget
 
 
 def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
-    """Return the lower and upper corner (3,) of the bounding box of the meshed volume."""
+    """Return the lower and the upper corner (3,), m, of the bounding box of the meshed volume."""
     low, high = GEOMETRIES[spec.geometry.shape].bounds_m(spec.geometry)
     margin = spec.slab_depth_m
     return low - margin, high + np.array([margin, margin, 0.0])
 
 
 def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
-    """Mesh the object of a scene in the frame of `world_from_mesh`.
+    """Mesh the object of a scene in the mesh frame.
 
-    Raises the errors of `build_mesh`.
+    skin_spacing_m: distance between skin nodes. Raise UnfitMeshError for an object, a spacing or a
+    support that cannot be meshed. Raise ValueError if the axis of a cylinder points to the user.
     """
     return build_mesh(mesh_spec(scene, skin_spacing_m))
 
@@ -241,8 +251,9 @@ def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
 def build_mesh(spec: MeshSpec) -> SolidMesh:
     """Build the mesh of a specification.
 
-    Raises UnfitMeshError like `_budget`, and also if the object is too thin for its elements or the
-    support fixes too few nodes or all touchable skin.
+    Raise UnfitMeshError for a skin spacing that does not fit the object or requires more than
+    `MAX_NODES` nodes. Also raise it if the object is too thin for the elements, or if the support
+    fixes too few nodes or all touchable skin.
     """
     geometry = spec.geometry
     shape = make_shape(dict(geometry))
@@ -276,8 +287,8 @@ def build_mesh(spec: MeshSpec) -> SolidMesh:
 def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
     """Build the mesh of a cylinder.
 
-    If the support is a strip, the mesh has nodes on its edges. Any other support fixes the nodes
-    that happen to be inside it.
+    If the support is a strip, the mesh has nodes on the edges of the strip. Any other support fixes
+    the nodes inside its region.
     """
     strip = isinstance(spec.support, StripSupport)
     mesh = cylinder_mesh(
@@ -299,7 +310,10 @@ def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
 
 
 def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
-    """Return whether each skin point (n, 3), mesh frame, is fixed; see `supports.select_fixed`."""
+    """Return whether the support fixes each skin point (n, 3), m, mesh frame.
+
+    normals (n, 3): outward unit normals at the points, mesh frame.
+    """
     object_from_mesh = rigid.transform_from_rpy(np.zeros(3), [spec.rotation_rad, 0.0, 0.0])[:3, :3]
     return select_fixed(
         spec.support,
@@ -311,7 +325,7 @@ def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
 
 
 def _slab_normals(nodes: Floats) -> Floats:
-    """Return the normals (n, 3) at the top and bottom nodes of a slab; at other nodes, +x."""
+    """Return the normals (n, 3) at the top and bottom nodes of a slab, and +x at other nodes."""
     normals = np.zeros_like(nodes)
     normals[:, 0] = 1.0
     low, high = nodes[:, 2].min(), nodes[:, 2].max()
@@ -322,7 +336,7 @@ def _slab_normals(nodes: Floats) -> Floats:
 
 
 def _require_volume(mesh: Mesh, nodes: Floats, elements: Ints, spec: MeshSpec) -> None:
-    """Raise UnfitMeshError if the mesh lacks parts of the object, too thin for the elements."""
+    """Raise UnfitMeshError if the mesh omits parts of the object that are too thin for elements."""
     required_m3 = volume_m3(mesh.vertices_m, mesh.triangles.astype(np.int64))
     lost_fraction = 1.0 - float(signed_volumes(nodes, elements).sum()) / required_m3
     if lost_fraction > MAX_LOST_FRACTION:

@@ -10,20 +10,22 @@ from flexsheet.nodes.arrays import Bools, Floats, Ints
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
-"""Increase of the element size per depth below the skin (m/m)."""
+"""The increase of the element size per depth below the skin (m/m)."""
 RAMP_RAD = 0.6
-"""Angle beyond the touchable skin over which the element size increases."""
+"""The angle beyond the touchable skin over which the element size increases."""
 EDGE_SIZE_RATIO = 1.1 * np.sqrt(2.0)
-"""Maximum ratio of the longest edge of a tetrahedron to the required size. It is that of the
-diagonal to the side of a square, plus 10 % for distortion by maps to curved surfaces."""
+"""The maximum ratio of the longest edge of a tetrahedron to the required size. The value is the
+ratio of the diagonal to the side of a square, plus 10 % for distortion by maps to curved
+surfaces."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grading:
-    """Element sizes of a mesh.
+    """The element sizes of a mesh.
 
-    Skin whose normal is within `touch_angle_rad` of the unit vector `towards_user` can be touched.
-    Its nodes are `skin_spacing_m` apart; elsewhere elements are larger.
+    Skin can be touched if the angle between its normal and the unit vector `towards_user` is at
+    most `touch_angle_rad`. The nodes of touchable skin are `skin_spacing_m` apart. Elements
+    elsewhere are larger.
     """
 
     skin_spacing_m: float
@@ -32,17 +34,18 @@ class Grading:
 
     @property
     def element_m(self) -> float:
-        """Return the minimum element size, m; it is two spacings, as edges have a midpoint node."""
+        """Return the minimum element size, m: two spacings, because edges have a midpoint node."""
         return 2.0 * self.skin_spacing_m
 
     def touchable(self, normals: Floats) -> Bools:
-        """Return whether skin with the unit normals (n, 3) can be touched (n,)."""
+        """Return whether the finger can touch skin with the unit normals (n, 3)."""
         return np.asarray(self._angles(normals) <= self.touch_angle_rad + 1e-9)
 
     def sizes(self, normals: Floats, depth_m: Floats) -> Floats:
         """Return the required element sizes (n,), m.
 
-        normals (n, 3): unit normals of the nearest skin. depth_m (n,): depths below it.
+        normals (n, 3): unit normals of the nearest skin. depth_m (n,): depths below the nearest
+        skin.
         """
         behind = np.clip((self._angles(normals) - self.touch_angle_rad) / RAMP_RAD, 0.0, 1.0)
         coarser = 1.0 + (BACK_COARSENING - 1.0) * behind
@@ -54,7 +57,7 @@ class Grading:
 
 
 def longest_edges(points: Floats, tetrahedra: Ints) -> Floats:
-    """Return the length of the longest edge of each tetrahedron (e,)."""
+    """Return the length (e,) of the longest edge of each tetrahedron, in the unit of the points."""
     corners = points[tetrahedra]
     pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
     square = [np.square(corners[:, i] - corners[:, j]).sum(axis=1) for i, j in pairs]

@@ -35,21 +35,22 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 from flexsheet.nodes.models.shapes import CuboidMap, Shape
 
 COARSENINGS = (8.0, 4.0, 2.0, 1.0, 0.85, 0.7)
-"""Widths of the lattice cells before bisection, divided by the minimum element size; all are tried.
-"""
+"""The widths of the lattice cells before bisection, divided by the minimum element size. Each width
+is tried."""
 ANCHORS = (30.0, 3.0, 0.3, 0.0)
-"""Stiffness of the springs that hold corners at their mapped positions, see `smooth_mesh`. The
-first value is used for which the radius ratios of all elements exceed `GOOD_RATIO`."""
+"""The stiffnesses of the springs that hold corners at their mapped positions. The
+first value for which the radius ratios of all elements exceed `GOOD_RATIO` is used."""
 GOOD_RATIO = 0.2
 MAX_SURPLUS_RATIO = 2.0
-"""Maximum ratio of a lattice's number of elements to that of the smallest lattice."""
+"""The maximum ratio between the number of elements of a lattice and that of the smallest
+lattice."""
 
 
 def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
-    """Map lattice vertices (n, 3) to the solid.
+    """Map lattice vertices (n, 3) to points (n, 3), m, in the solid.
 
-    half_cells (3,): half the number of lattice cells along each axis. Returns the mapped points
-    (n, 3) and the surface points X(w) (n, 3), see the module docstring.
+    half_cells (3,): half the number of lattice cells along each axis. The second result contains
+    the surface points (n, 3), m, on the rays from the centre through the vertices.
     """
     u = vertices / (CELL * half_cells)
     weight = np.abs(u).max(axis=1, keepdims=True)
@@ -60,9 +61,10 @@ def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[
 
 
 def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3), object frame, and elements (e, 10) of the solid inside a shape.
+    """Return nodes (n, 3), m, object frame, and elements (e, 10) of the solid inside a shape.
 
-    template: map from the cube to the shape. Raises UnfitMeshError if all meshes are too distorted.
+    template: map from the cube to the shape. grading: required element sizes. Raise UnfitMeshError
+    if the elements of all meshes are too distorted.
     """
 
     def positions(vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
@@ -95,7 +97,7 @@ def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Fl
 
 
 def mesh_slab(plane: Plane, margin_m: float, grading: Grading) -> tuple[Floats, Ints]:
-    """Return nodes (n, 3) and elements (e, 10) of a slab that represents a half-space.
+    """Return nodes (n, 3), m, and elements (e, 10) of a slab that represents a half-space.
 
     The slab is `margin_m` deep and extends `margin_m` beyond each side of the touchable rectangle.
     """
@@ -112,15 +114,16 @@ def mesh_slab(plane: Plane, margin_m: float, grading: Grading) -> tuple[Floats, 
 
 
 def distance_to_rectangle(points: Floats, plane: Plane) -> Floats:
-    """Return the distances (n,) of points (n, 3) from the touchable rectangle of a plane."""
+    """Return the distances (n,), m, of points (n, 3) from the touchable rectangle of a plane."""
     half = 0.5 * np.array([plane.width_m, plane.height_m])
     beside = np.maximum(np.abs(points[:, :2]) - half, 0.0)
     return np.asarray(np.linalg.norm(np.column_stack([beside, points[:, 2]]), axis=1))
 
 
 MapFunction = Callable[[Ints, Ints], tuple[Floats, Floats]]
-"""Function that maps lattice vertices (n, 3), given half the number of cells along each axis (3,).
-It returns the mapped points (n, 3) and the required element sizes there (n,), m."""
+"""A function that maps lattice vertices (n, 3). Its second argument (3,) is half the number of
+cells along each axis. It returns the mapped points (n, 3), m, and the required element sizes (n,),
+m."""
 
 
 def _map_lattices(
@@ -128,9 +131,10 @@ def _map_lattices(
 ) -> list[tuple[Floats, Ints, Bools]]:
     """Return several mapped lattices, sorted by their number of elements.
 
-    They start with cells of different sizes and are bisected where smaller elements are required.
-    Each consists of corners (n, 3), tetrahedra (e, 4), and whether each corner is on the boundary
-    (n,).
+    The lattices start with cells of different sizes and are bisected where smaller elements are
+    required. A lattice consists of corners (n, 3), tetrahedra (e, 4), and flags (n,) for corners on
+    the boundary. half_m (3,): half extents. element_m: minimum element size. positions: function
+    that maps the vertices.
     """
     found: list[tuple[Floats, Ints, Bools]] = []
     for cells in COARSENINGS:

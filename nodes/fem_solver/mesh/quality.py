@@ -9,16 +9,17 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats, Ints
 
 MIN_RADIUS_RATIO = 0.1
-"""Minimum radius ratio of an accepted mesh."""
+"""The minimum radius ratio of all elements of an accepted mesh."""
 MIN_JACOBIAN_RATIO = 0.1
-"""Minimum ratio of the Jacobian determinants of a curved element and one with straight edges."""
+"""The minimum ratio of the Jacobian determinant of a curved element to that of the straight
+element."""
 
 _EDGE_OF = np.array([[-1, 4, 6, 7], [4, -1, 5, 8], [6, 5, -1, 9], [7, 8, 9, -1]])
-"""Index of the node at the midpoint of the edge between two corners of an element."""
+"""The index of the node at the midpoint of the edge between two corners of an element."""
 
 
 def signed_volumes(points: Floats, tetrahedra: Ints) -> Floats:
-    """Return signed volumes (e,), m^3, of the straight tetrahedra between the first four nodes."""
+    """Return the signed volumes (e,), m^3, of tetrahedra with straight edges."""
     corners = points[tetrahedra[:, :4]]
     volume: Floats = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
     return volume
@@ -27,10 +28,11 @@ def signed_volumes(points: Floats, tetrahedra: Ints) -> Floats:
 def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
     """Return the radius ratio (e,) of each tetrahedron, a measure of its quality.
 
-    It is 3 r / R, with the radii r of the inscribed and R of the circumscribed sphere: 1 for a
-    regular tetrahedron, 0 for a flat and negative for an inverted one. Crelle's formula gives R
-    from the volume V: 24 V R = sqrt(p (p - 2 a) (p - 2 b) (p - 2 c)). Here a, b and c are the
-    products of the lengths of opposite edges, and p is their sum.
+    The ratio is 3 r / R, where r is the radius of the inscribed sphere and R that of the
+    circumscribed sphere. It is 1 for a regular, 0 for a flat and negative for an inverted
+    tetrahedron. Crelle's formula gives R from the volume V: 24 V R = sqrt(p (p - 2 a) (p - 2 b) (p
+    - 2 c)), where a, b and c are the products of the lengths of opposite edges, and p is the sum of
+    these products.
     """
     corners = points[tetrahedra[:, :4]]
     volume = signed_volumes(points, tetrahedra)
@@ -54,13 +56,13 @@ def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
 
 
 def min_jacobian_ratios(nodes: Floats, elements: Ints) -> Floats:
-    """Return how much curved edges reduce the Jacobian determinant of each 10-node tetrahedron.
+    """Return a lower bound (e,) of the Jacobian determinant of each 10-node tetrahedron.
 
-    The result (e,) is a lower bound of the ratio of the determinant to that with straight edges.
-    The determinant is a cubic polynomial, which is bounded by its Bernstein coefficients (Johnen,
-    Remacle, Geuzaine, "Geometrical validity of curvilinear finite elements", 2013). The three
-    derivatives of position are linear, so each coefficient belongs to three corners. It is the
-    mean, over all permutations of these corners, of the determinant of the derivatives at them.
+    The bound is divided by the determinant of the tetrahedron with straight edges. The determinant
+    is a cubic polynomial, which is bounded by its Bernstein coefficients. Each coefficient belongs
+    to three corners and is the mean, over all permutations of these corners, of the determinant of
+    the position derivatives at the corners. Source: Johnen, Remacle, Geuzaine, "Geometrical
+    validity of curvilinear finite elements", 2013.
     """
     points = nodes[elements]
     slopes = np.empty((len(elements), 4, 4, 3))

@@ -20,19 +20,20 @@ from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
 from flexsheet.nodes.models.shapes import Shape
 
 Surface = Callable[[Floats], tuple[Floats, Floats]]
-"""Function that maps points (n, 3) to the nearest surface points and outward normals there."""
+"""A function that returns the nearest surface points (n, 3) and their outward normals (n, 3) for
+points (n, 3)."""
 
 SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-"""Spring stiffness in each round, if the boundary is at first up to one element off the surface.
-Lengths are measured in median edge lengths."""
+"""The spring stiffness in each round for a boundary that is initially up to one element off the
+surface. The unit of length is the median edge length."""
 SPRINGS_ON_SURFACE = (300.0, 1000.0, 3000.0)
-"""Spring stiffness in each round, if the boundary is on the surface from the start."""
+"""The spring stiffness in each round for a boundary that is initially on the surface."""
 MIN_FINAL_RADIUS_RATIO = 0.15
-"""Minimum radius ratio (`quality.radius_ratios`) of an element after its corners are moved onto the
-surface."""
+"""The minimum radius ratio (`quality.radius_ratios`) of an element after its corners are moved onto
+the surface."""
 ROUND_STEPS = 20
 MEMORY = 8
-"""Number of previous steps and gradient changes that the L-BFGS method uses."""
+"""The number of previous steps and gradient changes that the L-BFGS method uses."""
 
 _REGULAR = np.array(
     [[1.0, 0.5, 0.5], [0.0, np.sqrt(0.75), np.sqrt(1.0 / 12.0)], [0.0, 0.0, np.sqrt(2.0 / 3.0)]]
@@ -41,7 +42,7 @@ _FROM_REGULAR = np.linalg.inv(_REGULAR)
 
 
 def make_surface_query(shape: Shape) -> Surface:
-    """Return the function of type `Surface` for a shape, an argument of `smooth_mesh`."""
+    """Return a function that finds the nearest surface points of a shape and their normals."""
 
     def nearest(points: Floats) -> tuple[Floats, Floats]:
         found = shape.closest(points)
@@ -59,12 +60,13 @@ def smooth_mesh(
     springs: tuple[float, ...],
     anchor: float,
 ) -> Floats:
-    """Return improved positions (n, 3) of the corners of tetrahedra with positive volume.
+    """Improve the shape of tetrahedra and return the new positions (n, 3) of their corners, m.
 
-    hull: indices of the corners that move to the surface. springs: spring stiffness in each round.
-    anchor: stiffness of springs from each corner to its start position, which preserve the
-    variation of element sizes. If an element would have a radius ratio below
-    `MIN_FINAL_RADIUS_RATIO`, its corners are not moved fully onto the surface.
+    corners (n, 3), m, tetrahedra (e, 4): mesh with positive volumes. hull: indices of the corners
+    that move to the surface. surface: function that finds the nearest surface points. springs:
+    spring stiffness in each round. anchor: stiffness of springs from each corner to its start
+    position, which preserve the variation of element sizes. If an element would have a radius ratio
+    below `MIN_FINAL_RADIUS_RATIO`, its corners are not moved fully onto the surface.
     """
     sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
     unit = float(np.median(np.linalg.norm(sides, axis=1)))
@@ -99,7 +101,7 @@ def smooth_mesh(
 
 
 def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
-    """Return the sum of w^2 (see the module docstring) and its gradient (n, 3).
+    """Return the sum of squared inverse mean ratios of all tetrahedra and its gradient (n, 3).
 
     The sum is infinite if a tetrahedron is inverted.
     """
@@ -124,9 +126,9 @@ def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
 def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) -> Floats:
     """Minimize an energy by `ROUND_STEPS` steps of L-BFGS with a backtracking line search.
 
-    points (n, 3): start. energy: function that returns value and gradient. Source: Nocedal and
-    Wright, Numerical Optimization, alg. 7.5. The optimizer of scipy is not used, because its line
-    search does not accept infinite values.
+    points (n, 3): start. energy: function that returns the energy and its gradient (n, 3). The line
+    search accepts infinite energies, unlike that of scipy. Source: Nocedal and
+    Wright, Numerical Optimization, alg. 7.5.
     """
     value, gradient = energy(points)
     steps: list[tuple[Floats, Floats, float]] = []
@@ -155,7 +157,11 @@ def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) 
 
 
 def _times_inverse_hessian(gradient: Floats, steps: list[tuple[Floats, Floats, float]]) -> Floats:
-    """Multiply a gradient by the approximate inverse Hessian (two-loop recursion of L-BFGS)."""
+    """Multiply a gradient (n, 3) by the approximate inverse Hessian of L-BFGS.
+
+    steps: previous steps (n, 3), gradient changes (n, 3), and reciprocals of their scalar products.
+    Source: two-loop recursion, Nocedal and Wright, alg. 7.4.
+    """
     result = gradient.copy()
     weights = []
     for moved, gradient_change, inverse in reversed(steps):

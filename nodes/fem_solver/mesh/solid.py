@@ -15,16 +15,16 @@ from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.arrays import Bools, Floats, Ints
 
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
-"""Corners of the edges whose midpoints are the nodes 4 to 9 of a tetrahedron."""
+"""The corners of the edges whose midpoints are the nodes 4 to 9 of a tetrahedron."""
 FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]])
-"""Nodes of the faces of a tetrahedron: three corners, counter-clockwise seen from outside, then the
-midpoints of the edges between them."""
+"""The nodes of the faces of a tetrahedron. Each face has three corners, counter-clockwise if seen
+from outside, and then the midpoints of the edges between these corners."""
 SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
-"""Division of a six-node triangle into four flat triangles over the same nodes."""
+"""The division of a six-node triangle into four flat triangles over the same nodes."""
 
 
 class UnfitMeshError(FlexsheetError, ValueError):
-    """Raised for an object that cannot be meshed as specified."""
+    """An error that is raised for an object that cannot be meshed as specified."""
 
     code = "unfit-mesh"
     remedy = "Choose a coarser or finer spacing, or repair the surface."
@@ -32,16 +32,16 @@ class UnfitMeshError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class SolidMesh:
-    """Solid mesh of 10-node tetrahedra.
+    """A solid mesh of 10-node tetrahedra.
 
-    nodes (n, 3): positions, m, mesh frame. elements (e, 10): indices of their nodes. slab (n,):
+    nodes (n, 3): positions, m, mesh frame. elements (e, 10): node indices. slab (n,):
     index of the slice along one axis that contains the node. The nodes of one element are in at
-    most two successive slabs; nodes are sorted by slab. fixed (n,): whether each node is fixed.
+    most two successive slabs, and nodes are sorted by slab. fixed (n,): whether each node is fixed.
     skin (s,): nodes on the surface. skin_triangles (t, 3): indices into `skin`, ordered for outward
     normals.
     contact_nodes (m,): nodes that the finger can touch, a sorted subset of `skin`. contact_normals
-    (m, 3): outward normals there. contact_faces (f, 6): indices into `contact_nodes` of six-node
-    triangles, ordered for outward normals.
+    (m, 3): outward normals at these nodes. contact_faces (f, 6): six-node
+    triangles as indices into `contact_nodes`, ordered for outward normals.
     """
 
     nodes: Floats
@@ -70,14 +70,17 @@ def triangle_shape_functions(local: Floats) -> Floats:
 
 
 def triangle_shape_functions_at(a: float, b: float) -> tuple[float, ...]:
-    """Return the values of `triangle_shape_functions` at one point, without slow small arrays."""
+    """Return the six shape functions of a six-node triangle at local coordinates (a, b).
+
+    For one point, this function is faster than `triangle_shape_functions`.
+    """
     c = 1.0 - a - b
     corners = (c * (2.0 * c - 1.0), a * (2.0 * a - 1.0), b * (2.0 * b - 1.0))
     return (*corners, 4.0 * c * a, 4.0 * a * b, 4.0 * b * c)
 
 
 def boundary_faces(elements: Ints) -> Ints:
-    """Return the outward six-node faces (f, 6) that belong to a single element."""
+    """Return the six-node faces (f, 6), with outward normals, that belong to a single element."""
     faces = elements[:, FACES].reshape(-1, 6)
     _, first, counts = np.unique(
         np.sort(faces[:, :3], axis=1), axis=0, return_index=True, return_counts=True
@@ -89,7 +92,7 @@ def boundary_faces(elements: Ints) -> Ints:
 def add_midside_nodes(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
     """Convert tetrahedra (e, 4) to 10-node elements with straight edges.
 
-    Returns the nodes (n, 3), of which the corners come first, and the elements (e, 10).
+    Return the nodes (n, 3), which start with the corners, and the elements (e, 10).
     """
     pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
@@ -108,9 +111,10 @@ def orient_tetrahedra(corners: Floats, tetrahedra: Ints) -> Ints:
 
 
 def number_slabs(nodes: Floats, elements: Ints) -> Ints:
-    """Return the slab (n,) of each node, as defined in `SolidMesh`, along the longest axis.
+    """Return the index of the slab (n,) that contains each node, along the longest axis.
 
-    Raises UnfitMeshError if the mesh consists of several separate components.
+    The nodes of one element are in at most two successive slabs. Raise UnfitMeshError if the mesh
+    consists of several separate components.
     """
     axis = int(np.ptp(nodes, axis=0).argmax())
     level = np.full(len(nodes), -1)
@@ -135,9 +139,10 @@ def make_solid_mesh(
 ) -> SolidMesh:
     """Sort the nodes by slab, find the skin and the touchable part, and return the mesh.
 
-    touchable, fixed (n,): whether each boundary node can be touched, and is fixed. normals (n, 3):
-    outward normals at touchable nodes. A face is touchable if all its nodes are touchable and none
-    is fixed.
+    touchable, fixed (n,): whether each boundary node can be touched, and whether it is fixed.
+    normals (n, 3): outward normals at touchable nodes. A face is touchable if all its nodes are
+    touchable and none is fixed. Raise UnfitMeshError if no face is touchable or the mesh has
+    separate components.
     """
     level = number_slabs(nodes, elements)
     order = np.lexsort((nodes[:, 2], nodes[:, 1], nodes[:, 0], level))
@@ -164,9 +169,10 @@ def make_solid_mesh(
 
 
 def restrict_touchable(mesh: SolidMesh, touchable: Bools) -> SolidMesh:
-    """Return the mesh with its touchable part restricted to nodes that are `touchable` (n,).
+    """Return a copy of the mesh that has fewer touchable nodes.
 
-    Fixed nodes are also excluded. Raises UnfitMeshError if no face remains.
+    touchable (n,): whether each node may remain touchable. Fixed nodes are always excluded. Raise
+    UnfitMeshError if no touchable face remains.
     """
     good = (touchable & ~mesh.fixed)[mesh.contact_nodes]
     faces = mesh.contact_faces[good[mesh.contact_faces].all(axis=1)]

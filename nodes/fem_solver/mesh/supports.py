@@ -22,9 +22,9 @@ def select_fixed(
 ) -> Bools:
     """Return whether each skin point (n, 3) is fixed (n,).
 
-    normals (n, 3): outward unit normals at the points. towards_user (3,): unit vector to the user.
-    down (3,): downward direction for a base support, of any length. All are in the object frame.
-    Raises UnfitMeshError if all fixed points are collinear.
+    All vectors are in the object frame. normals (n, 3): outward unit normals at the points.
+    towards_user (3,): unit vector to the user. down (3,): downward vector of any length, for a base
+    support. Raise UnfitMeshError if all fixed points are collinear.
     """
     chosen: Bools
     match support:
@@ -32,7 +32,7 @@ def select_fixed(
             if support.angle_rad >= 2.0 * np.pi:
                 raise UnfitMeshError(
                     f"object.support.angle_rad: {support.angle_rad:g} must be less than 2 pi, "
-                    "because no skin would be touchable"
+                    "because a full strip leaves no touchable skin; reduce the angle"
                 )
             away = np.arccos(np.clip(-(normals @ towards_user), -1.0, 1.0))
             chosen = np.asarray(away <= 0.5 * support.angle_rad + 1e-9)
@@ -52,7 +52,11 @@ def select_fixed(
 
 
 def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
-    """Raise UnfitMeshError if all chosen points are collinear, so that the body could rotate."""
+    """Raise UnfitMeshError if all chosen points are collinear, because the body could rotate.
+
+    kind: kind of the support, for the error text. points (n, 3): skin points, m. chosen (n,):
+    whether each point is fixed.
+    """
     some = points[chosen]
     extent = float(np.ptp(points, axis=0).max())
     if len(some) >= 3:
@@ -60,6 +64,7 @@ def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
         if spread[1] > 1e-3 * extent:
             return
     raise UnfitMeshError(
-        f"object.support: this {kind} fixes {len(some)} of {len(points)} skin nodes; at least "
-        "three that are not collinear are required; enlarge the support or reduce skin_spacing_m"
+        f"object.support: the support of the kind {kind} fixes {len(some)} of {len(points)} skin "
+        "nodes, but at least three nodes that are not collinear are required; enlarge the support "
+        "or reduce skin_spacing_m"
     )
