@@ -24,10 +24,10 @@ from flexsheet.nodes.console.scene_view import (
 from flexsheet.nodes.console.sheet import (
     COLUMNS,
     ROWS,
+    TRIANGLES,
     compute_sheet_points,
     film,
     intersect_sheet,
-    make_sheet_triangles,
 )
 from flexsheet.nodes.console.snapshot import compute_snapshot, rays, select_ray_vertices
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
@@ -151,9 +151,9 @@ def test_sharp_edges_are_split_and_smooth_ones_are_not() -> None:
     assert np.bincount(source).tolist() == [3] * 8, "a vertex for each of the three faces"
     np.testing.assert_array_equal(source[triangles], box)
     points = sheet(np.array([0.02, 0.01, -0.01]))
-    source, triangles = split_creases(points, make_sheet_triangles())
+    source, triangles = split_creases(points, TRIANGLES)
     assert sorted(source.tolist()) == list(range(len(points)))
-    np.testing.assert_array_equal(source[triangles], make_sheet_triangles())
+    np.testing.assert_array_equal(source[triangles], TRIANGLES)
 
 
 def test_rays_that_miss_have_no_segments(scene: Scene) -> None:

@@ -300,7 +300,7 @@ async def run_session(folder: Path) -> PageVisit:
                 await visit(page, session, port)
             session.restarts = dict(graph.restarts)
             session.notes["log"] = scenes_left_out(graph.run)
-        await expect(page.get_by_text("No connection to the console")).to_be_visible()
+        await expect(page.get_by_text("There is no connection to the console")).to_be_visible()
         await browser.close()
     session.exit_codes = graph.exit_codes
     return session

@@ -113,7 +113,7 @@ def test_the_requested_push_survives_scenes_and_lifting(scene: Scene) -> None:
     finger.advance(0.05, None)
     finger.use(SurfacePicker(thinner))
     assert depth_m(thinner, moved(finger, sent)) == pytest.approx(0.008, abs=2e-4)
-    finger.lift()
+    finger.lift_or_lower()
     assert depth_m(thinner, moved(finger, sent)) == pytest.approx(-HOVER_M, abs=2e-4)
     finger.move_to(0.02, 0.01)
     lifted = moved(finger, sent)

@@ -159,4 +159,4 @@ def test_a_restarted_console_restores_its_state(scene: Scene, tmp_path: Path) ->
     (begun,) = controller()[1]
     assert isinstance(begun, Scene)
     assert begun.name == scene.name
-    assert "invalid state" in warnings[0]
+    assert "the saved state is invalid" in warnings[0]

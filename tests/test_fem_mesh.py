@@ -183,8 +183,6 @@ def require_sound(solid: SolidMesh) -> None:
     assert (uses == 2).all()
     assert len(np.unique(faces[:, :3])) - len(unique) + len(faces) == 2
     assert len(np.unique(solid.elements)) == len(solid.nodes)
-    assert np.ptp(solid.slab[solid.elements], axis=1).max() <= 1
-    assert (np.diff(solid.slab) >= 0).all()
     assert (np.unique(faces) == solid.skin).all()
     assert (np.diff(solid.contact_nodes) > 0).all()
     assert np.isin(solid.contact_nodes, solid.skin).all()
@@ -308,7 +306,7 @@ def test_about_a_focus_a_cylinders_mesh_leans_to_no_side(angle_rad: float) -> No
 @pytest.mark.parametrize("name", SHAPES)
 def test_the_same_scene_gives_the_same_mesh(name: str) -> None:
     first, again = mesh(name), build_mesh(mesh_spec(scene(SHAPES[name]), SPACING))
-    for part in ("nodes", "elements", "slab", "fixed", "skin", "contact_nodes", "contact_faces"):
+    for part in ("nodes", "elements", "fixed", "skin", "contact_nodes", "contact_faces"):
         assert (getattr(first, part) == getattr(again, part)).all(), part
 
 

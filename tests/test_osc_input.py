@@ -163,7 +163,7 @@ async def test_a_silent_sender_makes_the_inputs_invalid() -> None:
     assert (eye.valid, tip.valid) == (False, False)
     used, _, note = select_eyes(SCENE.eyes, eye)
     np.testing.assert_array_equal(used.centre_world_m, CENTRE)
-    assert "using the scene's eyes" in note
+    assert "the eyes of the scene are used" in note
 
 
 async def test_a_port_in_use_is_reported_and_opened_later() -> None:

@@ -1,9 +1,10 @@
-"""Control access to the console page: only this computer by default, from elsewhere with a token.
+"""Control access to the console page.
 
-A web page of another site, opened in a browser on this computer, could connect to the console's
-sockets. Listening on loopback is therefore no protection: the Host and Origin headers of every
-request are checked. No page may show the console in a frame, because a frame can hide what the user
-clicks.
+By default, only users of this computer have access. Users of other computers need a token. A web
+page of another site, opened in a browser on this computer, could connect to the console's sockets.
+Listening on loopback is therefore insufficient, and the Host and Origin headers of every request
+are checked. No other page may show the console in a frame, because a frame can hide the element
+that the user clicks.
 """
 
 from __future__ import annotations
@@ -37,59 +38,68 @@ MIN_TOKEN_LENGTH = 16
 COOKIE = "flexsheet-token"
 
 FRAMING_HEADERS = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
-"""Headers of every response, which forbid other pages to show the console in a frame."""
+"""The headers of every response that forbid other pages to show the console in a frame."""
 
 FRAME_DESTINATIONS = ("iframe", "frame", "fencedframe", "embed", "object")
-"""Values of the header Sec-Fetch-Dest in requests for a page inside another page."""
+"""The values of the header Sec-Fetch-Dest in requests for a page inside another page."""
 
 SINGLE_HEADERS = ("Host", "Origin", "Upgrade", "Accept-Encoding", "Cookie", "Sec-Fetch-Dest")
-"""Headers that are read; a request that repeats one of them is malformed."""
+"""The headers that are read. A request that repeats one of these headers is malformed."""
 
-MALFORMED = "the console cannot read this HTTP request; open its address in a browser"
+MALFORMED = (
+    "the console cannot read this HTTP request; open the address of the console in a browser"
+)
 CLOSE_TIMEOUT_S = 1.0
-"""Time for which a refused connection stays open, so that the client can read the reason."""
+"""The time for which a refused connection stays open, so that the client can read the reason, in
+seconds."""
 
 PageRequest = Callable[[Any, Request], Response | None]
 
 
 class ConsoleError(FlexsheetError, RuntimeError):
-    """Raised if the page cannot be served; the text gives the reason and the remedy."""
+    """An error that is raised if the page cannot be served."""
 
     code = "console"
     remedy = "Choose another port, or set a token if the page is open to the network."
 
 
 def read_token(path: Path) -> str:
-    """Read the access token from a file: one line that only its owner can read.
+    """Read the access token from a file.
 
-    Raises ConsoleError.
+    Raise ConsoleError if the file cannot be read, if other users can read it, or if the token is
+    too short or contains other characters than letters and digits.
     """
     try:
         mode, text = path.stat().st_mode, path.read_text().strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise ConsoleError(f"token_file {path}: cannot be read: {error}") from error
+        raise ConsoleError(
+            f"token_file {path}: the file cannot be read: {error}; check the path and permissions"
+        ) from error
     if mode & 0o077:
-        raise ConsoleError(f"token_file {path}: other users can read it; run chmod 600 {path}")
+        raise ConsoleError(
+            f"token_file {path}: other users can read the file; run chmod 600 {path}"
+        )
     if len(text) < MIN_TOKEN_LENGTH or not (text.isascii() and text.isalnum()):
         raise ConsoleError(
-            f"token_file {path}: expected at least {MIN_TOKEN_LENGTH} letters and digits; create "
-            f"it with python3 -c 'import secrets; print(secrets.token_hex(16))' > {path}"
+            f"token_file {path}: the token must have at least {MIN_TOKEN_LENGTH} letters and "
+            "digits and no other characters; create the file with "
+            f"python3 -c 'import secrets; print(secrets.token_hex(16))' > {path}"
         )
     return text
 
 
 class AccessControl:
-    """Decides which HTTP and WebSocket requests to the console page are allowed.
+    """The access control for HTTP and WebSocket requests to the console page.
 
     address: IP address of the page. token: required token; None permits every user of this
-    computer.
+    computer. Raise ConsoleError if the address is not loopback and there is no token.
     """
 
     def __init__(self, address: str, token: str | None) -> None:
         if token is None and not ipaddress.ip_address(address).is_loopback:
             raise ConsoleError(
-                f"address {address} is not loopback: set token_file, or use 127.0.0.1 with "
-                "ssh -L 8080:127.0.0.1:8080"
+                f"address {address} is not loopback and requires a token; set token_file, or use "
+                "127.0.0.1 with ssh -L 8080:127.0.0.1:8080"
             )
         self._token = token
 
@@ -101,24 +111,30 @@ class AccessControl:
             return make_bad_request()
 
     def _refusal(self, request: Request) -> Response | None:
-        """Check a request for `refusal`.
+        """Return the response that refuses a request, or None if the request is allowed.
 
-        Raises ValueError or MultipleValuesError for a malformed request.
+        Raise ValueError or MultipleValuesError for a malformed request.
         """
         repeated = [name for name in SINGLE_HEADERS if len(request.headers.get_all(name)) > 1]
         if repeated or "Host" not in request.headers:
             return make_bad_request()
         host = request.headers["Host"]
         if request.headers.get("Sec-Fetch-Dest") in FRAME_DESTINATIONS:
-            return _page(http.HTTPStatus.FORBIDDEN, "no page may show the console in a frame")
+            return _page(
+                http.HTTPStatus.FORBIDDEN,
+                "no page may show the console in a frame; open the console in its own tab",
+            )
         if not _names_an_address(host):
             return _page(
                 http.HTTPStatus.FORBIDDEN,
-                f"the console cannot be opened as {host!r}; use its IP address",
+                f"the console cannot be opened under the name {host!r}; use its IP address",
             )
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != host:
-            return _page(http.HTTPStatus.FORBIDDEN, "pages of other sites may not use the console")
+            return _page(
+                http.HTTPStatus.FORBIDDEN,
+                "pages of other sites may not use the console; open its address directly",
+            )
         if self._token is None:
             return None
         token = parse_qs(urlsplit(request.path).query).get("token", [""])[-1]
@@ -133,13 +149,13 @@ class AccessControl:
             return None
         return _page(
             http.HTTPStatus.UNAUTHORIZED,
-            "this console needs its token: open http://ADDRESS:PORT/?token=TOKEN with the "
-            "content of the console's token_file",
+            "this console requires a token; open http://ADDRESS:PORT/?token=TOKEN, where TOKEN "
+            "is the content of the console's token_file",
         )
 
 
 def _names_an_address(host: str) -> bool:
-    """Return whether a Host header is an IP address or localhost; other names can be forged."""
+    """Return whether a Host header is an IP address or localhost. Other names can be forged."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
         return name == "localhost" or bool(ipaddress.ip_address(name))
@@ -185,10 +201,7 @@ def forbid_framing(response: Response) -> Response:
 
 
 def make_page_logger() -> logging.Logger:
-    """Return the page server's logger.
-
-    For invalid bytes from a client it logs one line instead of a traceback.
-    """
+    """Return the logger of the page's server, which logs errors as one line without traceback."""
     logger = logging.getLogger("flexsheet.console")
     if not logger.filters:
         logger.addFilter(shorten_traceback)
@@ -196,7 +209,7 @@ def make_page_logger() -> logging.Logger:
 
 
 def shorten_traceback(record: logging.LogRecord) -> bool:
-    """Replace the traceback of a log record by its last line; return True, so that it is logged."""
+    """Replace the traceback of a log record by its last line, and return True to log the record."""
     if record.exc_info and record.exc_info[1] is not None:
         error = record.exc_info[1]
         record.msg = f"{record.getMessage()}: {type(error).__name__}: {error}".replace("\n", " ")
@@ -205,12 +218,12 @@ def shorten_traceback(record: logging.LogRecord) -> bool:
 
 
 class PageConnection(ServerConnection):
-    """Connection that answers malformed HTTP with status 400 instead of a traceback."""
+    """A connection that answers malformed HTTP requests with the status 400."""
 
     refused = False
 
     def send_data(self) -> None:
-        """Send the protocol's data; after a malformed request, send a refusal first."""
+        """Send the data of the protocol. After a malformed request, first send a refusal."""
         malformed = isinstance(self.protocol.handshake_exc, InvalidMessage)
         if malformed and not self.refused and not self.transport.is_closing():
             self.refused = True
@@ -218,21 +231,21 @@ class PageConnection(ServerConnection):
         super().send_data()
 
     async def handshake(self, *arguments: Any, **rest: Any) -> None:
-        """Perform the opening handshake; close the connection if the handshake is malformed."""
+        """Perform the opening handshake, and close the connection if the handshake is malformed."""
         try:
             await super().handshake(*arguments, **rest)
         except InvalidHandshake:
-            # If the connection were closed at once, the client might not read the answer.
+            # If the connection were closed at once, the client might not read the refusal.
             await asyncio.wait([self.connection_lost_waiter], timeout=CLOSE_TIMEOUT_S)
 
 
 def start_server(address: str, port: int, access: AccessControl, label: str) -> viser.ViserServer:
-    """Start a viser server at exactly this address, with access control.
+    """Start a viser server with access control at exactly the requested address and port.
 
-    viser uses the next free port if the requested one is in use, and accepts every client. The port
-    is therefore tried first, and access is checked before viser's own request handler. Raises
-    ConsoleError, also if this version of viser starts its server in another way.
+    label: title of the page. Raise ConsoleError if the port is in use, or if the installed version
+    of viser does not support the access control.
     """
+    # viser uses the next free port if the requested port is in use, so test the port first.
     _check_port_is_free(address, port)
     # viser prints its address before the graph is ready; the launcher prints it afterwards.
     with _checking(access) as checked_servers, redirect_stdout(io.StringIO()):
@@ -251,7 +264,7 @@ def start_server(address: str, port: int, access: AccessControl, label: str) -> 
 
 @contextmanager
 def _checking(access: AccessControl) -> Iterator[list[PageRequest]]:
-    """Make new servers of the websockets library check each request with `access` first.
+    """Add access control to all servers of the websockets library that start in the context.
 
     Yield the list of the request handlers that were replaced.
     """
@@ -296,6 +309,6 @@ def _check_port_is_free(address: str, port: int) -> None:
 
 def _port_in_use_text(address: str, port: int) -> str:
     return (
-        f"page_port {port} of {address} is in use; "
+        f"page_port: port {port} of {address} is in use; "
         "choose another port with --set console.page_port=PORT"
     )

@@ -1,7 +1,7 @@
-"""Define how the console page draws the arms: boxes for each link, and poses of the links.
+"""Compute the boxes by which the console page draws the links of the arms, and their poses.
 
 The lengths come from the model of the arm in the scene. The thicknesses are approximate. The origin
-of the frame of a link is on its joint axis.
+of the frame of a link is on the joint axis of the link.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, tran
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Box that is part of a link: size and centre (m) in the link's frame; link 0 is the base."""
+    """A box that is part of a link, with size and centre in the frame of the link.
+
+    link: index of the link, where 0 is the base. dark: whether the box has the darker colour.
+    """
 
     link: int
     size_m: tuple[float, float, float]
@@ -39,25 +42,29 @@ PIECES = (
     Piece(5, (0.05, 0.05, 0.062), (0.0, 0.0, 0.035)),
     Piece(6, (0.044, 0.044, 0.012), (0.0, 0.0, -0.006), dark=True),
 )
-"""Boxes that represent the links of a Mitsubishi RV-1A."""
+"""The boxes that represent the links of a Mitsubishi RV-1A."""
 
 LINK_WIDTH_M = 0.07
-"""Width of the boxes that represent the links of other arms."""
+"""The width of the boxes that represent the links of other arms."""
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-"""Corners of a box, (8, 3)."""
+"""The corners (8, 3) of a box with sides from -1 to 1."""
 
 BRACKET_WIDTH_M = 0.012
-"""Width of the bar between a flange and its clamp."""
+"""The width of the bar between a flange and its clamp."""
 
 CLAMP_SIZE_M = (0.012, 1.04, 0.012)
-"""Size of the bar that clamps the sheet: across, along (longer than the edge), thickness."""
+"""The size of the bar that clamps the sheet: width, ratio of the length to that of the edge, and
+thickness."""
 
 
 def compute_link_poses(
     world_from_base: Floats, joints_rad: Floats, model: ClosedFormArm | JointChain
 ) -> Floats:
-    """Compute world_from_link (7, 4, 4) of the base and the six links; the last is the flange."""
+    """Compute the poses (7, 4, 4) of the base and the six links, of which the last is the flange.
+
+    world_from_base (4, 4): pose of the base. joints_rad (6,): joint angles.
+    """
     chain = model.chain() if isinstance(model, ClosedFormArm) else model
     poses = [world_from_base]
     for origin, axis, angle_rad in zip(chain.origins, chain.axes, joints_rad.tolist(), strict=True):
@@ -68,7 +75,7 @@ def compute_link_poses(
 
 
 def make_pieces(model: ClosedFormArm | JointChain) -> tuple[Piece, ...]:
-    """Return the boxes of an arm; for an unknown arm, boxes that connect successive joints."""
+    """Return the boxes of an arm. For an unknown model, the boxes connect successive joints."""
     if model == RV_1A:
         return PIECES
     chain = model.chain() if isinstance(model, ClosedFormArm) else model
@@ -83,9 +90,9 @@ def make_pieces(model: ClosedFormArm | JointChain) -> tuple[Piece, ...]:
 def rounded_box(
     size_m: tuple[float, float, float], centre_m: tuple[float, float, float], bevel: float = 0.18
 ) -> tuple[Floats, NDArray[np.int32]]:
-    """Make a box with bevelled edges: vertices (24, 3) and counter-clockwise triangles (44, 3).
+    """Return vertices (24, 3) and counter-clockwise triangles (44, 3) of a box with bevelled edges.
 
-    bevel: fraction of the smallest half side that is cut off.
+    bevel: ratio of the bevel to half of the shortest side.
     """
     half = 0.5 * np.array(size_m)
     cut = bevel * half.min()
@@ -97,10 +104,9 @@ def rounded_box(
 
 
 def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Make the mesh of the bar from the flange to its clamp: vertices (n, 3), triangles (m, 3).
+    """Return vertices (n, 3), m, and triangles (t, 3) of the bar from the flange to its clamp.
 
-    flange_from_clamp_m: centre of the clamp (3,) in the flange frame. The bar reaches into the
-    flange and the clamp, so that no gap is visible.
+    flange_from_clamp_m (3,): centre of the clamp in the flange frame.
     """
     reach_m = np.abs(flange_from_clamp_m)
     vertices, triangles = rounded_box(
@@ -110,6 +116,7 @@ def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDAr
 
 
 def make_hull(points: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Return vertices and counter-clockwise triangles of the convex hull of points (n, 3)."""
+    """Return vertices (k, 3) and counter-clockwise triangles (t, 3) of the hull of points (n,
+    3)."""
     hull = trimesh.convex.convex_hull(points)
     return np.asarray(hull.vertices), np.asarray(hull.faces, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Render the banner of the page: the state of the arms, the remedy, and what the view shows."""
+"""Render the banner of the page: the state of the arms, a remedy, and the source of the view."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexsheet.nodes.console.panels import MODES, make_paragraph
 
 
 class BannerState(IntEnum):
-    """State that the banner shows; if several apply, the last one in this list has priority."""
+    """The state that the banner shows. If several states apply, the largest value has priority."""
 
     READY = 0
     WAITING = 1
@@ -29,7 +29,7 @@ GROUNDS = {
     BannerState.FAULT: "bad",
     BannerState.ESTOP: "bad",
 }
-"""CSS class of the banner's background for each state, in page.css."""
+"""The suffix of the CSS class in page.css that sets the banner's background, for each state."""
 
 FAULTY_MODES: tuple[ArmMode, ...] = ("fault", "estop", "disconnected")
 STILL_STOPPED = "the arms are still stopped"
@@ -37,11 +37,12 @@ STILL_STOPPED = "the arms are still stopped"
 
 @dataclass(frozen=True, slots=True)
 class GraphState:
-    """State of the graph from which the banner is made.
+    """The state of the graph that the banner describes.
 
-    arms: states of the arms by side. estop_reason: None without an e-stop. overload: sentence about
-    an overloaded computer, or empty. solver_note: note of the soft-body solver while it has no
-    result for this scene. replay: name of the bag that is shown, if any.
+    scene: name of the scene. arms: states of the arms by side. estop_reason: reason of the e-stop,
+    or None. sheet: newest target, or None. overload: sentence about an overloaded computer, or
+    empty. solver_note: note of the soft-body solver while it has no result for the scene, or empty.
+    replay: name of the replayed bag, or None.
     """
 
     scene: str
@@ -54,14 +55,14 @@ class GraphState:
 
     @property
     def stopped(self) -> str | None:
-        """Return the reason of the engaged e-stop; None if it is not engaged."""
+        """Return the reason of the engaged e-stop, or None if it is not engaged."""
         if self.estop_reason is None and any(arm.mode == "estop" for arm in self.arms.values()):
             return STILL_STOPPED
         return self.estop_reason
 
     @property
     def banner(self) -> BannerState:
-        """Return the state with the highest priority of those that apply."""
+        """Return the applicable state with the highest priority."""
         if self.stopped is not None:
             return BannerState.ESTOP
         if any(map(is_faulty, self.arms.values())):
@@ -97,7 +98,7 @@ def render(state: GraphState) -> str:
     if state.replay is not None:
         source = (
             f"<b>REPLAY</b> of {escape(state.replay)}, scene {scene}: the 3D view shows the bag, "
-            "this window the running graph."
+            "and this window shows the running graph."
         )
     text = " ".join([source, *(escape(one) for one in sentences if one)])
     return (
@@ -133,21 +134,21 @@ def _describe(side: str, arm: ArmState) -> str:
 
 
 def _remedy(state: GraphState, shown: BannerState) -> str:
-    """Return what the user can do; empty if no action is necessary."""
+    """Return a sentence about the necessary action of the user, or an empty text."""
     arms = state.arms.values()
     if shown is BannerState.ESTOP:
         return f"Release the stop when the arms are at rest; {_after_reset(state)}."
     if shown is BannerState.FAULT:
         if any(arm.path_blocked and not arm.faults for arm in arms):
             return (
-                "Lower Tension or Size, choose another scene, or move the finger; "
-                "the arms then search for a path again."
+                "Lower Tension or Size, choose another scene, or move the finger. "
+                "The arms then search for a path again."
             )
         if all(arm.mode == "disconnected" for arm in arms if is_faulty(arm)):
-            return "Check the power and the cable of the arm; it reconnects automatically."
+            return "Check the power and the cable of the arm. The arm reconnects automatically."
         return f"Remove the cause, then press Reset the fault; {_after_reset(state)}."
     if shown is BannerState.WAITING and any(_awaits_user(arm) for arm in arms):
-        return "The arms stay at rest until: flexsheet arms enable."
+        return "The arms stay at rest until you run: flexsheet arms enable."
     return ""
 
 
@@ -158,11 +159,11 @@ def _awaits_user(arm: ArmState) -> bool:
 def _after_reset(state: GraphState) -> str:
     if state.arms and all(arm.auto_arming for arm in state.arms.values()):
         return "the arms then move immediately"
-    return "the arms then stay at rest until: flexsheet arms enable"
+    return "the arms then stay at rest until you run: flexsheet arms enable"
 
 
 def _explain(state: GraphState, shown: BannerState) -> str:
-    """Return why arms without a fault do not follow the finger, or else the state of the sheet."""
+    """Return the reason why an arm without fault does not follow, or the state of the sheet."""
     if shown is BannerState.ESTOP:
         return ""
     for side, arm in state.arms.items():

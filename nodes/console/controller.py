@@ -1,4 +1,4 @@
-"""Carry out the requests of the console page's viewers, in the console node's asyncio loop.
+"""Execute the requests of the console page's viewers in the console node's asyncio loop.
 
 The "eye view" is the image that a user sees: a camera in the simulator traces the projected frame
 from the position of the user's eye.
@@ -32,27 +32,31 @@ from flexsheet.nodes.console.state_file import ConsoleState, load_state, save_st
 Publish = Callable[[Message], None]
 
 SETTLE_S = 0.4
-"""Time that a slider must rest before the changed scene is published."""
+"""The time that a slider must rest before the changed scene is published, in seconds."""
 
 EYE_VIEW_PERIOD_S = 6.0
 PIXELS_EVERY = 3
 MAX_DRAWING_S = 5.0
-"""Time after which the console stops waiting for the renderer to draw a frame."""
+"""The maximum time for which the console waits for a frame of the renderer, in seconds."""
 
 CAPTURE_S = 1.0
-"""Time after a frame within which the simulated eye receives all its inputs."""
+"""The time after a frame within which the simulated eye receives all its inputs, in seconds."""
 
 MAX_TRACING_S = 120.0
-"""Time after which the console stops waiting for the traced image of the eye view."""
+"""The maximum time for which the console waits for the traced image of the eye view, in seconds."""
 
 DEFAULT_BOOKMARK = "bookmark"
 MAX_LABELS = 64
-"""Number of requests whose images are still shown if they arrive late."""
+"""The number of requests whose images are still shown if they arrive late."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sliders:
-    """Positions of the page's sliders; `young_modulus_pa` is None for a rigid object."""
+    """The positions of the page's sliders.
+
+    young_modulus_pa: Young's modulus of the object; None for a rigid object. stretch_ratio: minimum
+    stretch ratio of the sheet. size_ratio: size of the object, relative to the scene file.
+    """
 
     young_modulus_pa: float | None
     stretch_ratio: float
@@ -70,7 +74,7 @@ class Sliders:
 
 
 class SceneController:
-    """Controller of the graph's scene, which the viewer selects and changes by sliders."""
+    """The controller of the graph's scene, which viewers select and change by sliders."""
 
     def __init__(
         self,
@@ -81,7 +85,8 @@ class SceneController:
     ) -> None:
         """Start with the scene `first`.
 
-        sliders: slider positions saved by the previous console process; None if they were never
+        publish: function that publishes a scene. folder: folder of the scenes to choose from.
+        sliders: slider positions that the previous console process saved; None if no slider was
         moved.
         """
         self._publish, self._folder = publish, folder
@@ -93,20 +98,21 @@ class SceneController:
         self._picker_task: asyncio.Task[None] | None = None
 
     def choose(self, name: str) -> None:
-        """Change to another scene of this run's launch file.  Raises SceneChoiceError."""
+        """Change to another scene of the run. Raise SceneChoiceError for an unknown name."""
         self.base, self.moved = scenes.load(self._folder, name), False
         self.sliders = Sliders.from_scene(self.base)
         self._send(self.base)
 
     def slide(self, now_s: float, **changes: float) -> None:
-        """Store a slider's position; `apply_sliders` publishes the scene when the sliders rest."""
+        """Store slider positions, from which `apply_sliders` publishes a scene later."""
         self.sliders = replace(self.sliders, **changes)
         self._due_s = now_s + SETTLE_S
 
     def apply_sliders(self, now_s: float) -> bool:
-        """Publish the changed scene once the sliders have rested; return whether it was published.
+        """Publish the changed scene if the sliders have rested, and return whether it was
+        published.
 
-        Raises SceneChoiceError.
+        Raise SceneChoiceError for invalid slider positions.
         """
         if self._due_s is None or now_s < self._due_s:
             return False
@@ -127,9 +133,9 @@ class SceneController:
         self._publish(self.scene)
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
-        """Prepare, in a thread, the picking of object points by which the viewer moves the finger.
+        """Prepare in a thread the selection of object points, by which viewers move the finger.
 
-        failed: called with the cause if the object does not allow it.
+        failed: function that receives the cause if points of the object cannot be selected.
         """
         if self._picker_task is not None:
             self._picker_task.cancel()
@@ -142,7 +148,7 @@ class SceneController:
         try:
             finger.use(await asyncio.to_thread(SurfacePicker, scene))
         except ValueError as error:
-            failed(f"the finger cannot be moved over this object: {error}")
+            failed(f"the finger cannot be moved over this object: {error}; choose another scene")
 
     async def close(self) -> None:
         if self._picker_task is not None:
@@ -151,7 +157,7 @@ class SceneController:
 
 
 class EyeViewState(Enum):
-    """State of a request for an eye view."""
+    """The state of a request for an eye view."""
 
     RESTING = auto()
     DRAWING = auto()
@@ -159,12 +165,12 @@ class EyeViewState(Enum):
 
 
 class EyeViewRequester:
-    """Requester of eye views: asks for one frame with pixels, which the simulated eye then traces.
+    """A requester of eye views, the images that a user sees.
 
-    Tracing takes one second of processor time, and longer on a busy computer, so only one image is
-    requested at a time. Once the simulated eye has its inputs, the display settings that another
-    writer had published are restored. If there are none, the image correction of the scene or of
-    the console is restored.
+    For each view, it requests one frame with pixels from the renderer, which the simulated eye then
+    traces. Only one image is requested at a time, because tracing takes a second of processor time.
+    When the simulated eye has its inputs, the display settings of another writer are restored.
+    Without such settings, the image correction of the scene or of the console is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
@@ -181,34 +187,34 @@ class EyeViewRequester:
 
     @property
     def label(self) -> str:
-        """Return the label of the newest view request, which the frame that answers it repeats."""
+        """Return the label of the newest request, which the requested frame also contains."""
         return f"console {self._number}"
 
     @property
     def correction(self) -> Correction:
-        """Return the image correction that was chosen at the console, or else that of the scene."""
+        """Return the image correction that was chosen at the console or specified by the scene."""
         return resolve_method(self.chosen_correction, self._by_scene, "two_pass")
 
     def waited_s(self, now_s: float) -> float:
-        """Return the time since the last change of state, s."""
+        """Return the time since the last change of state, in seconds."""
         return now_s - self._since_s
 
     def on_scene(self, scene: Scene) -> None:
-        """Take over the image correction that a new scene specifies.
+        """Use the image correction that a new scene specifies.
 
         A renderer that has received a display message ignores the correction of later scenes. If
-        the console sent that message, it must therefore publish the new correction.
+        the console sent the display message, this method therefore publishes the new correction.
         """
         self._by_scene = scene.methods.correction
         if self._owns_display and not self._borrowed:
             self._restore_display()
 
     def on_others_display(self, display: Display) -> None:
-        """Store display settings of another writer, to restore them after an eye view."""
+        """Store the display settings of another writer, which are restored after an eye view."""
         self._others_display, self._owns_display = display, False
 
     def advance(self, now_s: float) -> None:
-        """Request the next eye view if it is due, and give up a request that takes too long."""
+        """Request the next eye view if it is due, and abandon a request that takes too long."""
         waited_s = self.waited_s(now_s)
         match self.state:
             case EyeViewState.RESTING:
@@ -248,7 +254,7 @@ class EyeViewRequester:
             self._enter(EyeViewState.TRACING, now_s)
 
     def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """Process a traced image; return whether this console requested it, even if it is late."""
+        """Process a traced image, and return whether this console has requested it."""
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
         return eye.label in self._labels
@@ -269,7 +275,11 @@ class EyeViewRequester:
 
 
 class Replay:
-    """Replay of a bag on the page, instead of the running graph; nothing is published."""
+    """The replay of a bag on the page, which publishes no messages.
+
+    timeline: opened bag, or None. playing: whether the replay advances. rate: ratio of recorded
+    time to real time.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -278,11 +288,14 @@ class Replay:
         self.rate = 1.0
 
     def bags(self) -> list[str]:
-        """Return the names of the bags in the folder, the newest first."""
+        """Return the names of the bags in the folder, starting with the newest bag."""
         return list_bags(self._folder)
 
     def open(self, name: str) -> None:
-        """Open the named bag in the bag folder and play it from its start.  Raises BagError."""
+        """Open a bag of the folder by its name, and play it from its start.
+
+        Raise BagError for a file that is not a readable bag.
+        """
         self.timeline = Timeline(self._folder / name)
         self.playing = True
 
@@ -291,18 +304,18 @@ class Replay:
         self.timeline, self.playing = None, False
 
     def seek(self, seconds: float) -> None:
-        """Jump to a time in the bag (s from its start), clipped to its duration."""
+        """Jump to a time since the start of the bag, limited to the duration of the bag."""
         if self.timeline is not None:
             self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
 
     def play_or_pause(self) -> None:
-        """Pause, or continue from the current position; from the end, start again."""
+        """Pause or continue the replay. At the end of the bag, start from the beginning."""
         if self.timeline is not None and self.timeline.seconds >= self.timeline.duration_s:
             self.seek(0.0)
         self.playing = not self.playing
 
     def advance(self, duration_s: float) -> None:
-        """Advance the replay by this duration (s); stop at the end of the bag."""
+        """Advance the replay by a duration of real time, and stop at the end of the bag."""
         if self.timeline is None or not self.playing:
             return
         self.seek(self.timeline.seconds + self.rate * duration_s)
@@ -312,7 +325,7 @@ class Replay:
 
 @dataclass(frozen=True, slots=True)
 class ConsoleFiles:
-    """Paths that a console uses: the run's plan and scenes, the bags, and the saved state."""
+    """The paths of the run's plan, the scenes, the bags, and the saved state of a console."""
 
     plan: Path
     scenes: Path
@@ -321,7 +334,10 @@ class ConsoleFiles:
 
 
 class ReleaseError(FlexsheetError, ValueError):
-    """Raised if this console's host may not reset an e-stop; the text names the hosts that may."""
+    """An error that is raised if the host of the console may not reset an e-stop.
+
+    The text names the hosts that may reset it.
+    """
 
     code = "release"
     remedy = (
@@ -331,10 +347,10 @@ class ReleaseError(FlexsheetError, ValueError):
 
 
 class ConsoleController:
-    """Main controller of the console; also publishes e-stops, recording commands and bookmarks.
+    """The main controller of the console, which also publishes e-stops, recordings and bookmarks.
 
-    A restarted console continues with the scene, the sliders and the recording of its run. warn:
-    called with the cause if it cannot continue with them.
+    A restarted console continues with the saved scene, sliders and recording. warn:
+    function that receives the cause if the saved state cannot be used.
     """
 
     def __init__(
@@ -359,28 +375,28 @@ class ConsoleController:
         self.stopped: str | None = None
 
     def begin(self) -> None:
-        """Publish the latched messages again, because they are lost when their publisher exits."""
+        """Publish the latched messages again, which were lost when the previous process exited."""
         self.scenes.publish_current()
         if self.recording:
             self._publish(Recording(running=True))
 
     def stop(self, reason: str) -> None:
-        """Engage the e-stop."""
+        """Engage the e-stop of both arms, and publish the reason."""
         self.stopped = reason
         self._publish(EStop(engaged=True, reason=reason))
 
     def release(self) -> None:
-        """Reset the e-stop; raises ReleaseError if the nodes ignore resets from this host."""
+        """Reset the e-stop. Raise ReleaseError if the nodes ignore resets from this host."""
         if others := self.facts.others_may_reset:
             raise ReleaseError(
-                f"this console's host {NodeNote.MAY_NOT_RESET.phrase}; "
+                f"the host of this console {NodeNote.MAY_NOT_RESET.phrase}; "
                 f"use {' or '.join(others)}, or set may_reset_estop of this host in the launch file"
             )
         self.stopped = None
         self._publish(EStop(engaged=False, reason="reset at the console"))
 
     def record(self, running: bool) -> None:
-        """Start or stop recording."""
+        """Start or stop the recording of a bag."""
         self.recording = running
         self._publish(Recording(running=running))
         self.save_state()
@@ -397,7 +413,7 @@ class ConsoleController:
         self.save_state()
 
     def save_state(self) -> None:
-        """Save the scene, sliders and recording, with which a restarted console continues."""
+        """Save the scene, the sliders, the recording and the finger for a restarted console."""
         scenes = self.scenes
         state = ConsoleState(
             base=scenes.base,
@@ -409,9 +425,9 @@ class ConsoleController:
 
 
 def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> ConsoleState:
-    """Load the state of the previous console.
+    """Load the state of the previous console, or make a state with the first scene of the plan.
 
-    If there is none, make a state with the first scene.
+    warn: function that receives the cause if the saved state is invalid.
     """
     try:
         state = load_state(files.state)

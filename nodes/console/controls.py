@@ -1,7 +1,7 @@
-"""Wrap viser's controls (GUI elements) for all tabs of the page.
+"""Wrap the controls (GUI elements) of viser for all tabs of the page.
 
-Every callback runs on viser's own threads and only passes a request to the node. viser's type stubs
-do not declare that values can be set, so handles have the type Any.
+Every callback runs on a thread of viser and only passes a request to the node. Handles have the
+type Any, because the type stubs of viser do not declare that values can be set.
 """
 
 from __future__ import annotations
@@ -10,20 +10,18 @@ from collections.abc import Callable
 from typing import Any
 
 Request = Callable[..., None]
-"""Function request(name, *values), which passes a viewer's request to the node from any thread."""
+"""A function request(name, *values) that passes a viewer's request to the node from any thread."""
 
 
 def make_callback(request: Request, name: str, *values: Any) -> Callable[[Any], None]:
-    """Return a callback that makes the request `name` with these values."""
+    """Return a callback that makes a request with a given name and values."""
     return lambda event: request(name, *values)
 
 
 def on_value(handle: Any, changed: Callable[[Any], None]) -> None:
-    """Call `changed` with each value that a viewer sets, but not with values that the page sets.
+    """Call `changed` with each value that a viewer sets, but not with values that the page sets."""
 
-    The callback is a coroutine on viser's loop, so that values arrive in order.
-    """
-
+    # A coroutine runs on viser's loop, so that values arrive in order.
     async def on_update(event: Any) -> None:
         if event.client_id is not None:
             changed(event.target.value)
@@ -32,16 +30,16 @@ def on_value(handle: Any, changed: Callable[[Any], None]) -> None:
 
 
 def show_value(handle: Any, value: Any) -> None:
-    """Set the value of a control if it differs."""
+    """Set the value of a control if it differs from the current value."""
     if handle.value != value:
         handle.value = value
 
 
 class Html:
-    """Piece of HTML on the page, which is sent only when it changes."""
+    """A piece of HTML on the page, which is sent only when it changes."""
 
-    def __init__(self, gui: Any, html: str = "") -> None:
-        self._handle, self._shown = gui.add_html(html), html
+    def __init__(self, gui: Any) -> None:
+        self._handle, self._shown = gui.add_html(""), ""
 
     def show(self, html: str) -> None:
         if self._shown != html:

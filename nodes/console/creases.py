@@ -10,14 +10,14 @@ from flexsheet.nodes.arrays import Floats
 Triangles = NDArray[np.int32]
 
 CREASE_RAD = 0.7
-"""Minimum angle between the normals of two adjacent triangles whose edge counts as sharp."""
+"""The minimum angle between the normals of two triangles at a sharp edge."""
 
 
 def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.int64], Triangles]:
     """Duplicate the vertices at sharp edges, so that each side of an edge has its own vertices.
 
-    vertices: (n, 3). triangles: (t, 3). Return the index (k,) of the original vertex for each of
-    the k >= n new vertices, and the triangles (t, 3) with indices of the new vertices.
+    vertices (n, 3), triangles (t, 3): mesh. Return the index (k,) of the original vertex for each
+    of the k new vertices, and the triangles (t, 3) with indices of the new vertices.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -25,7 +25,7 @@ def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.in
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     normals = np.cross(b - a, c - a)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-    # Corner i of triangle t has index 3 t + i; its edge leads to the triangle's next corner.
+    # Corner i of triangle t has the index 3 t + i. Its edge ends at the next corner.
     corners = np.arange(triangles.size)
     after = corners - corners % 3 + (corners + 1) % 3
     start, end = triangles.ravel()[corners], triangles.ravel()[after]

@@ -19,16 +19,18 @@ IMAGES = (
 
 
 class EyeTab:
-    """Tab with the images that the simulated eye sees; each is hidden until it exists."""
+    """The tab with the images that the simulated eye sees, which are hidden until they exist."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._enabled = gui.add_checkbox(
-            "Render images", False, hint="One image every six seconds; each one loads the graph"
+            "Render images",
+            False,
+            hint="Render an image every six seconds, which loads the computer",
         )
         self._correction = gui.add_dropdown(
             "Correction",
             CORRECTIONS,
-            hint="Correction of the sheet's tilt and deflection; the best one is first",
+            hint="Correction for the sheet's tilt and deflection. The first method is the best",
         )
         on_value(self._enabled, lambda on: request("eye_view", on))
         on_value(self._correction, lambda name: request("correct", name))
@@ -40,7 +42,7 @@ class EyeTab:
         }
 
     def show_correction(self, correction: Correction) -> None:
-        """Show which image correction is active: the scene's or the one that a viewer chose."""
+        """Show the image correction that is active."""
         self._correction.value = correction
 
     def show_image(self, name: str, image: NDArray[np.uint8]) -> None:

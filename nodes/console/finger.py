@@ -1,4 +1,4 @@
-"""Control the simulated finger: move it step by step to the position that a viewer requests."""
+"""Move the simulated finger step by step to the position that a viewer requests."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
 
 LABEL = "console"
 FRONT_M = 1.5
-"""Distance from the imaginary screen at which rays from the front start, m."""
+"""The distance from the imaginary screen at which rays from the front start, in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ray:
-    """Ray in the world frame, which selects the first point on the object that it meets.
+    """A ray in the world frame that selects its first intersection with the object.
 
-    origin_m: (3,). direction: (3,), of any length. Raises ValueError for values that are not
+    direction: vector of any length except 0. Raise ValueError for values that are not
     finite, and for a direction of length 0.
     """
 
@@ -32,27 +32,28 @@ class Ray:
         length = float(np.linalg.norm(self.direction))
         if not (np.isfinite(self.origin_m).all() and np.isfinite(length) and length > 0.0):
             raise ValueError(
-                f"ray from {self.origin_m}: direction {self.direction} is not finite or is zero"
+                f"ray from {self.origin_m}: the direction {self.direction} must be finite and must "
+                "not be zero; drag on the sheet again"
             )
 
     @property
     def is_from_front(self) -> bool:
-        """Return whether the ray points along the negative z axis (away from the user)."""
+        """Return whether the ray has the direction of the negative z axis, away from the user."""
         return self.direction[:2] == (0.0, 0.0) and self.direction[2] < 0.0
 
     @classmethod
     def from_front(cls, x_m: float, y_m: float) -> Ray:
-        """Return the ray along the negative z axis through (x, y)."""
+        """Return the ray along the negative z axis through the point (x, y)."""
         return cls((x_m, y_m, FRONT_M), (0.0, 0.0, -1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class FingerIntent:
-    """Finger position that a viewer requests.
+    """The finger position that a viewer requests.
 
-    position: ray that selects the point on any object. depth_m: depth below the surface, used
-    unless lifted. lifted: whether the finger hovers above the point. Raises ValueError for an
-    invalid depth.
+    position: ray that selects the point on any object. depth_m: depth of a lowered finger below the
+    surface. lifted: whether the finger hovers above the point. Raise ValueError for a negative
+    depth or a depth that is not finite.
     """
 
     position: Ray = field(default_factory=lambda: Ray.from_front(0.0, 0.0))
@@ -62,21 +63,22 @@ class FingerIntent:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.depth_m) and self.depth_m >= 0.0):
             raise ValueError(
-                f"depth: expected a finite number of at least 0 m, found {self.depth_m}"
+                f"depth_m: {self.depth_m} must be a finite number of at least 0; move the slider "
+                "Push again"
             )
 
     def target_m(self, picker: SurfacePicker) -> Floats:
-        """Return the requested position (3,) of the fingertip on an object."""
+        """Return the requested position (3,) of the fingertip on an object, world frame, m."""
         origin, direction = np.array(self.position.origin_m), np.array(self.position.direction)
         return picker.pick(origin, direction, -HOVER_M if self.lifted else self.depth_m)
 
 
 class FingerController:
-    """Controller that moves the simulated finger to the requested position at a limited speed.
+    """A controller that moves the simulated finger to the requested position at a limited speed.
 
-    Each step is published as a path of one point. Nothing is published before the viewer's first
-    command, so that other programs can control the finger. commanded: whether a viewer has moved
-    the finger. position_m: requested position (x, y) as seen from the front.
+    Each step is published as a path of one point. The controller publishes nothing before the first
+    command of a viewer, so that other programs can control the finger. commanded: whether a viewer
+    has moved the finger. position_m: requested position (x, y) as seen from the front.
     """
 
     def __init__(self, publish: Callable[[Message], None], *, speed_m_per_s: float) -> None:
@@ -90,7 +92,10 @@ class FingerController:
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
-        """Replace the object; picker: finder of surface points, None if the shape is unknown."""
+        """Replace the object.
+
+        picker: selector of points on the object; None if the shape is unknown.
+        """
         self._picker = picker
         self._update_target()
 
@@ -100,23 +105,23 @@ class FingerController:
         self._update_target()
 
     def touch(self, origin: Floats, direction: Floats) -> None:
-        """Push at the point where a ray from the viewer's eye meets the object."""
+        """Push at the point at which a ray from the viewer's eye meets the object.
+
+        origin, direction (3,): ray in the world frame, m.
+        """
         position = Ray(tuple(map(float, origin)), tuple(map(float, direction)))  # type: ignore[arg-type]  # three each
         self._request(position=position, lifted=False)
 
     def move_to(self, x_m: float, y_m: float) -> None:
-        """Move to (x, y) as seen from the front, m; the finger stays lifted or keeps pushing."""
+        """Move to a position (x, y) as seen from the front, without a change of the depth."""
         self._request(position=Ray.from_front(x_m, y_m))
 
     def push(self, depth_m: float) -> None:
-        """Push to this depth (m) at the requested position."""
+        """Push to a depth below the surface at the requested position."""
         self._request(depth_m=depth_m, lifted=False)
 
-    def lift(self) -> None:
-        """Lift the finger above the requested position."""
-        self._request(lifted=True)
-
     def lift_or_lower(self) -> None:
+        """Lift the finger above the requested position, or lower a lifted finger."""
         self._request(lifted=not self.intent.lifted)
 
     def _request(self, **changes: object) -> None:
@@ -135,9 +140,10 @@ class FingerController:
                 self.position_m = float(target[0]), float(target[1])
 
     def advance(self, duration_s: float, measured: Floats | None) -> bool:
-        """Publish the next step towards the target, if any; return whether it was the last step.
+        """Publish the next step towards the target, and return whether it was the last step.
 
-        measured: measured position of the finger (3,); None if unknown.
+        duration_s: duration of the step. measured (3,): measured position of the finger, m; None if
+        it is unknown.
         """
         if self._target is None or self._picker is None or self._arrived:
             if measured is not None:

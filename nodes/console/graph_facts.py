@@ -14,11 +14,11 @@ from flexsheet.nodes import NodeRole
 
 @dataclass(frozen=True, slots=True)
 class GraphFacts:
-    """Facts about the graph that are constant while the console runs.
+    """The facts about the graph that are constant while the console runs.
 
-    others_may_reset: other hosts that may reset an e-stop; empty if the console's own host may.
-    recorders: names of the recorder nodes. records_on_request: whether a recorder waits for the
-    topic `recording`. solvers: names of the nodes that publish the skin of the soft object.
+    others_may_reset: other hosts that may reset an e-stop; empty if the console's own host may
+    reset it. recorders: names of the recorder nodes. records_on_request: whether a recorder waits
+    for the topic `recording`. solvers: names of the nodes that publish the skin of the soft object.
     consoles: names of the console nodes.
     """
 
@@ -30,7 +30,10 @@ class GraphFacts:
 
     @classmethod
     def from_plan(cls, plan_file: Path, console: str) -> Self:
-        """Read the plan of the run.  console: name of the console's node."""
+        """Read the facts from the plan of the run.
+
+        console: name of the console's node.
+        """
         plan = json.loads(plan_file.read_text())
         nodes, hosts = plan["nodes"], tuple(plan["estop_resetters"])
         skins = {name for name, topic in TOPICS.items() if topic.message is Skin}

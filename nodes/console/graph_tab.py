@@ -13,12 +13,12 @@ from flexsheet.nodes.console.history import SERIES, WINDOW_S, widen_isolated
 
 
 class GraphTab:
-    """Chart of latencies, whose lines differ by colour and dashes, with tables below it."""
+    """The tab with a chart of latencies and tables of latencies, topics and nodes."""
 
     def __init__(self, gui: Any) -> None:
         gui.add_html(
-            '<p class="fs-words"><b>Latency, ms</b>, over the last half minute, s; the table '
-            "below explains the lines</p>"
+            '<p class="fs-words"><b>Latency, ms</b>, during the last half minute. The table below '
+            "explains the lines.</p>"
         )
         lines = tuple(
             {"label": name, "stroke": line.color, "width": 2, "dash": line.dash, "spanGaps": False}
@@ -52,7 +52,10 @@ def _scales(top_ms: float) -> dict[str, Any]:
 
 
 def max_latency_ms(columns: tuple[Floats, ...]) -> float:
-    """Return the upper end of the chart's scale: the next larger one of 1, 2, 5, 10, ... ms."""
+    """Return the upper end of the chart's scale, in ms: 1, 2, 5, 10 and so on.
+
+    columns: times (n,), s, and series (n,), ms.
+    """
     values = np.concatenate(columns[1:])
     largest = float(values[np.isfinite(values)].max(initial=1.0))
     decade = 10.0 ** np.floor(np.log10(largest))

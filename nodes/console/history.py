@@ -16,21 +16,22 @@ SERIES = ("finger found", "sheet placed", "body answered", "arm commanded", "fra
 
 
 class History:
-    """Samples of the time from the camera's exposure to each step of the processing, ms."""
+    """The samples of the latencies from the camera's exposure to each processing step, in ms."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, tuple[float, ...]]] = deque()
 
     def add(self, now_s: float, source: MessageSource) -> None:
-        """Add a sample; samples older than half a minute are dropped."""
+        """Add a sample, and remove samples that are older than half a minute."""
         self._samples.append((now_s, read_latencies_ms(source)))
         while self._samples and self._samples[0][0] < now_s - WINDOW_S:
             self._samples.popleft()
 
     def columns(self) -> tuple[Floats, ...]:
-        """Return the samples' times relative to the latest one (s, <= 0), and each series in ms.
+        """Return the times of the samples, in seconds relative to the latest sample, and all
+        series.
 
-        Missing values are NaN.
+        The series (n,) are in ms and contain NaN for missing values.
         """
         if not self._samples:
             return (np.zeros(1), *(np.full(1, np.nan) for _ in SERIES))
@@ -40,7 +41,8 @@ class History:
         return (times, *values.T)
 
     def latest_and_max(self) -> dict[str, tuple[float, float]]:
-        """Return the latest sample and the maximum of each series, ms; NaN if there is none."""
+        """Return the latest sample and the maximum of each series, in ms, or NaN without
+        samples."""
         found = {}
         for name, values in zip(SERIES, self.columns()[1:], strict=True):
             valid = values[np.isfinite(values)]
@@ -49,10 +51,10 @@ class History:
 
 
 def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
-    """Return the columns with values repeated so that even an isolated one is drawn.
+    """Repeat isolated values of a chart, because the chart draws only lines between values.
 
-    A value without a neighbour is repeated at the previous sample. A single sample is repeated half
-    a second earlier.
+    columns: times (n,), s, and series (n,). A value between missing values is repeated at the
+    previous sample. A single sample is repeated half a second earlier.
     """
     times, *series = columns
     if len(times) == 1:
@@ -72,7 +74,7 @@ def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
 def read_latencies_ms(source: MessageSource) -> tuple[float, ...]:
     """Return the time (ms) from the exposure to the newest message of each processing step.
 
-    NaN if there is no message. For the arms, the time ends when the resulting command was sent.
+    A value is NaN if there is no message. The time of the arms ends when the command was sent.
     """
     found = []
     for name, kind in (

@@ -1,8 +1,8 @@
 """Add the console's style and script to the head of viser's page.
 
 viser's page has sliders without names, folders that no key opens, labels with too little contrast,
-and only a red dot for a lost connection. The console's two files correct this. A page without a
-head element is served unchanged.
+and only a red dot for a lost connection. The files page.css and page.js correct these defects. A
+page without a head element is served unchanged.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ HEAD_END = b"</head>"
 
 
 def inject_assets(response: Response) -> Response:
-    """Add style and script to a response if it is an HTML page; otherwise return it unchanged."""
+    """Add style and script to the response of an HTML page. Return other responses unchanged."""
     kind = response.headers.get("Content-Type", "")
     if response.status_code != 200 or not kind.startswith("text/html"):
         return response

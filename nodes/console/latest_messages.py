@@ -13,17 +13,20 @@ M = TypeVar("M", bound=Message)
 
 
 class MessageSource(Protocol):
-    """Interface of a source of the displayed messages: the running graph, or a bag."""
+    """The interface of a source of the displayed messages, the running graph or a bag."""
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the latest message of the topic with its header; None before the first message."""
+        """Return the latest message of a topic with its header, or None before the first message.
+
+        Raise TypeError if the message does not have the type `kind`.
+        """
         ...
 
 
 class LatestMessages:
-    """Store of the latest message of each topic, which is decoded when it is first read.
+    """A store of the latest message of each topic, which is decoded when it is first read.
 
-    refused: called with the topic and the error if a message cannot be decoded.
+    refused: function that receives the topic and the error if a message cannot be decoded.
     """
 
     def __init__(self, refused: Callable[[Topic, WireError], None]) -> None:
@@ -32,13 +35,16 @@ class LatestMessages:
         self._refused = refused
 
     def put(self, name: str, frames: Any) -> bool:
-        """Store a message's frames; return whether they replaced frames that had not been read."""
+        """Store the frames of a message, and return whether they replaced unread frames."""
         unread = name in self._frames
         self._frames[name] = frames
         return unread
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the latest message; see `MessageSource`."""
+        """Return the latest message of a topic with its header, or None before the first message.
+
+        Raise TypeError if the message does not have the type `kind`.
+        """
         frames = self._frames.pop(name, None)
         if frames is not None:
             topic = find_topic(name)
@@ -50,10 +56,13 @@ class LatestMessages:
 
 
 def check_type(entry: tuple[Message, Header] | None, kind: type[M]) -> tuple[M, Header] | None:
-    """Return the entry if its message has the type `kind`; raises TypeError otherwise."""
+    """Return an entry unchanged. Raise TypeError if its message does not have the type `kind`."""
     if entry is None:
         return None
     message, header = entry
     if not isinstance(message, kind):
-        raise TypeError(f"expected {kind.__name__}, found {type(message).__name__}")
+        raise TypeError(
+            f"expected a message of the type {kind.__name__}, found {type(message).__name__}; "
+            "request the type of the topic"
+        )
     return message, header

@@ -1,4 +1,4 @@
-"""Serve a web page that shows the running graph with all devices, and controls it."""
+"""Serve a web page that shows and controls the running graph with all devices."""
 
 from __future__ import annotations
 
@@ -27,41 +27,41 @@ TOPICS_READ = {
     *("fingertip", "sheet_target", "arm_left", "arm_right", "skin", "soft_body"),
     *("frame", "twin/eye", "status", "host", "estop", "display"),
 }
-"""Topics that the console reads if a node of the graph writes them."""
+"""The topics that the console reads if a node of the graph writes them."""
 
 
 class ConsoleParameters(NodeParameters):
-    """Address of the page, its update rates and its files."""
-
-    address: str = Field(default="127.0.0.1", description="IP address of the page")
+    address: str = Field(default="127.0.0.1", description="IP address of the page.")
     page_port: ListenPort = Field(
-        default=8080, description="TCP port of the page; 0: any free port"
+        default=8080, description="TCP port of the page. 0: any free port."
     )
     token_file: Path | None = Field(
         default=None,
-        description="file with the token that viewers need; required unless on loopback",
+        description="File with the token that viewers need. It is required unless the address is "
+        "loopback.",
     )
-    rate_hz: Positive = Field(default=25.0, description="update rate of the 3D view")
-    tables_hz: Positive = Field(default=2.0, description="update rate of tables and charts")
+    rate_hz: Positive = Field(default=25.0, description="Update rate of the 3D view, Hz.")
+    tables_hz: Positive = Field(default=2.0, description="Update rate of tables and charts, Hz.")
     control_finger: bool = Field(
-        default=True, description="whether viewers move the simulated finger"
+        default=True, description="Whether viewers can move the simulated finger."
     )
     finger_speed_m_per_s: Positive = Field(
-        default=0.15, description="maximum speed of the simulated finger"
+        default=0.15, description="Maximum speed of the simulated finger, m/s."
     )
     bags: Path = Field(
-        default=Path("runs"), description="folder with the bags that can be replayed"
+        default=Path("runs"), description="Folder with the bags that viewers can replay."
     )
     plan: Path = Field(
         default=Path("@run/plan.json"),
-        description="plan file of the run, which contains the first scene",
+        description="Plan file of the run, which contains the first scene.",
     )
     scenes: Path = Field(
-        default=Path("@run/scenes"), description="folder with the scenes to choose from"
+        default=Path("@run/scenes"),
+        description="Folder with the scenes from which viewers can choose.",
     )
     state_file: Path = Field(
         default=Path("@run/console-state.json"),
-        description="file in which a restarted console finds its state",
+        description="File from which a restarted console loads its state.",
     )
 
     @field_validator("address")
@@ -71,21 +71,21 @@ class ConsoleParameters(NodeParameters):
             return str(ip_address(address))
         except ValueError:
             raise ValueError(
-                f'"{address}" is not an IP address; use for example 127.0.0.1'
+                f'address: "{address}" is not an IP address; use for example 127.0.0.1'
             ) from None
 
     @model_validator(mode="after")
     def _has_access_control(self) -> Self:
         if self.token_file is None and not ip_address(self.address).is_loopback:
             raise ValueError(
-                f"address {self.address} is not loopback: set token_file, "
+                f"address {self.address} is not loopback and requires a token; set token_file, "
                 "or use 127.0.0.1 with ssh -L"
             )
         return self
 
 
 class Console(Node):
-    """Node that serves the page; while there are viewers, it reads messages at its own rates."""
+    """The node that serves the page, and reads messages at its own rates while it has viewers."""
 
     takes_frames: ClassVar[bool] = True
     opens_devices: ClassVar[bool] = True
@@ -141,7 +141,8 @@ class Console(Node):
         await asyncio.to_thread(self._server.stop)
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
-        """Store messages until they are drawn; decode them at once where all are needed."""
+        """Store a message until it is drawn, or process it if all messages of its topic are
+        needed."""
         source = self.inputs[port]
         source.counts.count(header, self.clock.now_ns())
         superseded = self._latest.put(source.topic.name, message)
@@ -154,7 +155,7 @@ class Console(Node):
 
     @periodic("rate_hz")
     def draw(self) -> None:
-        """Update the 3D view and everything on the page that moves."""
+        """Update the 3D view and all moving elements of the page."""
         now_s = self.clock.now_ns() * 1e-9
         viewers = len(self._server.get_clients())
         self.note = f"{self.url}, viewers: {viewers}"
@@ -171,7 +172,7 @@ class Console(Node):
         next(out for out in self.outputs.values() if out.topic.message is kind).publish(message)
 
     def _request(self, name: str, *values: Any) -> None:
-        """Pass a viewer's request to the node's loop; called on any thread."""
+        """Pass a viewer's request to the node's loop. Any thread may call this method."""
         self._loop.call_soon_threadsafe(self._call, self.operator.handle_request, name, *values)
 
     def _call(self, function: Any, *values: Any) -> None:

@@ -1,4 +1,4 @@
-"""Connect the page with the running graph: pass on viewers' requests, and show messages."""
+"""Connect the page with the running graph: execute viewers' requests, and show messages."""
 
 from __future__ import annotations
 
@@ -40,27 +40,27 @@ from flexsheet.nodes.console.scene_view import LAYERS
 from flexsheet.nodes.console.snapshot import compute_snapshot
 
 MAX_WIDTH_PX = 340
-"""Maximum width of the images on the page."""
+"""The maximum width of the images on the page."""
 
 BAG_LIST_PERIOD_S = 5.0
 MAX_STEP_S = 0.2
-"""Maximum time step of the finger and the replay, so that they do not jump after a pause."""
+"""The maximum time step of the finger and the replay, which prevents jumps after a pause."""
 
 SIDES = ("left", "right")
 BOOKMARKS_SHOWN = 5
 REPLAYED = (
-    "the page shows a replay, but the finger is part of the running graph: first press "
-    '"Back to the running graph" in Record'
+    "the page shows a replay, but the finger is part of the running graph; first press "
+    '"Back to the running graph" in the tab Record'
 )
-MEASURED = "this graph measures a real finger; the console can only move a simulated finger"
+MEASURED = "this graph measures a real finger, which the console cannot move; move the real finger"
 NO_RECORDER = (
-    "this graph has no recorder that the console can start: start the graph with --console, or "
-    "set the parameter start_paused: true of its recorder"
+    "this graph has no recorder that the console can start; start the graph with --console, or "
+    "set the parameter start_paused of its recorder to true"
 )
 
 
 class Operator:
-    """Mediator between the page and the running graph, in the console node's asyncio loop."""
+    """The mediator between the page and the running graph, in the console node's asyncio loop."""
 
     def __init__(
         self,
@@ -75,8 +75,8 @@ class Operator:
     ) -> None:
         """Build the page.
 
-        name: name of the console's node. with_finger: whether the graph simulates the finger, so
-        that the mouse can move it. with_eye: whether the graph simulates the eye.
+        name: name of the console's node. with_finger: whether the mouse can move the finger,
+        because the graph simulates the finger. with_eye: whether the graph simulates the eye.
         """
         self._name, self._live, self.controller = name, live, controller
         self._with_finger, self._with_eye = with_finger, with_eye
@@ -120,11 +120,11 @@ class Operator:
 
     @property
     def source(self) -> MessageSource:
-        """Return the source of the displayed messages: a replayed bag or the running graph."""
+        """Return the source of the displayed messages, a replayed bag or the running graph."""
         return self.controller.replay.timeline or self._live
 
     def handle_request(self, name: str, *values: Any) -> None:
-        """Execute a request of a viewer; show an error on the page."""
+        """Execute a request of a viewer, and show errors on the page."""
         try:
             self._handlers[name](*values)
         except (ValueError, BagError) as error:
@@ -138,7 +138,7 @@ class Operator:
         self._page.show_problem(str(error))
 
     def on_message(self, message: Message, header: Header, now_s: float) -> None:
-        """Process a message of a topic on which every message is needed, not only the newest."""
+        """Process a message of a topic of which every message is needed, not only the newest."""
         if isinstance(message, Status):
             self._statuses[message.node] = (message, now_s)
         elif isinstance(message, HostStatus):
@@ -154,7 +154,7 @@ class Operator:
                 self._page.eye.show_image(name, downsample_image(image))
 
     def advance(self, now_s: float, has_viewers: bool) -> None:
-        """Advance finger, sliders and replay by one step; update the page if it has viewers."""
+        """Advance finger, sliders and replay by one step, and update the page if it has viewers."""
         step_s = min(now_s - self._now_s, MAX_STEP_S)
         self._now_s, controller = now_s, self.controller
         finger = self._live.latest("fingertip", Fingertip) if has_viewers else None
@@ -263,7 +263,7 @@ class Operator:
         )
 
     def _solver_note(self) -> str:
-        """Return the solver's note until the skin of this scene arrives; then an empty text."""
+        """Return the note of the soft-body solver, or an empty text if the skin has arrived."""
         skin = self._live.latest("skin", Skin)
         if skin is not None and skin[1].source_ns >= self._sent_ns:
             return ""
@@ -290,7 +290,7 @@ class Operator:
     def _command_finger(self, command: Callable[..., None], *values: Any) -> None:
         """Pass a command to the finger's controller.
 
-        Raises ValueError if the command is refused; the page then shows the unchanged state.
+        Raise ValueError if the command is refused. The page then shows the unchanged state.
         """
         finger = self.controller.finger
         self._finger_shown_s = self._now_s + SETTLE_S
@@ -342,7 +342,7 @@ class Operator:
             self.controller.record(True)
 
     def _show_bags(self) -> None:
-        """List the bags, the newest first, and select one that was just recorded."""
+        """List the bags on the page, and select a bag that was just recorded."""
         bags = self.controller.replay.bags()
         recorded = next((bag for bag in bags if bag not in self._bags_before), None)
         self._page.record.show_bags(bags, recorded if self._awaits_bag else None)
@@ -354,7 +354,7 @@ class Operator:
             raise ValueError(NO_RECORDER)
         if facts.records_on_request and not self.controller.recording:
             raise ValueError(
-                "recording is off, so the bookmark would be lost: start recording first"
+                "recording is off, so the bookmark would be lost; start recording first"
             )
         label = self.controller.add_bookmark(label)
         self._bookmarks = (*self._bookmarks, label)[-BOOKMARKS_SHOWN:]
@@ -371,6 +371,6 @@ class Operator:
 
 
 def downsample_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Downsample an image by taking every nth pixel, so that it is at most `MAX_WIDTH_PX` wide."""
+    """Downsample an image (height, width, 3) to a width of at most `MAX_WIDTH_PX`."""
     step = -(-image.shape[1] // MAX_WIDTH_PX)
     return np.ascontiguousarray(image[::step, ::step])

@@ -5,12 +5,12 @@
 
   const STOP = "E-STOP";
   const LOST =
-    "No connection to the console. The page is out of date, and its e-stop does nothing: " +
-    "use the e-stop of the arms.";
+    "There is no connection to the console. The page is out of date, and its e-stop does nothing. " +
+    "Use the e-stop of the arms.";
 
   const VIEW =
-    "3D view of arms, sheet, object and finger. Arrow keys rotate it, W, A, S, D, Q, E move it; the " +
-    "sliders under Touch move the finger.";
+    "3D view of arms, sheet, object and finger. The arrow keys rotate the view. The keys W, A, S, D, " +
+    "Q and E move the view. The sliders in the tab Touch move the finger.";
 
   // viser reads the dark mode from the address only.
   const asked = new URLSearchParams(location.search);

@@ -24,7 +24,7 @@ MAIN_WIDTH, STOP_WIDTH = 380, 320
 
 
 class Page:
-    """All panels of the page; the `Operator` updates their contents."""
+    """The panels of the page next to the 3D view."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class Page:
     ) -> None:
         """Build the panels.
 
-        others_may: other hosts that may reset an e-stop; empty if the console's host may.
+        others_may: other hosts that may reset an e-stop; empty if the console's host may reset it.
         """
         self._gui: Any = server.gui
         self._request, self._others_may = request, others_may
@@ -87,7 +87,7 @@ class Page:
         self.eye.show_correction(controller.eye_view.correction)
 
     def show_problem(self, text: str) -> None:
-        """Show an error; an empty text removes it."""
+        """Show an error, or remove the shown error if the text is empty."""
         self._problem.show(panels.problem(text))
 
     def show_state(self, state: GraphState) -> None:

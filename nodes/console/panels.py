@@ -17,10 +17,10 @@ from flexsheet.nodes.console.controller import EyeViewState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_RATIO = 0.5
-"""Fraction of a topic's minimum rate below which the topic is reported as slow."""
+"""The fraction of a topic's minimum rate below which the topic is reported as slow."""
 
 MAX_STATUS_AGE_S = 3.0
-"""Age of the last status message above which a node is reported as silent."""
+"""The age of the last status message above which a node is reported as silent, in seconds."""
 
 MODES = {
     "starting": "starting",
@@ -33,12 +33,15 @@ MODES = {
     "relax": "relaxing the sheet",
     "estop": "stopped",
 }
-"""Texts for the modes of an arm."""
+"""The texts for the modes of an arm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """Line style of a series in a chart: colour on light and dark pages, and dashes (px)."""
+    """The line style of a series in a chart.
+
+    color: colour, which is visible on light and dark pages. dash: lengths of dashes and gaps, px.
+    """
 
     color: str
     dash: tuple[int, ...] = ()
@@ -60,7 +63,10 @@ def _mark(kind: tuple[str, str], text: str) -> str:
 def _table(
     caption: str, head: Iterable[str], rows: Iterable[Iterable[str]], *, numbers: Iterable[int] = ()
 ) -> str:
-    """Make an HTML table. numbers: indices of right-aligned columns."""
+    """Make an HTML table.
+
+    numbers: indices of the columns that are aligned to the right.
+    """
     alignments = dict.fromkeys(numbers, ' class="fs-number"')
     heads = "".join(
         f'<th scope="col"{alignments.get(i, "")}>{escape(one)}</th>' for i, one in enumerate(head)
@@ -85,7 +91,7 @@ def make_paragraph(html: str) -> str:
 def make_latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
     """Make the legend of the latency chart, with the values of each series.
 
-    latencies: latest and maximum value (ms) by the name of the series; NaN if there is none.
+    latencies: latest and maximum value (ms) by the name of the series; NaN for a missing value.
     """
     rows = []
     for line, (name, (newest, worst)) in zip(LINES, latencies.items(), strict=True):
@@ -101,7 +107,7 @@ def make_latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
 
 
 def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
-    """Make the table of the nodes: state, processor load, last error or note.
+    """Make the table of the nodes with state, processor load, and last error or note.
 
     statuses: latest status of each node and its age (s), by the name of the node.
     """
@@ -130,10 +136,10 @@ def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
 def make_topics_table(
     statuses: Mapping[str, tuple[Status, float]], sampling_readers: Collection[str] = ()
 ) -> str:
-    """Make the table of the topics: rate, maximum age at the readers, and lost messages.
+    """Make the table of the topics with rate, maximum age at the readers, and lost messages.
 
-    statuses: see `make_nodes_table`. sampling_readers: nodes that skip messages by design and are
-    therefore not counted as readers.
+    statuses: latest status of each node and its age (s), by the name of the node. sampling_readers:
+    nodes that skip messages by design and are therefore not counted as readers.
     """
     written: dict[str, list[PortStatus]] = {}
     read: dict[str, list[PortStatus]] = {}
@@ -169,13 +175,14 @@ def make_topics_table(
         rows.append((escape(name), state, rate, oldest, str(dropped), str(lost)))
     head = ("topic", "state", "Hz", "age, ms", "skipped", "lost")
     return _table("Topics", head, rows, numbers=(2, 3, 4, 5)) + make_paragraph(
-        "Age: time since the exposure, maximum of the readers. Skipped: replaced by a newer "
-        "message before it was read. Lost: in transit. Both since the start."
+        "Age: maximum time since the exposure over all readers. Skipped: messages that a newer "
+        "message replaced before they were read. Lost: messages lost in transit. Both numbers "
+        "count from the start."
     )
 
 
 def finger(fingertip: Fingertip | None) -> str:
-    """Describe the fingertip's position, or why it is unknown, in a box of constant height."""
+    """Describe the position of the fingertip, or the reason why it is unknown, as HTML."""
     return f'<div class="fs-finger">{make_paragraph(_finger(fingertip))}</div>'
 
 
@@ -195,14 +202,15 @@ def _finger(fingertip: Fingertip | None) -> str:
 def eye(
     *, possible: bool, enabled: bool, state: EyeViewState, waited_s: float, ago_s: float | None
 ) -> str:
-    """Describe the state of the images that show what the user's eye sees.
+    """Describe the state of the eye view, the image that the user's eye sees, as HTML.
 
+    possible: whether the graph has a simulated eye. enabled: whether viewers requested images.
     waited_s: duration of `state`. ago_s: age of the latest image; None if there is no image.
     """
     if not possible:
         return make_paragraph("This graph has no simulated eye (a node of type twin_eye).")
     if not enabled:
-        return make_paragraph("Tick the box to show images of the user's eye.")
+        return make_paragraph("Tick the box to show the images that the user's eye sees.")
     last = "" if ago_s is None else f" The last image is {ago_s:.0f} s old."
     match state:
         case EyeViewState.DRAWING:
@@ -223,9 +231,9 @@ def eye(
 
 
 def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
-    """Describe the state of the recorder and the newest bookmarks.
+    """Describe the state of the recorder and the newest bookmarks as HTML.
 
-    note: status note of the recorder node; None if there is no recorder.
+    note: status note of the recorder node; None if there is no recorder. bookmarks: labels.
     """
     if note is None:
         return make_paragraph(_mark(WARN, "this graph has no recorder"))
@@ -234,7 +242,7 @@ def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
 
 
 def problem(text: str) -> str:
-    """Make the box that shows an error; an empty text removes the box."""
+    """Make the HTML of the box that shows an error, or an empty text if there is no error."""
     if not text:
         return ""
     sentence = escape(text[:1].upper() + text[1:])

@@ -1,4 +1,5 @@
-"""Compute the fingertip position that the mouse selects on the object, and the path to it."""
+"""Compute the fingertip position that the mouse selects on the object, and the path to the
+position."""
 
 from __future__ import annotations
 
@@ -13,14 +14,14 @@ MAX_RAY_M = 3.0
 SURFACE_TOLERANCE_M = 1e-4
 MAX_STEPS = 64
 MIN_STEP_RATIO = 0.01
-"""Minimum length of a step around an object, as a fraction of a full step."""
+"""The minimum length of a step around an object, as a fraction of a full step."""
 
 HOVER_M = 0.03
-"""Height of a lifted finger above the object's surface."""
+"""The height of a lifted finger above the object's surface."""
 
 
 class SurfacePicker:
-    """Picker of points on a scene's object; building one for a mesh takes a second."""
+    """A selector of points on the object of a scene. Its construction takes a second for a mesh."""
 
     def __init__(self, scene: Scene) -> None:
         self._world_from_object = pose_matrix(scene.object.world_from_object)
@@ -31,9 +32,10 @@ class SurfacePicker:
     def pick(self, origin: Floats, direction: Floats, depth_m: float) -> Floats:
         """Return the fingertip position (3,) that a ray from the viewer's eye selects.
 
-        If the ray meets the object, this is the point `depth_m` below the surface along the normal
-        (negative: above). If it misses the object, it is the ray's point nearest to the object, but
-        at least at that height. direction: (3,), not zero.
+        If the ray meets the object, the position is `depth_m` below the surface along the normal. A
+        negative depth is above the surface. If the ray misses the object, the position is the point
+        of the ray nearest to the object, but not below `depth_m`. origin (3,), m, direction (3,),
+        not zero: ray in the world frame.
         """
         direction = direction / np.linalg.norm(direction)
         travelled, nearest_m, nearest = 0.0, np.inf, origin
@@ -52,19 +54,20 @@ class SurfacePicker:
         )
 
     def offset_point(self, near: Floats, depth_m: float) -> Floats:
-        """Return the point `depth_m` below the surface point nearest to `near`.
+        """Return the point (3,) at a depth below the surface point nearest to `near` (3,), m.
 
-        A negative depth gives a point above the surface.
+        A negative depth results in a point above the surface.
         """
         found = self._shape.closest(apply(self._object_from_world, near))
         inside = found.point - depth_m * found.normal
         return self._within(apply(self._world_from_object, inside))
 
     def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
-        """Return the next point (3,) on the way to the target, within `max_step_m` of the finger.
+        """Return the next point (3,) of the finger on a path to the target, m.
 
-        The step goes no deeper into the object than `depth_m` or than the finger already is. If a
-        step around the object makes no progress, the step is straight.
+        The step is at most `max_step_m` long and reaches no deeper into the object than `depth_m`
+        or than the current finger. If a step around the object makes no progress, the step is
+        straight.
         """
         across = target - finger
         distance = float(np.linalg.norm(across))

@@ -14,11 +14,11 @@ PLAY_RATES = ("0.1", "0.25", "0.5", "1", "2", "4")
 NO_BAG = "(no bag)"
 NO_BOOKMARK = "-"
 RECORDING_COLOR = (146, 64, 14)
-"""Colour of the recording button; it differs from that of the e-stop."""
+"""The colour of the recording button, which differs from the colour of the e-stop."""
 
 
 class RecordTab:
-    """Controls for recording and replay; the timeline is visible while a bag is shown."""
+    """The controls for recording and replay. The timeline is visible while a bag is shown."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._request = request
@@ -64,7 +64,7 @@ class RecordTab:
     def show_bags(self, names: Sequence[str], recorded: str | None = None) -> None:
         """List the bags.
 
-        recorded: bag to select, because it was just recorded.
+        recorded: bag that was just recorded and is selected, or None.
         """
         options = tuple(names) or (NO_BAG,)
         if self._bag.options != options:
@@ -75,7 +75,7 @@ class RecordTab:
     def show_replay(self, replay: Replay, *, opened: bool = False) -> None:
         """Show the current time in the replayed bag.
 
-        opened: whether a different bag, or none, is shown from now on.
+        opened: whether the shown bag has changed.
         """
         timeline = replay.timeline
         if opened:

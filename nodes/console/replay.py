@@ -1,4 +1,4 @@
-"""Read a bag for the page: the newest message of each topic up to a time in the bag."""
+"""Read the newest message of each topic up to a selected time in a bag, for the page."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ MAX_CHUNKS = 6
 
 
 class Timeline:
-    """Reader that returns the state of a recording at a selected time.
+    """A reader that returns the state of a recording at a selected time.
 
-    seconds: selected time since the start of the bag, s. Raises BagError if the file is not a bag
+    seconds: selected time since the start of the bag. Raise BagError if the file is not a bag
     or contains no topic that the page shows.
     """
 
@@ -33,7 +33,10 @@ class Timeline:
         self.duration_s, self._start_ns = summary.duration_s, summary.start_ns
         self._readable = {one.name for one in summary.topics if one.readable and one.count}
         if not self._readable & {"arm_left", "arm_right", "fingertip", "soft_body"}:
-            raise BagError(f"{path}: contains no topic that the page shows, for example arm_left")
+            raise BagError(
+                f"{path}: the bag contains no topic that the page shows, such as arm_left; choose "
+                "another bag"
+            )
         self._channels = {one.topic: one.id for one in self._reader.channels.values()}
         self._positions = {name: self._times(name) for name in self._readable}
         self._chunks: OrderedDict[int, dict[tuple[int, int], Record]] = OrderedDict()
@@ -42,7 +45,11 @@ class Timeline:
         self.seconds = 0.0
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the last message at or before `seconds`; see `latest_messages.MessageSource`."""
+        """Return the last message of a topic at or before the selected time, with its header.
+
+        kind: type of the message. Return None if there is no such message, and raise TypeError for
+        another type.
+        """
         times, _ = self._positions.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
         if i < 0:
@@ -66,11 +73,14 @@ class Timeline:
         times, chunks = self._positions[name]
         record = self._records(chunks[i]).get((self._channels[name], times[i]))
         if record is None:
-            raise BagError(f'{self.path}: topic "{name}": its index points to no message')
+            raise BagError(
+                f'{self.path}: topic "{name}": the index of the bag refers to a missing message; '
+                "the file is damaged, choose another bag"
+            )
         return self._reader.open_record(self._reader.channels[self._channels[name]], record)
 
     def _records(self, chunk: Chunk) -> dict[tuple[int, int], Record]:
-        """Return a chunk's messages by channel and log time; the most recent chunks are cached."""
+        """Return the messages of a chunk by channel and log time (ns), and cache recent chunks."""
         cached = self._chunks.get(chunk.offset)
         if cached is None:
             with self.path.open("rb") as file:
@@ -87,7 +97,7 @@ class Timeline:
         return cached
 
     def _find_bookmarks(self) -> list[tuple[float, str]]:
-        """Return the bookmarks in the bag as (seconds from the start, label)."""
+        """Return the time since the start (s) and the label of each bookmark in the bag."""
         found = []
         for i, time_ns in enumerate(self._positions.get("bookmark", ([], []))[0]):
             message, _ = self._open("bookmark", i)
@@ -97,7 +107,7 @@ class Timeline:
 
 
 def list_bags(folder: Path) -> list[str]:
-    """List the bags in a folder, the newest first."""
+    """List the bags in a folder and its subfolders, starting with the newest bag."""
     found = [path for path in folder.glob("**/*.mcap") if path.is_file()]
     found.sort(key=lambda path: path.stat().st_mtime, reverse=True)
     return [str(path.relative_to(folder)) for path in found]

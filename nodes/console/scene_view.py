@@ -19,7 +19,7 @@ from flexsheet.nodes.console.arms import (
     rounded_box,
 )
 from flexsheet.nodes.console.creases import split_creases
-from flexsheet.nodes.console.sheet import COLUMNS, ROWS, compute_sheet_points, make_sheet_triangles
+from flexsheet.nodes.console.sheet import COLUMNS, ROWS, TRIANGLES, compute_sheet_points
 from flexsheet.nodes.console.snapshot import (
     SceneSnapshot,
     rays,
@@ -48,22 +48,20 @@ EYE: Color = (250, 250, 250)
 
 GRID: Color = (176, 181, 189)
 GRID_SECTION: Color = (128, 135, 146)
-"""Both grid colours are visible on light and dark pages."""
+"""The colours of the floor grid, which are visible on light and dark pages."""
 
 SHEET_LIFT_M, LINES_LIFT_M = 0.0006, 0.0009
-"""Distance by which the sheet and its lines are drawn nearer to the viewer.
-
-Without it, a flat object in the plane of the sheet would flicker, because both have equal depth.
-"""
+"""The distances by which the sheet and its lines are drawn nearer to the viewer. They prevent
+flicker of a flat object in the plane of the sheet."""
 
 LINES_EVERY = 5
 FINGER_LENGTH_M = 0.05
 FINGER_TILT_RAD = 0.6
 FINGER_NAME_M = (0.0, -0.06, 0.04)
-"""Position of the finger's name relative to its tip, below its end."""
+"""The position of the finger's name relative to the fingertip."""
 NAME_ABOVE_M = np.array([0.0, 0.05, 0.0])
 FLOOR_M = 0.02
-"""Distance of the drawn floor below the bases of the arms."""
+"""The distance of the drawn floor below the bases of the arms."""
 
 LAYERS = ("Arms", "Sheet", "Object", "Finger", "Rays", "Devices", "Names")
 EYE_VIEW = "the eye"
@@ -72,14 +70,16 @@ VIEWPOINTS: dict[str, tuple[Any, Any] | None] = {
     "near": ((0.13, 0.1, 0.6), (0.0, 0.0, 0.0)),
     EYE_VIEW: None,
 }
-"""Camera position and target of each view (world, m); None: between the user's eyes."""
+"""The camera position and the target of each view, world frame, m; None for a position between the
+user's eyes."""
 
 Drag = Callable[[Floats, Floats], None]
-"""Callback with a ray (origin, direction; world) from the viewer's eye through the pointer."""
+"""A callback that receives the origin (3,), m, and the direction (3,) of a ray, world frame, from
+the viewer's eye through the pointer."""
 
 
 class SceneView:
-    """The 3D view of the scene that all viewers see; `draw` sends changes to them."""
+    """The 3D view of the scene that all viewers see."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
@@ -99,7 +99,7 @@ class SceneView:
         server.initial_camera.fov = 0.75
 
     def look_from(self, client: viser.ClientHandle, name: str) -> None:
-        """Change one viewer's camera to the view of this name."""
+        """Change the camera of one viewer to a view of `VIEWPOINTS`."""
         viewpoint, scene = VIEWPOINTS[name], self._of_scene
         if viewpoint is None:
             if scene is None:
@@ -111,7 +111,7 @@ class SceneView:
             client.camera.position, client.camera.look_at = position, target
 
     def show_layer(self, layer: str, shown: bool) -> None:
-        """Show or hide a layer."""
+        """Show or hide a layer of the 3D view."""
         self._shown[layer] = shown
         for handle in self._layers.get(layer, []):
             handle.visible = shown
@@ -121,7 +121,7 @@ class SceneView:
                 handle.visible = self._shown["Arms"] and side in self._posed
 
     def set_scene(self, scene: Scene) -> None:
-        """Draw everything again after the scene has changed."""
+        """Draw all parts of the 3D view for a new scene."""
         self._scene.reset()
         self._layers = {layer: [] for layer in LAYERS}
         self._of_scene, self._skin_shape, self._posed = scene, None, set()
@@ -142,7 +142,10 @@ class SceneView:
         ]
 
     def set_skin(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
-        """Draw the object with this surface mesh; `rest`: vertices at rest."""
+        """Draw the object with the surface mesh of the soft-body solver.
+
+        rest (n, 3): vertices at rest, world frame, m. triangles (t, 3): vertex indices.
+        """
         self._skin_source, split = split_creases(rest, triangles)
         corners = _f32(rest[self._skin_source])
         self._object = self._add(
@@ -154,11 +157,11 @@ class SceneView:
         self._make_touchable(self._object)
 
     def on_touch(self, touched: Drag, released: Callable[[], None]) -> None:
-        """Set the callbacks for a press or drag on the sheet or object, and for its end."""
+        """Set the callbacks for the start or continuation, and for the end, of a press or drag."""
         self._touched, self._released = touched, released
 
     def draw(self, snapshot: SceneSnapshot) -> None:
-        """Update all poses and meshes in the view to a snapshot of the messages."""
+        """Update all poses and meshes of the 3D view to a snapshot of the messages."""
         scene = self._of_scene
         if scene is None:
             return
@@ -215,7 +218,10 @@ class SceneView:
         )
 
     def _add_arm(self, side: str, arm: ArmSpec, height_m: float) -> list[Any]:
-        """Add the frames and boxes of an arm's seven links, its bracket and its clamp."""
+        """Add the frames and boxes of an arm's links, bracket and clamp, and return the frames.
+
+        height_m: height of the sheet.
+        """
         frames = [
             self._add("Arms", self._scene.add_frame(f"/{side}/{link}", show_axes=False))
             for link in range(7)
@@ -258,7 +264,7 @@ class SceneView:
             self._scene.add_mesh_simple(
                 "/sheet",
                 _f32(lift_sheet(points, SHEET_LIFT_M)),
-                make_sheet_triangles(),
+                TRIANGLES,
                 color=SHEET,
                 opacity=0.5,
                 side="double",
@@ -313,7 +319,7 @@ class SceneView:
             )
 
     def _add_names(self, scene: Scene) -> None:
-        """Add name labels above the devices; those of finger and sheet move with them."""
+        """Add the name labels of the devices, the finger and the sheet."""
         camera = scene.camera
         baseline_m = -float(camera.right_from_left[0, 3])
         centre = apply(pose_matrix(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0]))
@@ -384,7 +390,7 @@ class SceneView:
 
 
 def lift_sheet(points: Floats, lift_m: float) -> Floats:
-    """Move the sheet's points (n, 3) towards the user along the sheet's mean normal."""
+    """Move the points (n, 3) of the sheet towards the user along its mean normal, m."""
     first, last = points[0], points[-1]
     right, left = points[COLUMNS - 1], points[-COLUMNS]
     normal = np.cross(right - left, last - first)
@@ -392,15 +398,14 @@ def lift_sheet(points: Floats, lift_m: float) -> Floats:
 
 
 def make_line_segments(points: Floats) -> Floats:
-    """Return segments (n, 2, 3) along every fifth row and column of the sheet's grid of points."""
+    """Return segments (k, 2, 3) along every fifth row and column of the sheet's points (n, 3)."""
     grid = points.reshape(ROWS, COLUMNS, 3)
-    rows, columns = grid[::LINES_EVERY], grid[:, ::LINES_EVERY].swapaxes(0, 1)
-    lines = np.concatenate([rows, columns]) if ROWS == COLUMNS else rows
+    lines = np.concatenate([grid[::LINES_EVERY], grid[:, ::LINES_EVERY].swapaxes(0, 1)])
     return np.stack([lines[:, :-1], lines[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
 def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
-    """Make a fingertip mesh: vertices (n, 3), with the tip at the origin, and triangles."""
+    """Return vertices (n, 3), m, and triangles (t, 3) of a fingertip with its tip at the origin."""
     tilt = np.linspace(0.0, 0.5 * np.pi, 8)
     radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m, 0.0]])
     ends = [FINGER_LENGTH_M, FINGER_LENGTH_M + 0.4 * radius_m]

@@ -17,18 +17,18 @@ from flexsheet.nodes.models.shapes import GEOMETRIES
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
 
 MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
-"""Minimum and step of the slider for the sheet's tension (stretch ratio)."""
+"""The minimum and the step of the slider for the sheet's tension, as stretch ratios."""
 
 
 class SceneChoiceError(FlexsheetError, ValueError):
-    """Raised for a scene that cannot be used; the text gives the reason."""
+    """An error that is raised for a scene that cannot be used."""
 
     code = "scene-choice"
     remedy = "Choose a scene with the devices of the running one."
 
 
 def first_scene(plan_file: Path) -> Scene:
-    """Return the scene of the run's plan; raises SceneChoiceError if the plan has none."""
+    """Return the scene of the run's plan. Raise SceneChoiceError if the plan has no scene."""
     values = json.loads(plan_file.read_text())["scene"]
     if values is None:
         raise SceneChoiceError('the launch file has no scene; set its key "scene" for the console')
@@ -40,7 +40,7 @@ def list_scene_names(folder: Path) -> list[str]:
 
 
 def load(folder: Path, name: str) -> Scene:
-    """Load a scene from the run's folder by its name; raises SceneChoiceError."""
+    """Load a scene of the run's folder. Raise SceneChoiceError for an unknown name."""
     names = list_scene_names(folder)
     if name not in names:
         raise SceneChoiceError(f'unknown scene "{name}"; choose one of: {", ".join(names)}')
@@ -52,8 +52,9 @@ def edit_scene(
 ) -> Scene:
     """Change the object's stiffness, the sheet's minimum stretch and the object's size.
 
-    The front of the object stays where it is; the object grows away from the user. A rigid object
-    stays rigid. Raises SceneChoiceError for invalid values.
+    The front of the object stays in place, and the object grows away from the user. size_ratio:
+    size relative to the size in `scene`. A rigid object stays rigid. Raise SceneChoiceError for
+    invalid values.
     """
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
@@ -74,7 +75,8 @@ def edit_scene(
         if stretch_ratio > limit + STRETCH_STEP:
             raise SceneChoiceError(
                 f"tension: {100 * (stretch_ratio - 1):.1f} % is above {100 * (limit - 1):.1f} %, "
-                "the limit of this scene (max_stretch_ratio and max_edge_force_n of its sheet)"
+                "the limit by max_stretch_ratio and max_edge_force_n of the scene's sheet; lower "
+                "the tension"
             )
         values["sheet"] = _with(sheet, min_stretch_ratio=min(stretch_ratio, limit))
         return Scene(**values)
@@ -85,7 +87,7 @@ def edit_scene(
 
 
 def max_stretch_ratio(scene: Scene) -> float:
-    """Return the upper end of the tension slider, from the scene's limits of stretch and force."""
+    """Return the upper end of the tension slider as a stretch ratio, from limits of the scene."""
     sheet = scene.sheet
     strongest = stretch_for_edge_force(sheet.max_edge_force_n, sheet)
     limit = min(sheet.max_stretch_ratio, strongest)
@@ -100,17 +102,21 @@ def _with(part: Any, **changes: Any) -> Any:
 
 
 def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
-    """Scale a shape about its origin; a plane is returned unchanged."""
+    """Scale a shape about its origin. A plane is returned unchanged.
+
+    Raise SceneChoiceError for a ratio that is not a positive number.
+    """
     if not (np.isfinite(ratio) and ratio > 0.0):
-        raise SceneChoiceError(f"size: factor {ratio} is not a positive number")
+        raise SceneChoiceError(
+            f"size: the factor {ratio} is not a positive number; move the slider Size again"
+        )
     changes = GEOMETRIES[geometry.shape].scale(geometry, ratio)
     return _with(geometry, **changes)  # type: ignore[no-any-return]  # of the same type
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """Return how far the touchable surface extends from its origin towards the user (world z), m.
+    """Return the extent (m) of the touchable surface from its origin towards the user (world z).
 
-    world_from_object: rotation (3, 3). For a cylinder only the curved surface counts, because its
-    ends are not touched.
+    world_from_object (3, 3): rotation. The ends of a cylinder are not touchable.
     """
     return GEOMETRIES[geometry.shape].extent_m(geometry, world_from_object[2])

@@ -1,7 +1,7 @@
-"""Compute the sheet that the page draws: a ruled surface between its edges, with a finger's dent.
+"""Compute the sheet that the page draws: a ruled surface that a finger deflects like a soap film.
 
-The deflection is that of a soap film, for display only. `flexsheet.nodes.models.sheet` contains the
-mechanics of the sheet.
+This deflection is for display only. `flexsheet.nodes.models.sheet` contains the mechanics of the
+sheet.
 """
 
 from __future__ import annotations
@@ -13,17 +13,19 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse
+from flexsheet.nodes.models.shapes.triangles import triangulate_grid
 from flexsheet.nodes.models.sheet import corners, sheet_from_edges
 
-Indices = NDArray[np.int32]
-
 COLUMNS, ROWS = 41, 41
+TRIANGLES = triangulate_grid(ROWS, COLUMNS)
+"""The triangles (t, 3) of the sheet's grid, counter-clockwise as seen by the user."""
 MIN_EDGE_DISTANCE_M = 0.05
 NEAR = 6
-"""Number of cells on each side of a vertex that are tested for the hit of a ray."""
+"""The number of rows and columns of cells around a vertex that are tested for an intersection with
+a ray."""
 
 MIRRORED = 2
-"""Number of mirror images of the finger in each free edge."""
+"""The number of mirror images of the finger beyond each free edge."""
 
 
 def compute_sheet_points(
@@ -34,9 +36,11 @@ def compute_sheet_points(
     fingertip: Floats | None,
     finger_radius_m: float,
 ) -> Floats | None:
-    """Compute vertices (ROWS * COLUMNS, 3) in the world frame: rows upwards, columns to the right.
+    """Compute the vertices (ROWS * COLUMNS, 3) of the drawn sheet, world frame, m.
 
-    fingertip: (3,), or None. Returns None if the edges are too close to each other.
+    Rows follow each other upwards, and columns to the right. The poses (4, 4) are those of the
+    sheet's edges. fingertip (3,): world frame, m, or None. Return None if the distance of the edges
+    is less than `MIN_EDGE_DISTANCE_M`.
     """
     left, right = world_from_left_edge, world_from_right_edge
     width_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
@@ -62,10 +66,10 @@ def film(
 ) -> Floats:
     """Compute the deflection (n,) of a film clamped at x = +-width / 2, per depth of the finger.
 
-    x, y: points (n,). The film solves Laplace's equation for a point force in an infinite strip,
-    whose Green's function is known in closed form from a conformal map. The free edges at y =
-    +-height / 2 are modelled by mirror images of the finger. Within `radius_m` of the finger the
-    deflection is 1.
+    x, y (n,): points, m. finger: position (x, y), m. size_m: width and height. The deflection
+    solves Laplace's equation for a point force in an infinite strip, whose Green's function is
+    known from a conformal map. Mirror images of the finger model the free edges at y = +-height /
+    2. Within `radius_m` of the finger, the deflection is 1.
     """
     width_m, height_m = size_m
     finger_x, finger_y = finger
@@ -81,9 +85,9 @@ def film(
 
 
 def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
-    """Compute Green's function of Laplace's equation in |x| < pi / 2 for a source at (source_x, 0).
+    """Compute Green's function (n,) of Laplace's equation in the strip |x| < pi / 2.
 
-    The result is not normalized.
+    The source is at (source_x, 0). x, y (n,): points. The result is not normalized.
     """
     high = np.cosh(np.minimum(np.abs(y), 30.0))
     near = np.maximum(high - np.cos(x - source_x), 1e-12)
@@ -92,32 +96,23 @@ def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
 
 @lru_cache(maxsize=1)
 def _fractions() -> tuple[Floats, Floats]:
-    """Return each vertex's position as fractions (n, 1) of the width and of the height, 0 to 1."""
+    """Return the position of each vertex as fractions (n, 1) of the width and of the height."""
     up, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
     return across.reshape(-1, 1), up.reshape(-1, 1)
 
 
-@lru_cache(maxsize=1)
-def make_sheet_triangles() -> Indices:
-    """Return triangles (2 * (ROWS - 1) * (COLUMNS - 1), 3), counter-clockwise for the user."""
-    index = np.arange(ROWS * COLUMNS, dtype=np.int32).reshape(ROWS, COLUMNS)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
-    lower, upper = np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)
-    return np.concatenate([lower.reshape(-1, 3), upper.reshape(-1, 3)])
-
-
 def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
-    """Compute where rays from `origin` (3,) in directions `towards` (n, 3) meet the sheet.
+    """Intersect rays from `origin` (3,) through the points `towards` (n, 3) with the sheet.
 
-    points: vertices from `compute_sheet_points`. A ray that misses gives NaN. The method of Moeller
-    and Trumbore (1997) is applied to the triangles around the vertex whose direction is nearest to
-    the ray.
+    points (ROWS * COLUMNS, 3): vertices of the sheet. Return the intersections (n, 3), which are
+    NaN for rays that miss the sheet. Only triangles near the vertex whose direction is nearest to
+    the ray are tested. Source: Moeller and Trumbore 1997.
     """
     direction = towards - origin
     directions = points - origin
     directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
     nearest = np.argmax(direction @ directions.T, axis=1)
-    triangles = make_sheet_triangles()[_around(nearest)]
+    triangles = TRIANGLES[_around(nearest)]
     a, b, c = (points[triangles[..., i]] for i in range(3))
     first, second, along = b - a, c - a, direction[:, None, :]
     across, away = np.cross(along, second), np.cross(origin - a, first)
@@ -133,7 +128,7 @@ def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
 
 
 def _around(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the indices (n, 2 * NEAR**2) of the triangles in the cells around vertices (n,)."""
+    """Return the indices (n, 2 * NEAR**2) of the triangles in the cells near vertices (n,)."""
     rows, columns = np.divmod(vertices, COLUMNS)
     cells = np.arange(-NEAR // 2, NEAR - NEAR // 2)
     row = np.clip(rows[:, None, None] + cells[None, :, None], 0, ROWS - 2)

@@ -1,6 +1,6 @@
 """Compute the contents of the 3D view at one time, as arrays in the world frame.
 
-"Skin" is the surface mesh of the soft object.
+The skin is the surface mesh of the soft object.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from flexsheet.nodes.console.sheet import compute_sheet_points, intersect_sheet
 from flexsheet.nodes.models.rigid import pose_matrix
 
 RAY_POSITIONS = (-0.55, 0.0, 0.55)
-"""Positions of the drawn light rays, as fractions of half the object's width and height."""
+"""The positions of the drawn light rays, as fractions of half the object's width and height."""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneSnapshot:
-    """Contents of the 3D view at one time; values that are not known yet are None.
+    """The contents of the 3D view at one time, in the world frame, m. Unknown values are None.
 
-    links: poses world_from_link (7, 4, 4) of each arm's links, by side. edges: pose world_from_edge
-    of each clamped edge, by side. sheet: points (n, 3) from `compute_sheet_points`. skin: deformed
-    vertices (n, 3). finger: fingertip (3,). finger_valid: whether the fingertip is tracked.
+    links: poses (7, 4, 4) of each arm's links, by side. edges: pose (4, 4)
+    of each clamped edge, by side. sheet (n, 3): points of the sheet. skin (s, 3): deformed
+    vertices. finger (3,): fingertip. finger_valid: whether the fingertip is tracked.
     """
 
     links: dict[str, Floats]
@@ -76,7 +76,7 @@ def _message(entry: tuple[Fingertip, Header] | None) -> Fingertip | None:
 
 
 def _skin(source: MessageSource) -> Floats | None:
-    """Return the deformed skin vertices; the skin at rest before the solver's first result."""
+    """Return the skin vertices (n, 3), m, at rest before the first result of the solver."""
     skin, body = source.latest("skin", Skin), source.latest("soft_body", SoftBody)
     if skin is None:
         return None
@@ -89,7 +89,7 @@ def _skin(source: MessageSource) -> Floats | None:
 def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
     """Select nine vertices at which light rays are drawn, in a grid on the user's side.
 
-    rest: vertices at rest. Return the indices (9,) of the vertices.
+    rest (n, 3): vertices at rest, m. Return the indices (9,) of the vertices.
     """
     low, high = rest.min(axis=0), rest.max(axis=0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -103,11 +103,11 @@ def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
 
 
 def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Compute the light rays that show points (n, 3) of the deformed skin.
+    """Compute the light rays through which the eye sees points (n, 3) of the deformed skin.
 
-    Return segments (m, 2, 3) from the eye to the sheet, and segments (m, 2, 3) from the sheet to
-    the projector. A point whose ray misses the sheet has no segments, nor has a scene without
-    projector.
+    sheet: points of the drawn sheet. Return segments (m, 2, 3) from the eye to the sheet, and
+    segments (m, 2, 3) from the sheet to the projector. A point whose ray misses the sheet has no
+    segments. The result is empty for a scene without projector.
     """
     if scene.projector is None:
         return np.empty((0, 2, 3)), np.empty((0, 2, 3))

@@ -13,10 +13,11 @@ from flexsheet.nodes.console.scenes import SceneChoiceError
 
 
 class ConsoleState(BaseModel):
-    """State of the console.
+    """The saved state of the console.
 
-    base: the selected scene. sliders: slider positions; None if not moved. recording: whether
-    recording was requested. finger: the requested finger position; None if nobody has moved it.
+    base: selected scene. sliders: slider positions; None if no slider was moved. recording: whether
+    recording was requested. finger: requested finger position; None if no viewer has moved the
+    finger.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -28,9 +29,9 @@ class ConsoleState(BaseModel):
 
 
 def load_state(path: Path) -> ConsoleState | None:
-    """Read the saved state; return None if there is no file.
+    """Read the saved state, or return None if there is no file.
 
-    Raises SceneChoiceError for an invalid file.
+    Raise SceneChoiceError for an invalid file.
     """
     try:
         return ConsoleState.model_validate_json(path.read_bytes())
@@ -39,10 +40,11 @@ def load_state(path: Path) -> ConsoleState | None:
     except (OSError, ValidationError) as error:
         first = str(error).splitlines()[0]
         raise SceneChoiceError(
-            f"{path}: invalid state, so the console starts with the first scene: {first}"
+            f"{path}: the saved state is invalid, so the console starts with the first scene; "
+            f"choose the scene again ({first})"
         ) from error
 
 
 def save_state(path: Path, state: ConsoleState) -> None:
-    """Write the state atomically."""
+    """Write the state of the console to a file atomically."""
     write_file(path, state.model_dump_json())

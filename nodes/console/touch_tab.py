@@ -19,14 +19,14 @@ LIFT, LOWER = "Lift the finger (L)", "Lower the finger (L)"
 
 
 class TouchTab:
-    """Controls of the finger, the scene and the view."""
+    """The controls of the finger, the scene and the view."""
 
     def __init__(self, gui: Any, request: Request, view: SceneView, *, with_finger: bool) -> None:
         self._gui, self._request, self._view = gui, request, view
         self._with_finger = with_finger
         gui.add_markdown(
-            "**Drag on the sheet** to stroke the object. Drag beside it to rotate the view, scroll "
-            "to zoom."
+            "**Drag on the sheet** to stroke the object. Drag beside the sheet to rotate the view. "
+            "Scroll to zoom."
             if with_finger
             else "The finger is measured, so it cannot be moved here."
         )
@@ -55,10 +55,15 @@ class TouchTab:
             MAX_OFFSET_MM,
             1.0,
             0.0,
-            hint="To the right of the centre of the screen",
+            hint="Distance of the finger to the right of the centre of the screen",
         )
         self._up = gui.add_slider(
-            "Up, mm", -MAX_OFFSET_MM, MAX_OFFSET_MM, 1.0, 0.0, hint="Above the centre of the screen"
+            "Up, mm",
+            -MAX_OFFSET_MM,
+            MAX_OFFSET_MM,
+            1.0,
+            0.0,
+            hint="Distance of the finger above the centre of the screen",
         )
         self._lift = gui.add_button(
             LOWER, hint="Lower the finger to the object, or lift it. Key: L"
@@ -82,10 +87,10 @@ class TouchTab:
         self._tension = gui.add_slider(
             "Tension, %",
             *(_percent(MIN_STRETCH_RATIO), 8.0, 0.1, 2.0),
-            hint="Minimum stretch of the sheet; the arms of this scene limit it",
+            hint="Minimum stretch of the sheet, which the scene limits",
         )
         self._size = gui.add_slider(
-            "Size, %", 50, 150, 1, 100, hint="Size of the object; its front side is fixed"
+            "Size, %", 50, 150, 1, 100, hint="Size of the object, whose front side stays in place"
         )
         on_value(self._scene, lambda name: request("choose", name))
         on_value(self._stiffness, lambda value: request("slide", "young_modulus_pa", 1e3 * value))
@@ -105,7 +110,8 @@ class TouchTab:
     def show_scene(self, scene: Scene, base: Scene, names: Sequence[str], sliders: Sliders) -> None:
         """Show the values of a scene in the controls.
 
-        base: the scene before the sliders changed it.
+        base: scene before the sliders changed it. names: names of all scenes. sliders: slider
+        positions.
         """
         if names:
             self._scene.options = tuple(names)
@@ -119,19 +125,19 @@ class TouchTab:
         self._size.value = round(100.0 * sliders.size_ratio)
 
     def show_intent(self, finger: FingerController) -> None:
-        """Show the finger position that the viewer requested."""
+        """Show the finger position that a viewer has requested."""
         if self._with_finger:
             show_value(self._depth, _within(1e3 * finger.intent.depth_m, 0.0, MAX_DEPTH_MM, 1))
             self.show_position(finger)
             self.show_lifted(finger)
 
     def show_position(self, finger: FingerController) -> None:
-        """Show the requested position, clipped to the range of the sliders."""
+        """Show the requested position, limited to the range of the sliders."""
         for slider, value_m in zip((self._across, self._up), finger.position_m, strict=True):
             show_value(slider, _within(1e3 * value_m, -MAX_OFFSET_MM, MAX_OFFSET_MM, 0))
 
     def show_lifted(self, finger: FingerController) -> None:
-        """Label the button according to what it does next: lift or lower the finger."""
+        """Set the label of the button that lifts or lowers the finger."""
         label = LOWER if finger.intent.lifted else LIFT
         if self._lift.label != label:
             self._lift.label = label

@@ -62,7 +62,7 @@ class EquilibriumState:
 
     displacement (n, 3): displacement of the nodes, m. force_n (3,): force of the body on the
     finger. centre (3,): centre of the sphere, m. min_volume_ratio: minimum ratio of deformed to
-    undeformed volume. iterations: number of Newton iterations. reached: whether the solution for
+    undeformed volume. reached: whether the solution for
     the target position converged. If it did not, `centre` is the last position that converged.
     """
 
@@ -70,7 +70,6 @@ class EquilibriumState:
     force_n: Floats
     centre: Floats
     min_volume_ratio: float
-    iterations: int
     reached: bool
 
 
@@ -286,7 +285,6 @@ class NeoHookeanBody:
                 raise ValueError(
                     f"the finger centre {centre} is not finite; check the push point and depth"
                 )
-            iterations = 0
             if position is None:
                 position = centre
             done, fraction = 0.0, 1.0
@@ -298,7 +296,7 @@ class NeoHookeanBody:
                 target = start_position + (done + step) * path
                 try:
                     guess = self._predict(displacement, position, target, stick, factors)
-                    solution, iteration_count, factors = self.solve_equilibrium(
+                    solution, factors = self.solve_equilibrium(
                         displacement, target, stick, guess=guess
                     )
                     self._check_validity(solution, target)
@@ -307,7 +305,7 @@ class NeoHookeanBody:
                     failed = fraction < self.min_step_fraction
                     continue
                 displacement, position = solution, target
-                iterations, done = iterations + iteration_count, done + step
+                done += step
                 fraction = min(1.0, 2.0 * fraction)
                 if self.friction == "stick":
                     stick = self.obstacle.update_stick(
@@ -320,17 +318,16 @@ class NeoHookeanBody:
                 ),
                 centre=position,
                 min_volume_ratio=self.solid.min_volume_ratio(displacement),
-                iterations=iterations,
                 reached=not failed,
             )
 
     def solve_equilibrium(
         self, displacement: Floats, centre: Floats, stick: _StickState, *, guess: Floats
-    ) -> tuple[Floats, int, Factors | None]:
+    ) -> tuple[Floats, Factors | None]:
         """Find the equilibrium with the sphere at `centre` (3,) by Newton's method.
 
         The iteration starts at `displacement` (n, 3) or at `guess` (n, 3), m, whichever has less
-        energy. Return the displacement (n, 3) at equilibrium, the number of iterations, and the
+        energy. Return the displacement (n, 3) at equilibrium and the
         last factors of the tangent stiffness. Raise NewtonNotConvergedError if the iteration does
         not converge.
         """
@@ -345,7 +342,7 @@ class NeoHookeanBody:
             residual = np.where(self.fixed[:, None], 0.0, inner + contact_forces)
             scale = max(np.abs(inner).max(), np.abs(contact_forces).max())
             if np.abs(residual).max() <= self.tolerance * scale:
-                return displacement, iteration, factors
+                return displacement, factors
             factors = self._factorize(displacement, centre, stick)
             step = -factors.solve(residual.ravel()).reshape(-1, 3)
             slope = float((residual * step).sum())

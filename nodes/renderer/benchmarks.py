@@ -1,9 +1,9 @@
 """Measure time and image error of the correction methods.
 
-The time is that of drawing a stereo frame, without reading its pixels. The method `floor` gives a
-lower bound for it: it clears the frame and draws the same triangles once for each eye, with the
-same number of samples. The error is measured at each point that the eye sees on a reference sheet.
-The caller provides this reference, which shares no code with the renderer.
+The measured time is the time for drawing a stereo frame, without reading its pixels. The method
+`floor` gives a lower bound of this time. It clears the frame and draws the same triangles once for
+each eye, with the same number of samples. The error is measured at each point that the eye sees on
+a reference sheet. The caller provides this reference, which shares no code with the renderer.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
 from flexsheet.nodes.renderer.object_surface import make_surface
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
-from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
+from flexsheet.nodes.renderer.sheet_mesh import MAX_TRIANGLES_DEPTH_M, SheetMesh, pyramid_mesh
 
 ErrorMeasure = Callable[[Image, Image], Floats]
-"""Function that computes the errors (n,), m, at all visible points of the object. Its arguments are
-the projector's images of the patterns `coordinate_ramp_x` and `coordinate_ramp_y`."""
+"""A function that computes the errors (n,), m, at all visible points of the object. Its arguments
+are the projector's images of the patterns `coordinate_ramp_x` and `coordinate_ramp_y`."""
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure]
-"""Function that returns an `ErrorMeasure` for a scene, the poses (4, 4) of the sheet's left and
-right edge, and the fingertip (3,) or None."""
+"""A function that returns an `ErrorMeasure`. Its arguments are a scene, the poses (4, 4) of the
+sheet's left and right edges, and the fingertip (3,), m, or None."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 SHAPES: dict[str, Callable[[SheetPose], SheetMesh]] = {
     "two_pass_triangles": pyramid_mesh,
 }
-"""Variants of two_pass that use an approximate shape of the sheet."""
+"""The variants of two_pass that use an approximate shape of the sheet."""
 FLOOR = "floor"
 METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
 WITHOUT_SHAPES = tuple(method for method in METHODS if method != "two_pass")
@@ -48,7 +48,7 @@ CASES: tuple[tuple[float, float], ...] = (
     *((tilt, 0) for tilt in (-50, -30, 30, 50)),
     *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
 )
-"""Tilts of the sheet (degrees) and push depths (mm)."""
+"""The tilts of the sheet (degrees) and the push depths (mm)."""
 LARGE_CASES: tuple[tuple[float, float], ...] = ((-30, 0), (0, 30))
 SIZES_PX = ((800, 600), (1280, 720))
 STRETCH = 1.05
@@ -64,30 +64,27 @@ def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Fa
     return Family(
         name="correction",
         unit="mm",
-        reference="rms error at the points the eye sees on the twin's sheet",
+        reference="rms error at the points that the eye sees on the simulated sheet",
         methods=METHODS if solved else WITHOUT_SHAPES,
         trials=partial(_trials, reference, solved),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
 
-MAX_TRIANGLES_DEPTH_MM = 3.5
-"""Push depth at which the shape of four triangles causes an rms error of half a millimetre."""
-
-
 def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
     """Return whether a method is specified for a tilt and push depth of the sheet.
 
     `none` requires the sheet on the imaginary screen, `one_plane` a sheet without a push, and
-    `four_triangles` a push depth of at most `MAX_TRIANGLES_DEPTH_MM`. All methods except `none` are
+    `four_triangles` a push depth of at most `MAX_TRIANGLES_DEPTH_M`. All methods except `none` are
     specified for tilts of up to 50 degrees.
     """
+    max_triangles_mm = 1e3 * MAX_TRIANGLES_DEPTH_M
     if method == "none":
         return tilt_deg == 0 and push_mm == 0
     deepest_mm = {
         FLOOR: -1.0,
-        "four_triangles": MAX_TRIANGLES_DEPTH_MM,
-        "two_pass_triangles": MAX_TRIANGLES_DEPTH_MM,
+        "four_triangles": max_triangles_mm,
+        "two_pass_triangles": max_triangles_mm,
         "two_pass": 60.0,
     }.get(method, 0.0)
     return push_mm <= deepest_mm and abs(tilt_deg) <= 50.0
@@ -98,9 +95,9 @@ def roll_sheet(
 ) -> Floats:
     """Return the pose world_from_sheet (4, 4) of a tilted sheet that touches the object.
 
-    contact_m: (x, y) of the point of contact on the sheet. None: on a cylinder, the sheet has
-    rolled without slip from zero tilt. Other objects touch the sheet's centre with their point that
-    is nearest to the user.
+    contact_m: contact point (x, y) on the sheet. If it is None, the sheet has rolled on a cylinder
+    without slip from zero tilt. The centre of the sheet touches any other object at the point
+    nearest to the user.
     """
     if not isinstance(scene.object.geometry, Cylinder):
         return _lay_sheet(scene, tilt_rad, contact_m or (0.0, 0.0))
@@ -125,7 +122,7 @@ def _lay_sheet(scene: Scene, tilt_rad: float, contact_m: tuple[float, float]) ->
 
 
 def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
-    """Return the limits of the scene's working range: tilts (degrees) and push depths (mm)."""
+    """Return the limits of the scene's working range as tilts (degrees) and push depths (mm)."""
     tilt = round(float(np.degrees(scene.working_range.tilt_rad)), 1)
     return ((-tilt, 0.0), (tilt, 0.0), (0.0, round(1e3 * scene.working_range.push_depth_m, 3)))
 
@@ -184,9 +181,9 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 def _make_situation(
     scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
-    """Return the predicted sheet pose of a case, and a function that measures the image error.
+    """Return the predicted sheet pose of a case, and a function that returns the error measure.
 
-    The function computes the measure in the first call only.
+    The function creates the measure in its first call only.
     """
     pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
@@ -242,7 +239,10 @@ def _error_mm(
     get_measure: Callable[[], ErrorMeasure],
     _drawn: None,
 ) -> float:
-    """Return the root mean square error of all visible points, mm; infinite if there are none."""
+    """Return the root mean square error of all visible points, in mm.
+
+    The error is infinite if no point is visible.
+    """
     errors_m = get_measure()(*draw_coordinate_ramps(scene_renderer, method, sheet))
     return 1e3 * float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("inf")
 

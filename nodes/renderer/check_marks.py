@@ -1,9 +1,9 @@
 """Place the projected marks with which the stereo camera checks the calibrations.
 
 A mark is a square of projector pixels with a known ray. If the poses of projector and camera in the
-scene are correct, the camera must see the mark on this ray; if those of the arms are correct, on
-the sheet. Near a pushing finger, the sheet follows the finger in a known ratio, which shows the
-true depth of the finger.
+scene are correct, the camera must see the mark on this ray. If the poses of the arms are correct,
+the mark must be on the sheet. Near a pushing finger, the sheet follows the finger in a known ratio,
+which shows the true depth of the finger.
 """
 
 from __future__ import annotations
@@ -20,21 +20,20 @@ from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
 SIDE_M = 0.0053
-"""Side of a mark, whose area is that of a marker of 3 mm radius, so that the triangulator detects
-it.  Its side in pixels is even, as are the corners, because a mark may be drawn at half the
-resolution (see `output.image_parts`)."""
+"""The side of a mark. The area of the mark equals that of a marker of 3 mm radius, so that the
+triangulator detects it."""
 
 FINGER_STEP_M = 0.001
-"""Displacement of the fingertip for which the displacements of the marks are computed."""
+"""The displacement of the fingertip for which the displacements of the marks are computed."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckMarks:
-    """Projected marks of one frame.
+    """The projected marks of one frame.
 
-    side_px: side of the squares. corners_px: (n, 2) left column and top row. world_m: (n, 3)
-    centres on the sheet; NaN for a mark that misses it. finger_ratio: (n,) displacement of the
-    sheet along its normal, divided by that of the fingertip.
+    side_px: side of the squares. corners_px (n, 2): left column and top row. world_m (n, 3):
+    centres on the sheet; NaN for a mark that misses the sheet. finger_ratio (n,): displacement of
+    the sheet along its normal, divided by the displacement of the fingertip.
     """
 
     side_px: int
@@ -53,9 +52,10 @@ NO_MARKS = CheckMarks(0, np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros(
 def place_marks(
     projector: Projector, world_from_sheet: Floats, mesh: SheetMesh, deeper: SheetMesh | None
 ) -> CheckMarks:
-    """Place the marks of a projector on the sheet (4, 4) with its mesh.
+    """Compute the check marks of a projector on the sheet.
 
-    deeper: mesh of the sheet with the fingertip FINGER_STEP_M deeper; None if there is no contact.
+    world_from_sheet (4, 4): pose of the sheet. mesh: mesh of the sheet. deeper: mesh for a
+    fingertip that is `FINGER_STEP_M` deeper; None if there is no contact.
     """
     pose, lens = projector.world_from_projector, projector.lens
     world_from_projector = pose_matrix(pose)
@@ -63,6 +63,7 @@ def place_marks(
     distortion = np.array(lens.distortion)
     points = np.array([(x, y, 0.0) for x, y in projector.check_marks_sheet_m])
     local = apply(inverse(world_from_projector) @ world_from_sheet, points)
+    # Side and corners are even, because a mark may be drawn at half the resolution.
     side_px = 2 * round(0.5 * SIDE_M * lens.fx_px / float(local[:, 2].mean()))
     half = 0.5 * (side_px - 1)
     pixels = camera.project(local, matrix, distortion)
@@ -81,15 +82,16 @@ def place_marks(
 
 
 def intersect(origin: Floats, rays: Floats, corners: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """Intersect rays (n, 3) from a point with triangles (m, 3, 3).
+    """Intersect rays from a point with triangles.
 
-    Return the index (n,) of the triangle that each ray hits, and barycentric weights (n, 3) of its
-    corners; NaN if the ray does not hit the mesh. Source: Moller and Trumbore 1997.
+    origin (3,): start of the rays. rays (n, 3): directions. corners (m, 3, 3): triangles. Return
+    the index (n,) of the triangle that each ray hits, and the barycentric weights (n, 3) of its
+    corners. The weights are NaN if the ray misses the mesh. Source: Moller and Trumbore 1997.
     """
     first, along, up = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(along, up)
     from_first = origin - first
-    # Scalar triple products with the ray; one matrix product each for all rays and triangles.
+    # Each matrix product computes a scalar triple product for all rays and triangles.
     volume = -rays @ normal.T
     v = rays @ np.cross(up, from_first).T
     w = rays @ np.cross(from_first, along).T

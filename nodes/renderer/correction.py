@@ -1,10 +1,10 @@
-"""Correct the projected image for a moved or pushed sheet, by equations (1)-(6) of the paper.
+"""Correct the projected image for a moved or pushed sheet (Furukawa et al. 2007, eq. (1)-(6)).
 
-The paper is Furukawa et al. 2007.
-The image is drawn for the imaginary screen, a fixed plane z = 0, but projected onto the actual
+The image is drawn for the imaginary screen, the fixed plane z = 0, but projected onto the actual
 screen, the sheet. V is the eye, P the projector and A a point of the object. C is the intersection
-of the line V-A with the actual screen, and C' that of the line C-P with the imaginary screen. A' is
-the point of the line V-C' at the depth of A. If the point is drawn at A', the eye sees it at A.
+of the line V-A with the actual screen. C' is the intersection of the line C-P with the imaginary
+screen. A' is the point of the line V-C' at the depth of A. If the point is drawn at A', the eye
+sees it at A.
 
 The actual screen is one plane, or the four triangles between the pushed point and the sheet's
 corners. All points are in the world frame, m. Points are invalid and not moved if
@@ -12,7 +12,8 @@ corners. All points are in the world frame, m. Points are invalid and not moved 
 - the eye or the projector sees the screen edge-on, within `GRAZING_SINE`, or from the other side;
 - the point is not in front of the eye, or its C is behind the eye or the projector.
 
-The plane of the sheet replaces triangles without area, and all four if the push is too shallow.
+The plane of the sheet replaces triangles without area. It replaces all four triangles if the push
+is too shallow.
 """
 
 from __future__ import annotations
@@ -27,19 +28,20 @@ from flexsheet.nodes.models.camera import camera_matrix
 from flexsheet.nodes.models.rigid import inverse
 
 GRAZING_SINE = 0.05
-"""Sine of the minimum angle (2.9 degrees) between a ray and the sheet. At this angle a pixel is
-stretched by a factor of 20."""
+"""The sine of the minimum angle (2.9 degrees) between a ray and the sheet. At this angle, a pixel
+is stretched by a factor of 20."""
 
 NEAR_M = 0.02
-"""Minimum depth of drawn points in front of the eye."""
+"""The minimum depth of drawn points in front of the eye."""
 
 MIN_PUSH_M = 1e-4
-"""Minimum push depth for the four triangles; below it, the screen is a plane."""
+"""The minimum push depth for a screen of four triangles. For smaller depths, the screen is a
+plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScreenPlane:
-    """Plane through a point (3,) with a unit normal (3,) that points towards the user."""
+    """A plane through a point (3,), m, with a unit normal (3,) that points towards the user."""
 
     point: Floats
     normal: Floats
@@ -47,11 +49,11 @@ class ScreenPlane:
 
 @dataclass(frozen=True, slots=True)
 class ProjectionScreen:
-    """Actual screen: four triangles with a common vertex, or one plane.
+    """The actual screen, which consists of four triangles with a common vertex, or of one plane.
 
-    point: (3,), common to all triangles (r_s in the equations). normals: (4, 3), towards the user
-    (n_si). corners: (4, 3), counter-clockwise as seen by the user; triangle i is between corner i
-    and the next one. None for one plane, which has four equal normals.
+    point (3,): common vertex, m (r_s in the paper). normals (4, 3): unit normals towards the user
+    (n_si), which are equal for a plane. corners (4, 3): corners, m, counter-clockwise as seen by
+    the user; None for a plane. Triangle i is between corner i and the next corner.
     """
 
     point: Floats
@@ -69,9 +71,9 @@ def make_pushed_screen(
 ) -> ProjectionScreen:
     """Return the screen of four triangles between the pushed point and the sheet's corners.
 
-    pushed_point: (3,). corners: (4, 3), left bottom, right bottom, right top, left top. plane:
-    plane of the sheet without a push; it replaces triangles without area, and all four if the push
-    is below `MIN_PUSH_M`. Source: section III-C 3 of the paper.
+    pushed_point (3,), m. corners (4, 3): left bottom, right bottom, right top, left top, m. plane:
+    plane of the sheet without a push. It replaces triangles without area, and all triangles if the
+    push is below `MIN_PUSH_M`. Source: section III-C 3 of Furukawa et al. 2007.
     """
     if abs((pushed_point - plane.point) @ plane.normal) < MIN_PUSH_M:
         return make_flat_screen(plane)
@@ -86,9 +88,10 @@ def make_pushed_screen(
 def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
     """Return the unit normals (4, 3) of the planes through the eye, the pushed point and a corner.
 
-    Seen from the eye, the lines from the pushed point to the corners divide the image into sectors,
-    one for each triangle. A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1).
-    Normals are zero for a screen of one plane, and for a line that points to the eye.
+    As seen from the eye, the lines from the pushed point to the corners divide the image into one
+    sector for each triangle. A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1).
+    Normals are zero for a screen of one plane, and for a line that points to the eye. eye (3,):
+    position, m.
     """
     if screen.corners is None:
         return np.zeros((4, 3))
@@ -98,7 +101,10 @@ def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
 
 
 def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
-    """Return whether the eye sees the plane's front and the projector illuminates its back."""
+    """Return whether the eye sees the front of a plane and the projector illuminates its back.
+
+    eye, projector (3,): positions, m.
+    """
     to_eye, light = eye - plane.point, plane.point - projector
     return bool(
         to_eye @ plane.normal > GRAZING_SINE * np.linalg.norm(to_eye)
@@ -107,16 +113,17 @@ def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
 
 
 def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
-    """Return the points (n, 2) where lines from the eye to points (n, 3) intersect z = 0."""
+    """Return the points (n, 2) at which lines from the eye to points (n, 3) intersect z = 0."""
     fraction = eye[2] / (eye[2] - points[:, 2])
     crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * fraction[:, None]
     return crossings
 
 
 def pixel_from_screen(lens: Lens, world_from_projector: Floats) -> Floats:
-    """Return the homography (3, 3) from (x, y, 1) on the imaginary screen, m, to projector pixels.
+    """Return the homography (3, 3) from (x, y, 1) on the plane z = 0, m, to projector pixels.
 
-    The projector is modelled as a pinhole. Lens distortion is applied later (`lens.py`).
+    The projector is modelled as a pinhole, without lens distortion. world_from_projector (4, 4):
+    pose.
     """
     projector_from_world = inverse(world_from_projector)
     columns = projector_from_world[:3, [0, 1, 3]]
@@ -127,9 +134,10 @@ def pixel_from_screen(lens: Lens, world_from_projector: Floats) -> Floats:
 
 
 def clip_from_screen(pixel_from_screen: Floats, width_px: int, height_px: int) -> Floats:
-    """Return the matrix (3, 3) from (x, y, 1) on the imaginary screen to OpenGL clip (x, y, w).
+    """Return the matrix (3, 3) from (x, y, 1) on the plane z = 0 to OpenGL clip coordinates.
 
-    The origin of pixel coordinates is the centre of the top left pixel.
+    pixel_from_screen (3, 3): homography to pixels, whose origin is the centre of the top left
+    pixel. The clip coordinates are (x, y, w).
     """
     clip_from_pixel = np.array(
         [

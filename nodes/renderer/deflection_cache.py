@@ -28,28 +28,28 @@ from flexsheet.nodes.models.sheet.indentation import (
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 VERSION = 2
-"""Version of the computation. Increase it when results for the same inputs change."""
+"""The version of the computation. Increase it when results for the same inputs change."""
 
 STRETCH_SLACK = 0.01
-"""Margin by which the range of stretch ratios in the computation exceeds the scene's limits."""
+"""The margin by which the range of stretch ratios in the computation exceeds the scene's limits."""
 
 FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
-"""Fields of `IndentationBasis` that the cache file contains."""
+"""The fields of `IndentationBasis` that the cache file contains."""
 
 MAX_DEPTH_RATIO = 1.2
-"""Ratio of the maximum push depth in the computation to the scene's push depth."""
+"""The ratio of the maximum push depth in the computation to the push depth of the scene."""
 
 RADIUS_STEP_M, FIRST_RADIUS_M = 0.002, 0.003
-"""Difference between successive stored radii of the finger, and their minimum."""
+"""The difference between successive stored radii of the finger, and the minimum stored radius."""
 
 WIDTH_STEP_M = 0.005
-"""Difference between successive stored widths of the sheet."""
+"""The difference between successive stored widths of the sheet."""
 
 Progress = Callable[[int, int], None]
 
 
 def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
-    """Return the rubber sheet of a scene, and the range of pushes that must be computed for it."""
+    """Return the rubber sheet of a scene, and the range of pushes for which shapes are computed."""
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     within = IndentationRange(
@@ -61,9 +61,9 @@ def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
 
 
 def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
-    """Return the cache entry (key, inputs and format) for the shapes of a scene of `list_stored`.
+    """Describe how the deflection shapes of a scene are stored in the cache.
 
-    The shapes do not depend on the sheet's thickness and Young's modulus.
+    The shapes do not depend on the thickness and Young's modulus of the sheet.
     """
     rubber, within = required_shapes(scene)
     depends_on = {
@@ -91,7 +91,10 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 
 
 def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
-    """List scenes with stored radius and width, and their weights in the shapes of a scene."""
+    """List the scenes whose stored shapes are interpolated to those of a scene, with weights.
+
+    The listed scenes have a stored finger radius and a stored sheet width.
+    """
     width_m = WIDTH_STEP_M * max(round(scene.sheet.width_m / WIDTH_STEP_M), 1)
     sheet = scene.sheet.model_copy(update={"width_m": round(width_m, 6)})
     steps = max(scene.finger.radius_m - FIRST_RADIUS_M, 0.0) / RADIUS_STEP_M
@@ -107,7 +110,7 @@ def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
 
 
 def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> IndentationBasis:
-    """Combine the weighted shapes of the scenes of `list_stored` into those of a scene."""
+    """Interpolate the deflection shapes of a scene from stored shapes with weights."""
     rubber, _ = required_shapes(scene)
     stored = parts[0][1]
     wider = rubber.width_m / stored.rubber.width_m
@@ -125,7 +128,10 @@ def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> I
 
 
 def load(scene: Scene, cache_dir: Path | None) -> IndentationBasis | None:
-    """Return the scene's deflection shapes from the cache; None if they are not stored."""
+    """Return the scene's deflection shapes from the cache, or None if they are not stored.
+
+    cache_dir: folder of the cache; None for the cache of the user.
+    """
     parts = []
     for weight, stored in list_stored(scene):
         basis = load_cached(shapes_cache(stored), cache_dir)
@@ -138,10 +144,10 @@ def load(scene: Scene, cache_dir: Path | None) -> IndentationBasis | None:
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> IndentationBasis:
-    """Return the scene's deflection shapes; compute and store those that are not in the cache.
+    """Load the scene's deflection shapes from the cache, or compute and store them.
 
-    The computation uses all cores. cache_dir: folder of the cache; None: the user's cache.
-    progress: called with the number of solved pushes and their total number.
+    The computation uses all cores. cache_dir: folder of the cache; None for the cache of the user.
+    progress: function that receives the number of solved pushes and the total number.
     """
     return _combine(
         scene,

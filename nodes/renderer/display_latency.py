@@ -6,21 +6,22 @@ from collections import deque
 from statistics import median
 
 HISTORY = 31
-"""Number of recent frames from which latencies are computed: half a second at 60 Hz."""
+"""The number of recent frames from which latencies are computed: half a second at 60 Hz."""
 
 VSYNC_MARGIN_S = 0.0005
-"""Minimum time between the end of drawing and the swap that shows the frame."""
+"""The minimum time between the end of drawing and the swap that shows the frame."""
 
 ON_TIME_FRACTION = 0.85
-"""Fraction of frames that must be ready in time for their predicted swap."""
+"""The fraction of frames that must be ready in time for their predicted swap."""
 
 
 class DisplayLatencyEstimator:
-    """Estimator of a frame's display time: the middle of the interval in which it is projected.
+    """An estimator of the display time of a frame.
 
-    All times are ns of one clock. The display time is a constant latency after the swap that shows
-    the frame or, without a window, after the end of drawing. If swaps wait for the projector's
-    refresh, the prediction is based on the next swap for which the frame will be ready.
+    The display time is the middle of the interval in which the frame is projected. All times are ns
+    of one clock. The display time follows the swap that shows the frame or, without a window, the
+    end of drawing after a constant latency. If swaps wait for the projector's refresh, the
+    prediction is based on the next swap for which the frame will be ready.
     """
 
     def __init__(self, *, first_s: float, display_latency_s: float, period_s: float = 0.0) -> None:
@@ -50,15 +51,18 @@ class DisplayLatencyEstimator:
         return self._last_swap_ns + max(swaps, 1) * self._period_ns + self._light_ns
 
     def record_drawn(self, begun_ns: int, drawn_ns: int) -> int:
-        """Record the drawing time of a frame without a window, and return its display time."""
+        """Record the drawing time of a frame without a window, and return its display time, ns.
+
+        begun_ns, drawn_ns: start and end of drawing.
+        """
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(drawn_ns - begun_ns)
         return drawn_ns + self._light_ns
 
     def record_shown(self, begun_ns: int, drawn_ns: int, swapped_ns: int) -> int:
-        """Record a frame that a window showed at `swapped_ns`; return when its light appears (ns).
+        """Record a frame that a window has shown, and return its display time, ns.
 
-        begun_ns, drawn_ns: times at which drawing began and ended.
+        begun_ns, drawn_ns: start and end of drawing. swapped_ns: time of the swap.
         """
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(swapped_ns - begun_ns)
@@ -68,6 +72,7 @@ class DisplayLatencyEstimator:
     def is_late(self, light_ns: int, predicted_ns: int) -> bool:
         """Return whether a frame was displayed later than predicted.
 
-        The tolerance is half a refresh period, and at least the display latency.
+        light_ns, predicted_ns: measured and predicted display time. The tolerance is half a refresh
+        period, and at least the display latency.
         """
         return light_ns - predicted_ns > max(self._period_ns // 2, self._light_ns)

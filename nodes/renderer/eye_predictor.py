@@ -13,25 +13,27 @@ from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.max_age import MaxAge
 
 WINDOW_S = 0.15
-"""Duration over which the velocity is measured; it covers a few frames of a head tracker."""
+"""The duration over which the velocity is measured, which covers a few frames of a head tracker."""
 
 MIN_MESSAGES = 3
-"""Minimum number of positions to measure a velocity. With fewer, the newest position is used."""
+"""The minimum number of positions for the measurement of a velocity. With fewer positions, the
+newest position is used."""
 
 MAX_SPEED_M_PER_S = 1.0
-"""Maximum speed of a head. A faster one is an error of the tracker, and the velocity is ignored."""
+"""The maximum plausible speed of a head. Larger velocities are errors of the tracker and are
+ignored."""
 
 MAX_AHEAD_S = 0.1
-"""Maximum time over which a position is extrapolated."""
+"""The maximum time over which a position is extrapolated."""
 
 MAX_SHIFT_M = 0.03
-"""Maximum distance by which a position is extrapolated."""
+"""The maximum distance by which a position is extrapolated."""
 
 
 class EyePredictor:
-    """Predictor of the eyes' position, with the velocity of a line fitted to recent positions.
+    """A predictor of the eyes' position, with the velocity of a line fitted to recent positions.
 
-    max_age: maximum age of a message; with an older one, the eyes are considered as not tracked.
+    max_age: maximum age of a message. If the last message is older, the eyes are not tracked.
     """
 
     def __init__(self, max_age: MaxAge) -> None:
@@ -40,7 +42,7 @@ class EyePredictor:
         self._clock: tuple[str, int] | None = None
 
     def add(self, eye: Eye, header: Header) -> None:
-        """Add a message. After an invalid one, a gap or a change of clock, the fit starts again."""
+        """Add a message. After an invalid message, a gap or a change of clock, restart the fit."""
         clock, at_ns = (header.clock_id, header.epoch), header.source_ns
         known = self._positions
         if not eye.valid:
@@ -56,9 +58,10 @@ class EyePredictor:
             known.popleft()
 
     def predict(self, tracked: Input[Eye], horizon_s: float) -> Eye | None:
-        """Return the eyes predicted for `horizon_s` from now.
+        """Return the eyes as predicted for a time `horizon_s` after the current time.
 
-        Return None if there is no message or it is too old. An invalid message is not changed.
+        Return None if there is no message or it is too old. An invalid message is returned
+        unchanged.
         """
         eye, age_s = tracked.message, tracked.age_s()
         if eye is None or age_s > self._max_age.seconds:
@@ -72,7 +75,7 @@ class EyePredictor:
         return eye.model_copy(update={"centre_world_m": eye.centre_world_m + shift})
 
     def _velocity(self) -> Floats:
-        """Return the velocity (3,) of the eyes, m/s; zero if it is unknown or implausible."""
+        """Return the velocity (3,) of the eyes, m/s, or zero if it is unknown or implausible."""
         if len(self._positions) < MIN_MESSAGES:
             return np.zeros(3)
         newest_ns = self._positions[-1][0]

@@ -1,4 +1,4 @@
-"""Draw a frame for the projector from the newest messages, and describe it in a message."""
+"""Draw a frame for the projector from the newest messages, and make a message about the frame."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ from flexsheet.nodes.renderer.sheet_pose_predictor import SheetPosePredictor, pr
 from flexsheet.nodes.renderer.skin_extrapolator import SkinExtrapolator
 
 VISIBLE_CHANGE_M = 1e-4
-"""Motion of the sheet that makes a new frame necessary: about a fifth of a pixel."""
+"""The motion of the sheet that makes a new frame necessary, about a fifth of a pixel."""
 
 FLANGE_TO_SHEET_M = 0.15
-"""Maximum distance between a point of a sheet's edge and the flange of the arm that holds it."""
-
+"""The maximum distance between a point of a sheet's edge and the flange of the arm that holds the
+edge."""
 
 CHECK_MARKS_PERIOD_NS = 200_000_000
-"""Time after which the projected check marks are placed again on the moving sheet.  It limits their
+"""The period with which the projected check marks are placed on the moving sheet. It limits their
 cost to 1 % of a processor core."""
 
 
 @dataclass(frozen=True, slots=True)
 class RendererInputs:
-    """Inputs of the renderer node whose newest messages define a frame."""
+    """The inputs of the renderer node whose newest messages define a frame."""
 
     skin: Input[Skin]
     soft_body: Input[SoftBody]
@@ -55,7 +55,7 @@ class RendererInputs:
 
 
 class FrameRenderer:
-    """Renderer that draws a scene's frames on an output, and counts late and superseded ones."""
+    """A renderer that draws a scene's frames, and counts late and superseded frames."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class FrameRenderer:
             self.extrapolator.add(ports.soft_body.message, ports.soft_body.header)
 
     def is_unchanged(self, shown: Display) -> bool:
-        """Return whether a new frame would equal the last one because nothing touches or moves."""
+        """Return whether a new frame would equal the last frame because nothing has changed."""
         ports = self._ports
         arms = (ports.arm_left.message, ports.arm_right.message)
         others = (ports.skin.message, ports.eye.message, shown)
@@ -95,10 +95,10 @@ class FrameRenderer:
         )
 
     def render(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
-        """Draw a frame on the output; return its message, and the exposure time of its data, ns.
+        """Draw a frame, and return its message and the exposure time of its data, ns.
 
-        begun_ns: start of drawing. with_pixels: whether the message contains the image. The message
-        has no display time yet if there is a window; see `on_shown`.
+        begun_ns: start of drawing. with_pixels: whether the message contains the image. If there is
+        a window, the message has no display time until `on_shown` is called.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         self._drawn_of = (ports.skin.message, ports.eye.message, shown)
@@ -163,7 +163,7 @@ class FrameRenderer:
         return frame, source_ns
 
     def _place_check_marks(self, sheet: SheetPose, now_ns: int) -> CheckMarks:
-        """Place the check marks if it is time to; return none if they remain where they are."""
+        """Place and return the check marks if they are due; otherwise return no marks."""
         projector = self.scene_renderer.scene.projector
         if projector is None or not projector.check_marks_sheet_m:
             return NO_MARKS
@@ -175,7 +175,7 @@ class FrameRenderer:
     def on_shown(self, frame: Frame, swapped_ns: int) -> Frame:
         """Return the message of a frame with its measured display times.
 
-        swapped_ns: time of the swap; 0 if a newer frame replaced this one.
+        swapped_ns: time of the swap; 0 if a newer frame replaced the frame.
         """
         if not swapped_ns:
             self.superseded += 1
@@ -190,8 +190,8 @@ class FrameRenderer:
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
         """Deform the object as predicted for the display time `light_ns`.
 
-        If the solver has sent no new response, use the last one. Returns the exposure time of the
-        data and the time for which the deformation was predicted, ns.
+        Without a recent response of the solver, use the last response unchanged. Return the
+        exposure time of the data and the time for which the deformation was predicted, ns.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age.seconds
@@ -209,7 +209,7 @@ class FrameRenderer:
 
 
 def is_touched(fingertip: Fingertip | None, soft_body: SoftBody | None) -> bool:
-    """Return whether the shape may change: a finger is tracked, or the object is deformed."""
+    """Return whether the shape may change because a finger is tracked or the object is deformed."""
     if fingertip is not None and fingertip.valid:
         return True
     return soft_body is not None and bool(soft_body.displacement_world_m.any())

@@ -31,16 +31,16 @@ SOFTWARE_DRIVERS = ("llvmpipe", "softpipe", "swrast")
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 GRID_PITCH_M = 0.02
 SCREEN_PATTERNS = ("grid", "checker", "white")
-"""Patterns that are drawn on the imaginary screen (see `correction`) instead of the object."""
+"""The patterns that are drawn on the imaginary screen, the plane z = 0, instead of the object."""
 SOFT_LOOK, FLAT_LOOK = 0, 1
 LOOKS = {"coordinate_ramp_x": 2, "coordinate_ramp_y": 3, "grid": 4, "checker": 5, "white": 6}
-"""Value of the macro LOOK in the shader `object.frag.glsl` for each pattern."""
+"""The value of the macro LOOK in the shader `object.frag.glsl` for each pattern."""
 TEXTURES = {"none": 0, "speckle": 1, "grid": 2, "image": 3}
 MARK_RADIUS_M = 0.003
 
 
 class NoOpenGLError(FlexsheetError, RuntimeError):
-    """Error if no OpenGL 3.3 context can be created."""
+    """An error that is raised if no OpenGL 3.3 context can be created."""
 
     code = "no-opengl"
     remedy = "Install the packages for EGL that `flexsheet doctor` names."
@@ -48,11 +48,12 @@ class NoOpenGLError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class EyeView:
-    """Geometry of one eye's image.
+    """The geometry of one eye's image.
 
-    eye, projector: positions (3,), world, m. screen: sheet for which the image is corrected; None:
-    no correction. clip_from_screen: (3, 3), result of `correction.clip_from_screen`. lens: lens of
-    the projector; None: no distortion. grey: whether to draw without colour.
+    eye, projector: positions (3,), world frame, m. screen: sheet for which the image is corrected;
+    None for no correction. clip_from_screen: matrix (3, 3) from the imaginary screen to OpenGL clip
+    coordinates. lens: lens of the projector; None for no distortion. grey: whether to draw without
+    colour.
     """
 
     eye: Floats
@@ -65,10 +66,11 @@ class EyeView:
 
 @dataclass(frozen=True, slots=True)
 class DrawStyle:
-    """Style in which the object is drawn.
+    """The style in which the object is drawn.
 
-    flat: whether to draw without shading. pattern: see the message `Display`. fingertip_mark,
-    target_mark: points (3,), world, of the undeformed object at which marks are drawn, or None.
+    flat: whether to draw without shading. pattern: name of a pattern, or "object". fingertip_mark,
+    target_mark: points (3,), world frame, m, of the undeformed object at which marks are drawn, or
+    None.
     """
 
     flat: bool
@@ -83,9 +85,9 @@ class DrawStyle:
 
 @dataclass(frozen=True, slots=True)
 class ImagePart:
-    """Part of the projector's image that one eye sees.
+    """The part of the projector's image that one eye sees.
 
-    viewport: left, bottom, width, height, px. channels: whether red, green and blue are drawn.
+    viewport: left, bottom, width and height, px. channels: whether red, green and blue are drawn.
     """
 
     viewport: tuple[int, int, int, int]
@@ -97,7 +99,7 @@ class ImagePart:
 
     @contextmanager
     def of(self, frame: moderngl.Framebuffer) -> Iterator[None]:
-        """Restrict drawing to this part of a frame, and to its colour channels, in the context."""
+        """Restrict drawing in the context to this part of a frame and its colour channels."""
         whole = frame.viewport
         frame.viewport, frame.color_mask = self.viewport, (*self.channels, True)
         if self.is_grey:
@@ -110,12 +112,13 @@ class ImagePart:
 
 @dataclass(frozen=True, slots=True)
 class SurfaceMaterial:
-    """Colour and texture of the object.
+    """The colour and the texture of the object.
 
-    colour: red, green, blue, 0 to 1. texture: key of `TEXTURES`. pitch_m: period of the procedural
-    textures. image: (height, width, 3), top row first, or None. image_from_world: (4, 4), maps
-    points of the object at rest to image coordinates, which are 0 at the left and bottom edge, and
-    1 at the opposite edges. object_from_world: (4, 4).
+    colour: red, green and blue, from 0 to 1. texture: key of `TEXTURES`. pitch_m: period of the
+    procedural textures. image (height, width, 3): texture image, starting with the top row, or
+    None. image_from_world (4, 4): map from points of the object at rest to image coordinates, which
+    are 0 at the left and bottom edges, and 1 at the opposite edges. object_from_world (4, 4):
+    inverse pose of the object.
     """
 
     colour: tuple[float, float, float] = (0.95, 0.72, 0.60)
@@ -127,14 +130,15 @@ class SurfaceMaterial:
 
 
 class Canvas:
-    """OpenGL shaders, meshes and framebuffers with which the image of one projector is drawn."""
+    """The OpenGL shaders, meshes and framebuffers that draw the image of one projector."""
 
     def __init__(
         self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
     ) -> None:
         """Allocate the framebuffers.
 
-        samples: number of samples per pixel (multisampling), limited by the driver's maximum.
+        samples: number of samples per pixel (multisampling), which the maximum of the driver
+        limits.
         """
         self.width_px, self.height_px = width_px, height_px
         self.context = context
@@ -198,26 +202,29 @@ class Canvas:
     ) -> None:
         """Set the mesh of the object at rest.
 
-        rest: positions (vertices, 3), world. triangles: (triangles, 3), counter-clockwise as seen
-        from outside. normals: unit normals (vertices, 3) at rest; None: all along z.
+        rest (n, 3): vertices, world frame, m. triangles (t, 3): counter-clockwise as seen
+        from outside. normals (n, 3): unit normals at rest; None if all normals are along z.
         """
         if self._object is not None:
             self._object.release()
         self._object = _MeshBuffers(self.context, rest, triangles, normals)
 
     def set_shape(self, positions: Floats, normals: Floats) -> None:
-        """Set the current positions and unit normals of the object's vertices, (vertices, 3)."""
+        """Set the current positions (n, 3), m, and unit normals (n, 3) of the object's vertices.
+
+        Raise RuntimeError before the first call of `set_mesh`.
+        """
         if self._object is None:
-            raise RuntimeError("set_mesh must be called before set_shape")
+            raise RuntimeError("the canvas has no mesh; call set_mesh before set_shape")
         self._object.move(_interleaved(positions, normals))
 
     def set_moved(self, moved: NDArray[np.float32]) -> None:
-        """Set positions and normals of the object's vertices as one array (vertices, 6).
+        """Set positions and normals of the object's vertices as one array (n, 6).
 
-        The normals may have any length.
+        The normals may have any length. Raise RuntimeError before the first call of `set_mesh`.
         """
         if self._object is None:
-            raise RuntimeError("set_mesh must be called before set_moved")
+            raise RuntimeError("the canvas has no mesh; call set_mesh before set_moved")
         self._object.move(moved)
 
     def draw(self, view: EyeView, look: DrawStyle) -> None:
@@ -237,7 +244,7 @@ class Canvas:
         self.context.finish()
 
     def begin(self, *, multisampled: bool) -> None:
-        """Select the framebuffer `target` for the next image, and clear it."""
+        """Select and clear the framebuffer `target` for the next image."""
         self.target = self._frame if multisampled else self._single
         self.target.clear(0.0, 0.0, 0.0, 1.0)
 
@@ -275,23 +282,24 @@ class Canvas:
         )
 
     def resolve(self) -> None:
-        """Average the samples of a multisampled image into `resolved`, which `read` returns."""
+        """Average the samples of a multisampled image into the framebuffer `resolved`."""
         if self.target is self._frame:
             self.context.copy_framebuffer(self.resolved, self._frame)
 
     def read(self) -> Image:
-        """Return the last image: (height, width, 3), top row first."""
+        """Return the last image (height, width, 3), which starts with the top row."""
         data = self.resolved.read(components=3, alignment=1)
         rows = np.frombuffer(data, np.uint8).reshape(self.height_px, self.width_px, 3)
         return np.ascontiguousarray(rows[::-1])
 
     def shifted_points(self, view: EyeView) -> Floats:
-        """Return the corrected vertices A' (see `correction`) as the shader computes them.
+        """Return the corrected positions of the vertices as the shader computes them.
 
-        The result is (vertices, 4): position, and validity, which is 0 or 1. Tests use it.
+        The result (n, 4) contains positions, m, and validity, 0 or 1. Tests compare it with a
+        reference. Raise RuntimeError before the first call of `set_mesh`.
         """
         if self._object is None:
-            raise RuntimeError("set_mesh must be called before shifted_points")
+            raise RuntimeError("the canvas has no mesh; call set_mesh before shifted_points")
         text = shader_text("object.vert.glsl", CORRECTED=view.screen is not None, LENS=False)
         program = self.context.program(vertex_shader=text, varyings=("shifted",))
         set_view(Uniforms(program), view)
@@ -306,14 +314,14 @@ def _mark(point: Floats | None) -> tuple[float, ...]:
 
 
 class Uniforms:
-    """Uniforms of a shader program, of which only changed values are written to OpenGL."""
+    """The uniforms of a shader program, of which only changed values are written to OpenGL."""
 
     def __init__(self, program: moderngl.Program) -> None:
         self._program = program
         self._last: dict[str, object] = dict.fromkeys(program)
 
     def set(self, **values: object) -> None:
-        """Set uniforms by name; those that the compiler has removed as unused are ignored."""
+        """Set uniforms by name, and ignore uniforms that the compiler has removed as unused."""
         last = self._last
         for name, value in values.items():
             if name in last and last[name] != value:
@@ -321,16 +329,19 @@ class Uniforms:
 
 
 class Programs:
-    """Variants of a shader program with different values of its macros, compiled on first use."""
+    """The variants of a shader program with different values of its macros.
+
+    Each variant is compiled on first use.
+    """
 
     def __init__(self, context: moderngl.Context, name: str) -> None:
         self._context, self._name = context, name
         self._variants: dict[tuple[int, ...], tuple[moderngl.Program, Uniforms]] = {}
 
     def get(self, **macros: int) -> tuple[moderngl.Program, Uniforms]:
-        """Return the variant with these values of the macros, and its uniforms.
+        """Return the variant of the program for given values of the macros, and its uniforms.
 
-        Every call must give the same macros in the same order.
+        Every call must pass the same macros in the same order.
         """
         key = tuple(macros.values())
         if key not in self._variants:
@@ -347,7 +358,7 @@ class Programs:
 
 
 def set_view(uniforms: Uniforms, view: EyeView) -> None:
-    """Set the vertex shader's uniforms for a view."""
+    """Set the uniforms of the vertex shader for a view."""
     screen = view.screen
     uniforms.set(
         eye=tuple(view.eye.tolist()),
@@ -372,7 +383,7 @@ def set_view(uniforms: Uniforms, view: EyeView) -> None:
 
 
 class _MeshBuffers:
-    """OpenGL buffers of one mesh: constant ones, and one that is written for each frame."""
+    """The OpenGL buffers of one mesh, of which one is written for each frame."""
 
     def __init__(
         self,
@@ -391,10 +402,11 @@ class _MeshBuffers:
         self._arrays: dict[tuple[int, bool], moderngl.VertexArray] = {}
 
     def move(self, moved: NDArray[np.float32]) -> None:
-        """Set positions and normals (vertices, 6); raises ValueError if the shape differs."""
+        """Set positions and normals (n, 6). Raise ValueError for another shape of the array."""
         if moved.shape != (self.count, 6):
             raise ValueError(
-                f"positions and normals: expected shape ({self.count}, 6), found {moved.shape}"
+                f"positions and normals of the mesh: expected shape ({self.count}, 6), found "
+                f"{moved.shape}; pass one row for each vertex"
             )
         # Use new memory for each frame, so that the driver need not wait for the previous frame.
         self._moving.orphan()
@@ -429,10 +441,7 @@ def _interleaved(positions: Floats, normals: Floats) -> NDArray[np.float32]:
 
 
 def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
-    """Return a fine mesh of a square on the imaginary screen, with sides of 300 mm.
-
-    The patterns in SCREEN_PATTERNS are drawn on it.
-    """
+    """Return vertices (n, 3), m, and triangles (t, 3) of a square of 300 mm on the plane z = 0."""
     cells = 60
     axis = np.linspace(-0.15, 0.15, cells + 1)
     x, y = np.meshgrid(axis, axis)
@@ -441,7 +450,10 @@ def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
 
 
 def shader_text(name: str, **macros: int) -> str:
-    """Return the text of a shader file, with macros defined and `#include "name"` expanded."""
+    """Return the text of a shader file with defined macros and expanded `#include` lines.
+
+    name: name of the file. macros: value of each macro.
+    """
     text = files("flexsheet.nodes.renderer").joinpath(name).read_text()
     text = re.sub(r'^#include "(.+)"$', lambda line: shader_text(line[1]), text, flags=re.MULTILINE)
     defined = "".join(f"\n#define {macro} {int(value)}" for macro, value in macros.items())
@@ -449,23 +461,23 @@ def shader_text(name: str, **macros: int) -> str:
 
 
 def limit_driver_threads() -> None:
-    """Limit the threads of a software OpenGL driver to half of the cores; use none on two cores.
+    """Limit the threads of a software OpenGL driver to half of the cores.
 
-    The other cores remain free for other nodes. On busy cores the driver would wait for its
-    threads, which takes longer and uses 50 % more processor time. A given environment variable
-    LP_NUM_THREADS takes precedence.
+    On two cores, the driver uses no threads. The other cores remain free for other nodes, because
+    waiting for threads on busy cores uses 50 % more processor time. A value of the environment
+    variable LP_NUM_THREADS takes precedence.
     """
     cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("LP_NUM_THREADS", str(cores // 2 if cores > 2 else 0))
 
 
 def is_software(context: moderngl.Context) -> bool:
-    """Return whether the driver draws by the processor instead of a graphics card."""
+    """Return whether the OpenGL driver uses the processor instead of a graphics card."""
     return str(context.info["GL_RENDERER"]).startswith(SOFTWARE_DRIVERS)
 
 
 def headless_context() -> moderngl.Context:
-    """Return an OpenGL 3.3 context without a window; raises NoOpenGLError if there is none."""
+    """Return an OpenGL 3.3 context without a window. Raise NoOpenGLError if EGL provides none."""
     limit_driver_threads()
     # The type stub accepts further settings only as a dict.
     settings: dict[str, Any] = {"backend": "egl"}
@@ -474,5 +486,5 @@ def headless_context() -> moderngl.Context:
     except Exception as error:
         raise NoOpenGLError(
             f"OpenGL 3.3 is not available through EGL: {error}; "
-            "on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri"
+            "on Debian or Ubuntu, install it with: apt-get install libegl1 libgl1-mesa-dri"
         ) from error

@@ -9,17 +9,17 @@ import numpy as np
 from flexsheet.messages.scene import Lens
 
 REACH_MARGIN = 1.1
-"""The distortion must be invertible up to this multiple of the slope at the image's corners. The
-slope of a ray is the tangent of its angle to the optical axis."""
+"""The multiple of the slope at the image's corners up to which the distortion must be invertible.
+The slope of a ray is the tangent of its angle to the optical axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClipLens:
-    """Projector lens in OpenGL clip coordinates.
+    """The projector lens in OpenGL clip coordinates.
 
-    focal_centre: focal lengths and principal point (fx, fy, cx, cy). distortion: k1 k2 p1 p2 k3, as
-    in OpenCV. reach: maximum squared slope of a ray. Steeper rays are limited to it, because the
-    polynomial would map them back into the image.
+    focal_centre: focal lengths and principal point (fx, fy, cx, cy). distortion: k1, k2, p1, p2 and
+    k3 of OpenCV. reach: maximum squared slope of a ray. The slope of steeper rays is limited to
+    this value, because the polynomial would map these rays back into the image.
     """
 
     focal_centre: tuple[float, float, float, float]
@@ -28,9 +28,10 @@ class ClipLens:
 
 
 def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
-    """Return the lens for the shader `lens.glsl`; None for a lens without distortion.
+    """Convert a lens to OpenGL clip coordinates.
 
-    Raises ValueError for a distortion that is not invertible within the image.
+    Return None for a lens without distortion. Raise ValueError for a distortion that is not
+    invertible within the image.
     """
     if not any(lens.distortion):
         return None
@@ -48,9 +49,9 @@ def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
     needed = REACH_MARGIN * max(float(np.hypot(*corner)) for corner in corners)
     if largest < needed:
         raise ValueError(
-            f"projector.lens.distortion: {lens.distortion} maps several rays to one pixel: its "
-            f"maximum slope is {largest:.3f}, but the image's corners need {needed:.3f}; calibrate "
-            "the projector again with points in the whole image"
+            f"projector.lens.distortion: {lens.distortion} maps several rays to one pixel, because "
+            f"its maximum slope is {largest:.3f}, but the corners of the image need {needed:.3f}; "
+            "calibrate the projector again with points in the whole image"
         )
     reach = min(fold, 4.0 * needed)
     return ClipLens(

@@ -9,19 +9,19 @@ from flexsheet.messages.base import Header
 
 HISTORY = 15
 PERIODS = 4.0
-"""Maximum age in camera periods, so that three messages may be lost."""
+"""The maximum age in camera periods, which permits the loss of three successive messages."""
 MIN_AGE_S, MAX_AGE_S = 0.1, 0.5
 
 
 class MaxAge:
-    """Maximum age at which poses, fingertips, eyes and soft bodies are used.
+    """The maximum age at which poses, fingertips, eyes and soft bodies are used.
 
-    seconds: current value, s. It is either the fixed value passed to the constructor, or
+    seconds: current maximum age. It is either a fixed value, or
     `PERIODS` measured periods of the camera, limited to the range `MIN_AGE_S` to `MAX_AGE_S`.
     """
 
     def __init__(self, given_s: float | None = None) -> None:
-        """Set a fixed maximum age; if it is None, derive it from the camera's period."""
+        """Set a fixed maximum age, or None to derive the maximum age from the camera's period."""
         self.seconds = MIN_AGE_S if given_s is None else given_s
         self._is_given = given_s is not None
         self._last: Header | None = None
@@ -30,7 +30,7 @@ class MaxAge:
     def add(self, header: Header) -> None:
         """Measure the camera's period from the header of a fingertip message.
 
-        The header contains the exposure time. Sequence numbers show how many messages were lost.
+        The header contains the exposure time, and a sequence number that reveals lost messages.
         """
         last, self._last = self._last, header
         if (

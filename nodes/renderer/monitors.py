@@ -26,7 +26,7 @@ ON_A_PROJECTOR = {
 
 
 class WindowError(FlexsheetError, RuntimeError):
-    """Error if the requested window cannot be opened, or was lost."""
+    """An error that is raised if the requested window cannot be opened or was lost."""
 
     code = "window"
     remedy = "Set the renderer's `monitor` to one that the text lists, or `output: headless`."
@@ -34,15 +34,20 @@ class WindowError(FlexsheetError, RuntimeError):
 
 @contextmanager
 def glfw_errors() -> Iterator[None]:
-    """Convert errors of the window library GLFW to WindowError; requires `start_glfw` before."""
+    """Convert errors of the window library GLFW to WindowError in the context.
+
+    `start_glfw` must be called first.
+    """
     try:
         yield
     except glfw.GLFWError as error:
-        raise WindowError(f"the window system reports: {error}") from error
+        raise WindowError(
+            f"the window system reports: {error}; check the display and its driver"
+        ) from error
 
 
 def start_glfw() -> None:
-    """Connect to the display; raises WindowError if there is none."""
+    """Connect to the display. Raise WindowError if there is no display."""
     glfw.ERROR_REPORTING = "raise"
     try:
         with glfw_errors():
@@ -55,18 +60,21 @@ def start_glfw() -> None:
 
 def _no_display(why: str) -> WindowError:
     return WindowError(
-        f"parameter output: window: no display ({why}); set DISPLAY to the screen of the "
-        "projector (such as DISPLAY=:0), or use output: headless"
+        f"parameter output: window needs a display, but there is none ({why}); set DISPLAY to the "
+        "screen of the projector (such as DISPLAY=:0), or set output to headless"
     )
 
 
 def monitor_names() -> list[str]:
-    """Return the names of the monitors by their numbers; number 0 is the primary monitor."""
+    """Return the names of the monitors, ordered by number. Number 0 is the primary monitor."""
     return [_text(glfw.get_monitor_name(monitor)) for monitor in glfw.get_monitors()]
 
 
 def find_monitor(monitor: str | int) -> Any:
-    """Return the GLFW monitor with a number or name; raises WindowError if it is not unique."""
+    """Return the GLFW monitor with a number or name.
+
+    Raise WindowError if there is no such monitor, or if several monitors have this name.
+    """
     monitors, names = glfw.get_monitors(), monitor_names()
     key = monitor
     if isinstance(monitor, str) and monitor not in names and monitor.isdigit():
@@ -79,8 +87,14 @@ def find_monitor(monitor: str | int) -> Any:
     have = "; ".join(
         f'{index}: "{name}" {_mode(monitors[index])}' for index, name in enumerate(names)
     )
-    why = f"{len(same)} monitors have this name, set the number" if same else "unknown monitor"
-    raise WindowError(f"parameter monitor: {monitor!r}: {why}; monitors: {have or 'none'}")
+    why = (
+        f"{len(same)} monitors have this name; set the number"
+        if same
+        else "there is no such monitor; set one that is connected"
+    )
+    raise WindowError(
+        f"parameter monitor: {monitor!r}: {why}; connected monitors: {have or 'none'}"
+    )
 
 
 def _mode(monitor: Any) -> str:
@@ -93,13 +107,16 @@ def _text(name: bytes | str) -> str:
 
 
 def refresh_period_s(monitor: Any) -> float:
-    """Return the current refresh period of a monitor, s; 0 if it is unknown."""
+    """Return the current refresh period of a monitor, in seconds, or 0 if it is unknown."""
     rate_hz = glfw.get_video_mode(monitor).refresh_rate
     return 1.0 / rate_hz if rate_hz > 0 else 0.0
 
 
 def hidden_window() -> Any:
-    """Return an invisible window, whose OpenGL context is used for drawing."""
+    """Return an invisible window, whose OpenGL context is used for drawing.
+
+    Raise WindowError if the window cannot be opened.
+    """
     return _create((1, 1), {glfw.VISIBLE: False})
 
 
@@ -108,9 +125,10 @@ def open_window(
 ) -> tuple[Any, bool]:
     """Open a window that shares graphics objects with the window `share`.
 
-    size: width, height, px. monitor: monitor of a full-screen window; None: an ordinary window.
-    stereo: request quad buffering (separate buffers for each eye). Return the window, and whether
-    it is quad-buffered. Raises WindowError if the monitor has no mode of this size.
+    size: width and height, px. monitor: monitor of a full-screen window; None for an ordinary
+    window. stereo: whether to request quad buffering (separate buffers for each eye). Return the
+    window, and whether it is quad-buffered. Raise WindowError if the monitor has no mode of this
+    size.
     """
     width, height = size
     if monitor is not None:
@@ -119,7 +137,7 @@ def open_window(
             have = ", ".join(f"{w}x{h}" for w, h in sorted(modes))
             raise WindowError(
                 f"scene.projector has {width}x{height} px, but the monitor "
-                f'"{_text(glfw.get_monitor_name(monitor))}" supports {have}; '
+                f'"{_text(glfw.get_monitor_name(monitor))}" supports only {have}; '
                 "set one of these sizes in the scene and calibrate the projector again"
             )
     hints = {**ON_A_PROJECTOR, glfw.VISIBLE: True}
@@ -145,7 +163,10 @@ def _create(
             glfw.window_hint(hint, value)
         window = glfw.create_window(*size, "flexsheet", monitor, share)
     if not window:
-        raise WindowError(f"cannot open a window of {size[0]}x{size[1]} px with OpenGL 3.3")
+        raise WindowError(
+            f"cannot open a window of {size[0]}x{size[1]} px with OpenGL 3.3; install a graphics "
+            "driver with OpenGL 3.3, or set output to headless"
+        )
     if glfw.get_window_attrib(window, glfw.VISIBLE):
         glfw.set_input_mode(window, glfw.CURSOR, glfw.CURSOR_HIDDEN)
     return window

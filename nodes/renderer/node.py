@@ -30,10 +30,11 @@ from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 
 
 class Renderer(Node):
-    """Node that draws a frame for each soft-body message, at most at `rate_hz`.
+    """The node that draws a frame for each soft-body message, at most at `rate_hz`.
 
-    Without messages of the solver, fingertip messages trigger frames; without these, a timer does.
-    A frame is published after it was drawn or, with a window, after it was shown.
+    Without recent soft-body messages, fingertip messages trigger frames. Without both, a timer
+    triggers frames. The node publishes a frame after it was drawn or, with a window, after it was
+    shown.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RENDERER
@@ -128,7 +129,7 @@ class Renderer(Node):
 
     @periodic("rate_hz")
     def refresh(self) -> None:
-        """Handle the window's events, and draw a frame if no message has triggered one."""
+        """Handle the window's events, and draw a frame if no message has triggered a frame."""
         if not self._output.poll():
             self._reopen()
         if self.clock.now_ns() > self._due_ns + self._period_ns:
@@ -138,11 +139,11 @@ class Renderer(Node):
         return open_output(self.parameters, self.clock.now_ns, self._was_shown)
 
     def _was_shown(self, tag: tuple[Frame, int], swapped_ns: int) -> None:
-        """Publish a frame after the window showed it; this may be called from any thread."""
+        """Publish a frame that the window has shown. Any thread may call this method."""
         self._loop.call_soon_threadsafe(self._publish, *tag, swapped_ns)
 
     def _reopen(self) -> None:
-        """Create the output and all graphics objects again after the context was lost."""
+        """Create the output and all graphics objects again after a loss of the OpenGL context."""
         self.log.warning("window", problem=self._output.note)
         self._frame_renderer = None
         self._output.close()
@@ -178,7 +179,10 @@ class Renderer(Node):
             self.frame.publish(frame, source_ns=source_ns)
 
     def _publish(self, frame: Frame, source_ns: int, swapped_ns: int) -> None:
-        """Publish a frame that the window has shown, or replaced by a newer one."""
+        """Publish a frame that the window has shown or replaced by a newer frame.
+
+        source_ns: exposure time of the data. swapped_ns: time of the swap; 0 for a replaced frame.
+        """
         if self._frame_renderer is not None:
             frame = self._frame_renderer.on_shown(frame, swapped_ns)
         self.frame.publish(frame, source_ns=source_ns)

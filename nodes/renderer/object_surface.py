@@ -30,17 +30,18 @@ Indices = NDArray[np.int32]
 Real = TypeVar("Real", np.float32, np.float64)
 
 MIN_AROUND = 128
-"""Minimum number of vertices around a cylinder, sphere or ellipsoid, for a smooth outline."""
+"""The minimum number of vertices around a cylinder, sphere or ellipsoid, for a smooth outline."""
 CANDIDATES = 16
-"""Number of skin samples near a drawn vertex in whose triangles its nearest point is searched."""
+"""The number of samples of the skin near a drawn vertex whose triangles are searched for the
+nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectSurface:
-    """Surface mesh of the object at rest.
+    """The surface mesh of the object at rest.
 
-    rest_world_m, normals_world: (vertices, 3); vertices on sharp edges are duplicated. triangles:
-    (triangles, 3), counter-clockwise as seen from outside.
+    rest_world_m (n, 3): vertices, with duplicates on sharp edges. normals_world (n, 3): unit
+    normals. triangles (t, 3): counter-clockwise as seen from outside.
     """
 
     rest_world_m: Floats
@@ -51,7 +52,11 @@ class ObjectSurface:
     def placed(
         points: Floats, normals: Floats, triangles: NDArray[np.integer], world_from_object: Floats
     ) -> ObjectSurface:
-        """Transform points and normals (n, 3) of a surface from the object's to the world frame."""
+        """Transform a surface from the object frame to the world frame.
+
+        points (n, 3): vertices, m. normals (n, 3): unit normals. triangles (t, 3): vertex indices.
+        world_from_object (4, 4): pose of the object.
+        """
         return ObjectSurface(
             apply(world_from_object, points),
             normals @ world_from_object[:3, :3].T,
@@ -64,9 +69,9 @@ def make_surface(
 ) -> ObjectSurface:
     """Return the surface mesh of a geometry with vertices about `spacing_m` apart.
 
-    shape: shape of the geometry, for its true points and normals. A plane is drawn as a rectangle,
-    and a mesh as the smooth surface that its shape defines. Raises ValueError for a spacing that
-    needs too many triangles.
+    shape: shape of the geometry, which provides true points and normals. world_from_object (4, 4):
+    pose. A plane is drawn as a rectangle, and a mesh as the smooth surface that its shape defines.
+    Raise ValueError for a spacing that needs too many triangles.
     """
     match geometry:
         case Cylinder(radius_m=radius, length_m=length):
@@ -105,7 +110,8 @@ def cylinder_surface(
 ) -> ObjectSurface:
     """Return a closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
 
-    The vertices are the rings of the curved side, then rim and centre of each end.
+    The vertices are the rings of the curved side, and then the rim and the centre of each end.
+    world_from_object (4, 4): pose.
     """
     rings = int(np.ceil(length_m / spacing_m)) + 1
     around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), MIN_AROUND)
@@ -140,9 +146,9 @@ def _cells(length_m: float, spacing_m: float) -> int:
 
 
 def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Return a triangulated grid of the square from -0.5 to 0.5: points (n, 2), triangles (t, 3).
+    """Return points (n, 2) and triangles (t, 3) of a grid on the square from -0.5 to 0.5.
 
-    columns, rows: number of cells. Triangles are counter-clockwise.
+    columns, rows: number of cells. The triangles are counter-clockwise.
     """
     u, v = np.meshgrid(
         np.linspace(-0.5, 0.5, columns + 1), np.linspace(-0.5, 0.5, rows + 1), indexing="xy"
@@ -152,9 +158,10 @@ def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def _inflate_cuboid(template: CuboidMap, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Return the surface mesh of a solid, which the template maps from a grid on a cuboid.
+    """Map a grid on a cuboid to the surface mesh of a solid.
 
-    The result is points (n, 3), object frame, and triangles (t, 3).
+    template: map from the cuboid to the solid. Return points (n, 3), m, object frame, and triangles
+    (t, 3).
     """
     if template.is_round:
         quarter_m = 0.5 * np.pi * float(template.half_m.max())
@@ -176,7 +183,7 @@ def _inflate_cuboid(template: CuboidMap, spacing_m: float) -> tuple[Floats, NDAr
 
 
 class VertexNormals:
-    """Function that computes area-weighted unit normals at the vertices of a mesh."""
+    """A function that computes area-weighted unit normals at the vertices of a mesh."""
 
     def __init__(self, triangles: NDArray[np.integer], vertices: int) -> None:
         columns = np.repeat(np.arange(len(triangles)), 3)
@@ -187,7 +194,7 @@ class VertexNormals:
         self._corners = [np.ascontiguousarray(triangles[:, i]) for i in range(3)]
 
     def __call__(self, positions: NDArray[Real]) -> NDArray[Real]:
-        """Return the unit normals (vertices, 3) for vertex positions (vertices, 3)."""
+        """Return the unit normals (n, 3) for vertex positions (n, 3)."""
         # One contiguous array for each coordinate is several times faster than np.cross.
         coordinates = np.ascontiguousarray(positions.T)
         a, b, c = (coordinates.take(corner, axis=1) for corner in self._corners)
@@ -203,10 +210,10 @@ class VertexNormals:
 
 
 class DeformationTransfer:
-    """Transfer of a skin's displacement to a drawn surface.
+    """A transfer of the displacement of the solver's skin to a drawn surface.
 
-    A drawn vertex moves with the nearest point of the skin. Its normal changes as the skin's normal
-    does there, which is interpolated between the skin's vertices.
+    A drawn vertex moves with the nearest point of the skin. The normal of the drawn vertex changes
+    like the normal of the skin at this point, which is interpolated between vertices of the skin.
     """
 
     def __init__(
@@ -214,8 +221,9 @@ class DeformationTransfer:
     ) -> None:
         """Compute the interpolation weights.
 
-        skin_vertices: (s, 3), world, at rest. skin_triangles: (t, 3), counter-clockwise as seen
-        from outside. Raises ValueError if no triangle has an area, or a coordinate is not finite.
+        skin_vertices (s, 3): vertices at rest, world frame, m. skin_triangles (t, 3):
+        counter-clockwise as seen from outside. Raise ValueError if no triangle has an area, or if a
+        coordinate is not finite.
         """
         self.vertices = len(skin_vertices)
         self._weights = transfer_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
@@ -228,10 +236,11 @@ class DeformationTransfer:
         self._moves = np.empty((self.vertices, 6), np.float32)
 
     def apply(self, displacement: Singles | None) -> Singles:
-        """Return positions and normals (vertices, 6) of the deformed drawn surface.
+        """Return positions, m, and normals (n, 6) of the deformed drawn surface.
 
-        displacement: (s, 3) of the skin's vertices; None: at rest. The normals have no unit length.
-        Raises ValueError for a wrong shape, or for values that are not finite.
+        displacement (s, 3): displacement of the skin's vertices, m; None for the surface at rest.
+        The length of the normals is arbitrary. Raise ValueError for a wrong shape of the array, or
+        for values that are not finite.
         """
         if displacement is None:
             return self._rest
@@ -244,7 +253,9 @@ class DeformationTransfer:
         moves[:, :3] = displacement
         # The sum is not finite if one of its terms is not.
         if not np.isfinite(moves[:, :3].sum()):
-            raise ValueError("soft_body.displacement_world_m is not finite")
+            raise ValueError(
+                "soft_body.displacement_world_m is not finite; check the soft-body solver"
+            )
         np.subtract(self._normals(self._skin + displacement), self._rest_normals, out=moves[:, 3:])
         result: Singles = self._weights @ moves
         result += self._rest
@@ -254,18 +265,19 @@ class DeformationTransfer:
 def transfer_matrix(
     points: Floats, skin_vertices: Floats, skin_triangles: Indices
 ) -> scipy.sparse.csr_array:
-    """Return the matrix (points, skin vertices), float32, that interpolates skin values at points.
+    """Return the matrix (n, s), float32, that interpolates skin values at points (n, 3).
 
-    Each row has the barycentric weights of the nearest point of the skin. Triangles without area
-    are ignored. Raises ValueError if all are without area, or if a vertex is not finite.
+    Each row contains the barycentric weights of the nearest point of the skin. skin_vertices (s,
+    3), skin_triangles (t, 3): skin. Triangles without area are ignored. Raise ValueError if no
+    triangle has an area, or if a vertex is not finite.
     """
     if not np.isfinite(skin_vertices).all():
-        raise ValueError("skin.vertices_world_m is not finite")
+        raise ValueError("skin.vertices_world_m is not finite; check the soft-body solver")
     skin_triangles = skin_triangles[
         ~find_degenerate(skin_vertices, skin_triangles.astype(np.int64))
     ]
     if len(skin_triangles) == 0:
-        raise ValueError("skin.triangles: there are no triangles with an area")
+        raise ValueError("skin.triangles: no triangle has an area; check the soft-body solver")
     corners = skin_vertices[skin_triangles]
     samples, owners = _samples(corners)
     candidates = min(CANDIDATES, len(samples))
@@ -290,10 +302,11 @@ def transfer_matrix(
 
 
 def _samples(corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Return sample points (n, 3) on triangles (t, 3, 3), and the index (n,) of their triangle.
+    """Return sample points (n, 3) on triangles (t, 3, 3), and the triangle index (n,) of each
+    point.
 
-    Larger triangles have more samples. The nearest samples of a point then belong to the nearest
-    triangles, even if triangle sizes differ.
+    Larger triangles have more samples. The nearest samples of a point therefore belong to the
+    nearest triangles, even if triangle sizes differ.
     """
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
     parts = np.clip(np.ceil(sides / max(float(np.median(sides)), 1e-12)), 1, 12).astype(int)

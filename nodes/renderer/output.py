@@ -14,24 +14,24 @@ from flexsheet.nodes.renderer.gl import ImagePart
 WhichEye = Literal["both", "left", "right"]
 
 MIN_EYE_DISTANCE_M = 0.05
-"""Minimum distance of an eye from the imaginary screen."""
+"""The minimum distance of an eye from the imaginary screen, the plane z = 0."""
 
 
 def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
-    """Return the eyes to draw for, the unit vector (3,) from the left to the right eye, and a note.
+    """Return the eyes for drawing, the unit vector (3,) from left to right eye, and a note.
 
-    eyes: eyes of the scene, for use without tracked ones. tracked: newest message of the topic eye;
-    None if there is none or it is too old. The note is the reason why `tracked` is not used, or
-    empty.
+    eyes: eyes of the scene, which are used without tracked eyes. tracked: newest message of the
+    topic eye; None if there is no message or it is too old. The note is the reason why `tracked` is
+    not used, or empty.
     """
     across = np.array([1.0, 0.0, 0.0])
     if tracked is None:
         return eyes, across, ""
     if not tracked.valid:
-        return eyes, across, "the eyes are not tracked: using the scene's eyes"
+        return eyes, across, "the eyes are not tracked; the eyes of the scene are used"
     length = float(np.linalg.norm(tracked.right_world))
     if length < 1e-6:
-        return eyes, across, "topic eye: right_world is zero: using the scene's eyes"
+        return eyes, across, "topic eye: right_world is zero; the eyes of the scene are used"
     across = np.asarray(tracked.right_world / length, dtype=np.float64)
     reach = 0.5 * eyes.interocular_m * abs(float(across[2]))
     if tracked.centre_world_m[2] - reach < MIN_EYE_DISTANCE_M:
@@ -39,16 +39,17 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
         return (
             eyes,
             np.array([1.0, 0.0, 0.0]),
-            f"a tracked eye is {where} from the screen, too close or behind it: using the scene's "
-            "eyes",
+            f"a tracked eye is {where} in front of the screen, which is too close; the eyes of the "
+            "scene are used",
         )
     return eyes.model_copy(update={"centre_world_m": tracked.centre_world_m}), across, ""
 
 
 def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Floats:
-    """Return the world positions (2, 3) of the left and right eye; in mono mode they are equal.
+    """Return the positions (2, 3) of the left and the right eye, world frame, m.
 
-    across: unit vector (3,) from the left to the right eye; None: along x.
+    The positions are equal in mono mode. across: unit vector (3,) from the left to the right eye;
+    None for the x axis.
     """
     direction = np.array([1.0, 0.0, 0.0]) if across is None else across
     half = 0.0 if mode == "mono" else 0.5 * eyes.interocular_m
@@ -58,10 +59,11 @@ def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Flo
 
 
 def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
-    """Return the eyes for which frame `number` is drawn.
+    """Return the eyes for which a frame is drawn.
 
-    shows_both: whether the output alternates between the eyes itself, so that each frame needs both
-    images. If not, the renderer alternates in frame_sequential: odd frames are for the left eye.
+    number: number of the frame. shows_both: whether the output alternates between the eyes, so that
+    each frame needs both images. Otherwise, odd frames are for the left eye in the mode
+    frame_sequential, and even frames for the right eye.
     """
     if mode != "frame_sequential" or shows_both:
         return "both"
@@ -71,10 +73,11 @@ def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
 def select_drawn_eyes(
     pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: bool
 ) -> Floats:
-    """Select from both eyes (2, 3) the positions (1 or 2, 3) for which a frame is drawn.
+    """Select from both eye positions (2, 3) those (1 or 2, 3) for which a frame is drawn.
 
-    With swap_eyes, a frame for one eye contains the other eye's image, for shutter glasses that
-    open in the opposite order. If a frame has both images, `image_parts` swaps them.
+    which: eyes of the frame. swap_eyes: whether a frame for one eye contains the image of the other
+    eye, for shutter glasses that open in the opposite order. A frame for both eyes ignores
+    `swap_eyes`.
     """
     if which != "both":
         row = int((which == "right") != swap_eyes)
@@ -83,11 +86,12 @@ def select_drawn_eyes(
 
 
 def image_parts(mode: StereoMode, size: tuple[int, int], *, swap_eyes: bool) -> list[ImagePart]:
-    """Return the parts (one or two) of the projector's image for the eyes that share it.
+    """Return the parts of the projector's image for the eyes that share the image.
 
-    size: width, height, px. side_by_side: each eye has half the width, the left eye on the left.
-    top_bottom: each eye has half the height, the left eye above. anaglyph: each eye has the whole
-    image, the left eye in red, the right eye in green and blue. swap_eyes: exchange the parts.
+    size: width and height, px. In side_by_side mode, the left eye has the left half of the image.
+    In top_bottom mode, it has the upper half. In anaglyph mode, each eye has the whole image, the
+    left eye in red, and the right eye in green and blue. Other modes have one part. swap_eyes:
+    whether to exchange the parts.
     """
     width, height = size
     across, up = width // 2, height // 2

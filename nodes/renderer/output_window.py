@@ -1,4 +1,4 @@
-"""Provide the renderer's outputs: offscreen, or a window on the projector's monitor."""
+"""Provide the renderer's offscreen output, and a window on the projector's monitor."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from flexsheet.nodes.renderer.monitors import (
 from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.renderer.presenter import SLOTS, Presenter, Shown, Slot, make_slot
 
-CLOSED = "the window was closed; frames are not shown until the node is restarted"
+CLOSED = "the window was closed; restart the node to show frames again"
 
 
 class OutputWindow(Protocol):
-    """Interface of an output that shows the images for the eyes.
+    """The interface of an output that shows the images for the eyes.
 
-    context: OpenGL context for drawing, current in the caller's thread.
+    context: OpenGL context for drawing, which is current in the thread of the caller.
     """
 
     context: moderngl.Context
@@ -35,7 +35,8 @@ class OutputWindow(Protocol):
     shows_both: bool
     """Whether the output itself alternates between the eyes in the mode frame_sequential."""
     period_s: float
-    """Time between swaps that wait for the monitor's refresh, s; 0 if they do not wait."""
+    """The time between swaps that wait for the monitor's refresh, in seconds; 0 if swaps do not
+    wait."""
     note: str
 
     def open(self, size: tuple[int, int]) -> None: ...
@@ -46,7 +47,7 @@ class OutputWindow(Protocol):
 
 
 class OffscreenOutput:
-    """Output without a window: images are drawn, but not shown. Frame messages can contain them."""
+    """An output without a window. Images are drawn and can be part of frame messages."""
 
     is_seen = shows_both = False
     period_s = 0.0
@@ -56,13 +57,13 @@ class OffscreenOutput:
         self.context = headless_context()
 
     def open(self, size: tuple[int, int]) -> None:
-        """Do nothing: there is no window."""
+        """Do nothing, because there is no window."""
 
     def store(self, number: int, image: moderngl.Framebuffer) -> None:
-        """Do nothing: images are not stored."""
+        """Do nothing, because images are not stored."""
 
     def show(self, tag: Any, display: Display) -> None:
-        """Do nothing: images are not shown."""
+        """Do nothing, because images are not shown."""
 
     def poll(self) -> bool:
         return True
@@ -74,9 +75,11 @@ class OffscreenOutput:
 def open_output(
     parameters: RendererParameters, now_ns: Callable[[], int], shown: Shown
 ) -> OutputWindow:
-    """Open the output that the parameters select. Raises WindowError or NoOpenGLError.
+    """Open the output that the parameters select.
 
-    now_ns: returns the current time. shown: callback for each shown image, see `presenter.Shown`.
+    now_ns: function that returns the current time. shown: function that receives the tag and the
+    swap time, ns, of each shown image. Raise WindowError if the window cannot be opened, and
+    NoOpenGLError without OpenGL 3.3.
     """
     if parameters.output == "headless":
         return OffscreenOutput()
@@ -89,9 +92,9 @@ def open_output(
 
 
 class ProjectorWindow:
-    """Full-screen window on the projector's monitor, which shows images from a separate thread.
+    """A full-screen window on the projector's monitor, which shows images from a separate thread.
 
-    The window system requires that all methods are called on the main thread.
+    All methods must be called on the main thread.
     """
 
     def __init__(
@@ -104,9 +107,11 @@ class ProjectorWindow:
     ) -> None:
         """Create the drawing context.
 
-        monitor: name or number; None: an ordinary window, for tests. swap_interval: number of
-        monitor refreshes per shown image; 0: do not wait for the refresh, so images may tear.
-        Raises WindowError if there is no display or no such monitor.
+        monitor: name or number; None for an ordinary window, for tests. swap_interval: number of
+        monitor refreshes per shown image. With 0, swaps do not wait for the refresh, and images may
+        tear. now_ns: function that returns the current time. shown: function that receives the tag
+        and the swap time, ns, of each shown image. Raise WindowError if there is no display or no
+        such monitor.
         """
         limit_driver_threads()
         start_glfw()
@@ -124,7 +129,10 @@ class ProjectorWindow:
         self._filling: Slot | None = None
 
     def open(self, size: tuple[int, int]) -> None:
-        """Open the window for images of a size (width, height), px, if it is not yet open."""
+        """Open the window for images of a size (width, height), px, unless it is already open.
+
+        Raise WindowError if the monitor has no mode of this size.
+        """
         if self._presenter is not None and self._slots[0].textures[0].size == size:
             return
         self._shut()
@@ -150,7 +158,10 @@ class ProjectorWindow:
         self._note_size(size, self._presenter.framebuffer_px)
 
     def store(self, number: int, image: moderngl.Framebuffer) -> None:
-        """Store an image for the next `show`; number: index of the image in the frame, 0 or 1."""
+        """Store an image for the next call of `show`.
+
+        number: index of the image in the frame, 0 or 1.
+        """
         if self._presenter is None:
             return
         if self._filling is None:
@@ -158,7 +169,10 @@ class ProjectorWindow:
         self.context.copy_framebuffer(self._filling.frames[number], image)
 
     def show(self, tag: Any, display: Display) -> None:
-        """Show the stored images at the next refresh; the callback `shown` then gets the tag."""
+        """Show the stored images at the next refresh.
+
+        tag: object that the callback `shown` receives after the images were shown.
+        """
         slot, self._filling = self._filling, None
         if self._presenter is None or slot is None:
             return
@@ -168,14 +182,14 @@ class ProjectorWindow:
         self._presenter.put(slot)
 
     def poll(self) -> bool:
-        """Handle the window's events; return False if the graphics context was lost.
+        """Handle the window's events, and return False if the graphics context was lost.
 
-        If it was lost, `note` contains the reason, and the caller must create the output again. If
-        the user has closed the window, `note` reports it, and the window is not opened again.
+        After a loss, `note` contains the reason, and the caller must create the output again. If
+        the user has closed the window, `note` reports this, and the window is not opened again.
         """
         glfw.poll_events()
         if self._presenter is not None and self._presenter.problem is not None:
-            self.note = f"the window was lost ({self._presenter.problem}): opening it again"
+            self.note = f"the window was lost ({self._presenter.problem}) and is opened again"
             return False
         if self._window is not None and glfw.window_should_close(self._window):
             self._shut()
@@ -197,8 +211,9 @@ class ProjectorWindow:
         self.note = (
             ""
             if fits
-            else f"the window has {width}x{height} px, but the images have {size[0]}x{size[1]} px: "
-            "they are shown unscaled in the centre; set this size on the monitor or in the scene"
+            else f"the window has {width}x{height} px, but the images have {size[0]}x{size[1]} px; "
+            "images are shown unscaled in the centre; set the same size on the monitor and in the "
+            "scene"
         )
 
     def _shut(self) -> None:

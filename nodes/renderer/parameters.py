@@ -20,8 +20,8 @@ class RendererParameters(NodeParameters):
     )
     output: Literal["headless", "window"] = Field(
         default="headless",
-        description="headless: draw without a window. window: show frames on the projector's "
-        "monitor.",
+        description="Output of the frames. headless: draw without a window. window: show frames "
+        "on the projector's monitor.",
     )
     monitor: str | int | None = Field(
         default=None,
@@ -31,50 +31,54 @@ class RendererParameters(NodeParameters):
         default=1,
         ge=0,
         le=4,
-        description="Monitor refreshes per shown frame. 0: do not wait for the refresh.",
+        description="Number of monitor refreshes per shown frame. 0: do not wait for the refresh, "
+        "so that images may tear.",
     )
     prediction_horizon_s: NonNegative = Field(
         default=0.016,
         description="Assumed time, s, from the start of drawing to the middle of the frame's "
-        "display, used until it is measured.",
+        "display. It is used until the first frame has been measured.",
     )
     display_latency_s: NonNegative = Field(
         default=0.008,
-        description="Time, s, from the swap (without a window: the end of drawing) to the middle "
-        "of the frame's display: half a refresh period plus the projector's delay.",
+        description="Time, s, from the swap to the middle of the frame's display, which is half a "
+        "refresh period plus the projector's delay. Without a window, it starts at the end of "
+        "drawing.",
     )
     max_age_s: Positive | None = Field(
         default=None,
         description="Maximum age, s, of poses, fingertips, eyes and soft bodies that are used. "
-        "null: four measured camera periods, at least 0.1 s and at most 0.5 s.",
+        "null: four measured camera periods, limited to the range 0.1 s to 0.5 s.",
     )
     spacing_m: Positive = Field(
         default=0.004,
-        description="Distance, m, between vertices of the drawn object; it need not be smaller "
-        "than that of the soft body's skin.",
+        description="Distance, m, between vertices of the drawn object. It need not be smaller "
+        "than skin_spacing_m of the soft-body solver.",
     )
     samples: int | None = Field(
         default=None,
         ge=0,
         le=16,
-        description="Samples per pixel (antialiasing); fewer are faster without a GPU. null: 4; "
-        "two_pass without a GPU: none, at a higher resolution.",
+        description="Number of samples per pixel (antialiasing). Fewer samples are faster without "
+        "a GPU. null: 4. For two_pass without a GPU, null means a higher resolution without "
+        "multisampling.",
     )
     correction: Correction | Literal["auto"] = Field(
         default="auto",
-        description="Correction method until a display message sets it. auto: the scene's method, "
-        "else two_pass.",
+        description="Correction method until a display message sets it. auto: the method that the "
+        "scene specifies, or two_pass if the scene specifies none.",
     )
     sheet_shape: SheetShapeMethod | Literal["auto"] = Field(
         default="auto",
-        description="Method that computes the sheet's shape for two_pass. auto: the scene's "
-        "method, else reduced_order.",
+        description="Method that computes the sheet's shape for two_pass. auto: the method that "
+        "the scene specifies, or reduced_order if the scene specifies none.",
     )
     cache_dir: Path | None = Field(
-        default=None, description="Folder of the sheet's deflection shapes. null: the user's cache."
+        default=None,
+        description="Folder of the sheet's deflection shapes. null: the cache folder of the user.",
     )
     stereo: StereoMode | Literal["auto"] = Field(
         default="auto",
         description="Stereo mode until a display message sets it. auto: mono if both eyes of the "
-        "scene have the same position, else side_by_side.",
+        "scene have the same position, otherwise side_by_side.",
     )

@@ -2,7 +2,8 @@
 
 A swap that waits for the projector's refresh blocks only this thread. Meanwhile the event loop
 draws the next image. Both threads have their own OpenGL context, but share textures. There are
-three pairs of textures (triple buffering): one is shown, one is ready, and one is drawn into.
+three pairs of textures (triple buffering): a shown pair, a completely drawn pair, and a pair for
+the next image.
 """
 
 from __future__ import annotations
@@ -24,23 +25,24 @@ from flexsheet.nodes.renderer.monitors import WindowError, glfw_errors
 SLOTS = 3
 IDLE_S = 0.1
 REDRAW_COUNT = 4
-"""Number of times an image is shown again after the window was resized, because drivers may resize
-their buffers up to two swaps later."""
+"""The number of times that an image is shown again after the window was resized, because drivers
+may resize their buffers up to two swaps later."""
 
 _NO_WINDOW: Any = None
 GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
 
 Shown = Callable[[Any, int], None]
-"""Function that the presenter's thread calls with the tag and the swap time, ns, of each image. The
-time is 0 for an image that was replaced by a newer one before it was shown."""
+"""A function that the presenter's thread calls with the tag and the swap time, ns, of each image.
+The time is 0 for an image that a newer image replaced before it was shown."""
 
 
 @dataclass(slots=True)
 class Slot:
-    """Textures of one frame, and how to show them.
+    """The textures of one frame, and the mode in which they are shown.
 
-    In the mode frame_sequential, both textures are used: the images for the left and right eye.
-    Other modes use the first one only. tag: object of the caller that identifies the frame.
+    In the mode frame_sequential, the textures contain the images for the left and the right eye.
+    Other modes use only the first texture. tag: object of the caller that identifies the frame.
+    swap_eyes: whether to exchange the images.
     """
 
     textures: tuple[moderngl.Texture, moderngl.Texture]
@@ -57,7 +59,7 @@ def make_slot(context: moderngl.Context, size: tuple[int, int]) -> Slot:
 
 
 class Presenter:
-    """Thread that owns a window's OpenGL context and shows the images passed to `put`."""
+    """A thread that owns a window's OpenGL context and shows the images passed to `put`."""
 
     def __init__(
         self,
@@ -83,7 +85,7 @@ class Presenter:
         self._thread.start()
 
     def free_slot(self) -> Slot:
-        """Return a slot to draw into, which is neither shown nor waits to be shown."""
+        """Return a slot that is neither shown nor waiting to be shown, for drawing."""
         with self._changed:
             return next(
                 slot
@@ -92,7 +94,7 @@ class Presenter:
             )
 
     def put(self, slot: Slot) -> None:
-        """Show a completely drawn slot at the next refresh; return without waiting for it."""
+        """Show a completely drawn slot at the next refresh, and return immediately."""
         with self._changed:
             superseded, self._ready = self._ready, slot
             self._changed.notify()
@@ -106,7 +108,7 @@ class Presenter:
             self._changed.notify()
 
     def stop(self) -> None:
-        """Stop the thread and wait for its end; it releases its context."""
+        """Stop the thread and wait until it has released its context."""
         with self._changed:
             self._stop = True
             self._changed.notify()
@@ -126,7 +128,10 @@ class Presenter:
             glfw.make_context_current(_NO_WINDOW)
 
     def _next(self) -> tuple[Slot, bool] | None:
-        """Wait for the next slot to show; return it and whether it is new. None after `stop`."""
+        """Wait for the next slot to show.
+
+        Return the slot and whether it is new, or None after a call of `stop`.
+        """
         with self._changed:
             while not self._stop:
                 if self._ready is not None:
@@ -158,13 +163,16 @@ class Presenter:
         quad.wait_until_done()
         swapped_ns = self._now_ns()
         if quad.is_lost():
-            raise WindowError("the graphics driver reports that the graphics card was reset")
+            raise WindowError(
+                "the graphics driver reports that the graphics card was reset; the window is "
+                "opened again"
+            )
         if is_new:
             self._shown(slot.tag, swapped_ns)
 
 
 class _WindowQuad:
-    """Shader program and textures with which a slot's image is drawn in the window.
+    """The shader program and the textures that draw the image of a slot in the window.
 
     Blocking OpenGL functions are called through ctypes, which releases the interpreter lock.
     """
@@ -201,7 +209,10 @@ class _WindowQuad:
 
 
 def _function(name: str, result: Any, *arguments: Any) -> Any:
-    """Return an OpenGL function of the current context, or None if the driver lacks it."""
+    """Return an OpenGL function of the current context, or None if the driver does not provide it.
+
+    result, arguments: types of ctypes.
+    """
     address = glfw.get_proc_address(name)
     if not address:
         return None

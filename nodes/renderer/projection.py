@@ -27,12 +27,12 @@ from flexsheet.nodes.renderer.gl import (
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
 CLIP_DISTANCE_0, CLIP_PLANES = 0x3000, 5
-"""OpenGL's constant GL_CLIP_DISTANCE0, and the number of clip planes in `sheet.vert.glsl`."""
+"""The OpenGL constant GL_CLIP_DISTANCE0, and the number of clip planes in `sheet.vert.glsl`."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScreenRectangle:
-    """Rectangle on the imaginary screen, m."""
+    """A rectangle on the imaginary screen, the plane z = 0, in metres."""
 
     left: float
     bottom: float
@@ -43,7 +43,7 @@ class ScreenRectangle:
     def clip_from_screen(self) -> Floats:
         """Return the matrix (3, 3) from screen coordinates (x, y, 1) to OpenGL clip coordinates.
 
-        It maps the visible rectangle of the screen to the whole image.
+        The matrix maps the rectangle to the whole image.
         """
         return np.array(
             [
@@ -56,9 +56,10 @@ class ScreenRectangle:
 
 @dataclass(frozen=True, slots=True)
 class EyePicture:
-    """Framebuffers of the first pass: the drawn one, and one with the averaged image.
+    """The framebuffers of the first pass.
 
-    They are the same without multisampling.
+    samples: framebuffer for drawing. resolved: framebuffer with the averaged image, which is the
+    same without multisampling. image: texture of `resolved`.
     """
 
     samples: moderngl.Framebuffer
@@ -89,12 +90,13 @@ class EyePicture:
 
 
 class TwoPassProjector:
-    """Renderer of the two-pass method, with framebuffers of the first pass and sheet buffers."""
+    """A renderer of the two-pass method."""
 
     def __init__(self, context: moderngl.Context, *, samples: int = SAMPLES) -> None:
         """Prepare the shaders.
 
-        samples: samples per pixel of the first pass, limited by the driver's maximum; 0: one.
+        samples: samples per pixel of the first pass, which the maximum of the driver limits; 0 for
+        no multisampling.
         """
         self._context, self._samples = context, min(samples, context.max_samples)
         self._pictures: dict[tuple[int, int], EyePicture] = {}
@@ -116,7 +118,7 @@ class TwoPassProjector:
     ) -> None:
         """Draw the projector's image for one eye into a part of the canvas's target framebuffer.
 
-        window: rectangle that the eye's image shows. size: its width and height, px.
+        window: rectangle that the eye's image shows. size: width and height of the eye's image, px.
         """
         if size not in self._pictures:
             self._pictures[size] = EyePicture.make(self._context, size, self._samples)
@@ -145,7 +147,7 @@ class TwoPassProjector:
         self._context.enable(moderngl.CULL_FACE)
 
     def _sheet_array(self, sheet: SheetMesh, program: moderngl.Program) -> moderngl.VertexArray:
-        """Return the sheet's vertex array; update its buffers if the sheet has changed."""
+        """Return the vertex array of the sheet, after an update of its buffers if necessary."""
         if self._buffers is None or sheet is not self._drawn:
             vertices = np.ascontiguousarray(sheet.vertices, np.float32)
             if self._buffers is None or not self._has_triangles(sheet.triangles):
@@ -164,9 +166,9 @@ class TwoPassProjector:
         return self._arrays[program.glo]
 
     def _has_triangles(self, triangles: NDArray[np.int32]) -> bool:
-        """Return whether the buffers contain these triangles.
+        """Return whether the buffers contain these triangles (t, 3).
 
-        Equal grids usually share one array, so comparing contents is rarely needed.
+        Equal grids usually share one array, so that contents are rarely compared.
         """
         drawn = None if self._drawn is None else self._drawn.triangles
         return drawn is triangles or (drawn is not None and np.array_equal(drawn, triangles))

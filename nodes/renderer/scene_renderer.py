@@ -58,37 +58,38 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 )
 
 OVERSAMPLING, UNSAMPLED_OVERSAMPLING = 1.5, 2.5
-"""Ratio of the resolution of the eye's image (first pass of two_pass) to that of the projector,
-with and without multisampling. Without it, a software driver needs a quarter less time, and edges
-are as smooth."""
+"""The ratios of the resolution of the eye's image (first pass of two_pass) to that of the
+projector, with and without multisampling. Without multisampling, a software driver needs a quarter
+less time for equally smooth edges."""
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
-"""Margin of the rectangle around the object in the eye's image, and step to which its edges are
-rounded. Rounding avoids that the outline flickers when the object moves."""
+"""The margin of the rectangle around the object in the eye's image, and the step to which the edges
+of the rectangle are rounded. Rounding prevents flicker of the outline when the object moves."""
 MAX_WINDOW_M = 0.3
-"""Maximum distance of the rectangle's edges from the screen's centre; the sheet is smaller."""
+"""The maximum distance of the edges of the drawn rectangle from the centre of the screen. The sheet
+is smaller."""
 MIN_REPORTED_FRACTION = 0.005
-"""Minimum occluded fraction of the sheet (see `occluded_fraction`) that is reported."""
+"""The minimum fraction of the sheet without light due to folds that is reported."""
 NO_SHAPES_NOTE = (
-    "no deflection shapes in the cache: a pushed sheet is drawn as four triangles "
-    "(flexsheet precompute)"
+    "the cache contains no deflection shapes, so a pushed sheet is drawn as four triangles; "
+    "run flexsheet precompute"
 )
 
 GRID_WINDOW = ScreenRectangle(-0.151, -0.151, 0.302, 0.302)
 
 
 def projector_homography(scene: Scene) -> Floats:
-    """Return the homography (3, 3) from the world's plane z = 0 to the projector's pixels.
+    """Return the homography (3, 3) from the plane z = 0 of the world frame to projector pixels.
 
-    Points of the plane (the imaginary screen of Furukawa et al. 2007) are (x, y) in m. The pixels
-    are those without lens distortion.
+    Points of the plane, the imaginary screen of Furukawa et al. 2007, are (x, y) in m. The pixels
+    are those of a projector without lens distortion.
     """
     projector = require_projector(scene)
     return pixel_from_screen(projector.lens, pose_matrix(projector.world_from_projector))
 
 
 class SceneRenderer:
-    """Renderer of the projector's images for one scene."""
+    """A renderer of the projector's images for one scene."""
 
     def __init__(
         self,
@@ -102,10 +103,11 @@ class SceneRenderer:
     ) -> None:
         """Create the graphics objects of the scene.
 
-        spacing_m: distance between the vertices of the object. samples: samples per pixel; None:
-        `SAMPLES`, but no multisampling in the first pass of two_pass with a software driver. basis:
-        deflection shapes of the sheet; None: a pushed sheet is drawn as four triangles. Raises
-        ValueError if the projector's lens maps several rays to one pixel.
+        spacing_m: distance between the vertices of the object. samples: samples per pixel; None for
+        `SAMPLES`, without multisampling in the first pass of two_pass with a software driver.
+        basis: deflection shapes of the sheet; None to draw a pushed sheet as four triangles.
+        sheet_shape: method that computes the shape of the sheet. Raise ValueError if the
+        projector's lens maps several rays to one pixel.
         """
         projector, geometry = require_projector(scene), scene.object.geometry
         self.scene = scene
@@ -166,16 +168,16 @@ class SceneRenderer:
         )
 
     def set_skin(self, skin: Skin) -> None:
-        """Set the skin, the surface mesh of the solver whose displacements deform the drawn one."""
+        """Set the surface mesh of the soft-body solver, whose displacement deforms the object."""
         vertices = skin.vertices_world_m.astype(np.float64)
         self._deformation = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
 
     def deform(self, body: SoftBody | None) -> None:
-        """Deform the drawn surface by the solver's response; None draws it at rest.
+        """Deform the drawn surface by a response of the soft-body solver.
 
-        Raises ValueError, and leaves the surface unchanged, if the displacement does not fit the
-        current skin or is not finite.
+        body: response; None to draw the surface at rest. Raise ValueError, without a change of the
+        surface, if the displacement does not fit the current skin or is not finite.
         """
         if body is self._drawn_body:
             return
@@ -183,7 +185,10 @@ class SceneRenderer:
             self.canvas.set_shape(self._surface.rest_world_m, self._surface.normals_world)
             self._box_world = _box_around(self._surface.rest_world_m)
         elif self._deformation is None:
-            raise ValueError("topic soft_body: a message was received before the skin it refers to")
+            raise ValueError(
+                "topic soft_body: a message was received before the skin to which it refers; "
+                "publish the skin first"
+            )
         else:
             moved = self._deformation.apply(body.displacement_world_m)
             self.canvas.set_moved(moved)
@@ -195,8 +200,9 @@ class SceneRenderer:
     ) -> DrawStyle:
         """Return the drawing style for a display message.
 
-        If the message asks for marks, they are at the finger and at the target's contact point.
-        finger_tip: (3,), world, at the display time, or None if it is unknown.
+        If the message requests marks, they are at the finger and at the contact point of the
+        target. finger_tip (3,): position at the display time, world frame, m; None if it is
+        unknown.
         """
         marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
         return DrawStyle(
@@ -209,7 +215,8 @@ class SceneRenderer:
         )
 
     def surface_point(self, world_point: Floats) -> Floats:
-        """Return the point (3,), world, of the undeformed object nearest to a world point (3,)."""
+        """Return the point (3,) of the undeformed object nearest to a point (3,), world frame,
+        m."""
         start = None
         if self._near is not None:
             _, vertex = self._near.query(world_point)
@@ -218,7 +225,7 @@ class SceneRenderer:
         return apply(self._world_from_object, nearest.point)
 
     def sheet_at_rest(self) -> SheetPose:
-        """Return an unstretched sheet on the imaginary screen, used before the first arm poses."""
+        """Return an unstretched sheet on the plane z = 0, for use before the first arm poses."""
         half = 0.5 * self.scene.sheet.width_m * np.array([1.0, 0.0, 0.0])
         left, right = transform(np.eye(3), -half), transform(np.eye(3), half)
         return SheetPose(np.eye(4), corners(left, right, self.scene.sheet.height_m), None)
@@ -226,13 +233,16 @@ class SceneRenderer:
     def usable(self, sheet: SheetPose, centre: Floats | None = None) -> bool:
         """Return whether the eyes see the sheet's front and the projector illuminates its back.
 
-        centre: (3,), world, midpoint of the eyes; None: midpoint of the scene's eyes.
+        centre (3,): midpoint of the eyes, world frame, m; None for the eyes of the scene.
         """
         eye = self.scene.eyes.centre_world_m if centre is None else centre
         return is_plane_usable(sheet.plane, eye, self._world_from_projector[:3, 3])
 
     def eyes(self, display: Display) -> Floats:
-        """Return the positions (2, 3), world, of the scene's eyes; in mono mode they are equal."""
+        """Return the positions (2, 3) of the scene's eyes, world frame, m.
+
+        The positions are equal in mono mode.
+        """
         return both_eyes(self.scene.eyes, display.stereo)
 
     def draw(
@@ -245,12 +255,12 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image; return it, (height, width, 3), if `read` is true.
+        """Draw the projector's image, and return it (height, width, 3) if `read` is true.
 
-        eyes: positions (1 or 2, 3), world; None: the scene's eyes. Two eyes share the image, except
-        in the mode frame_sequential. It has two images, of which the left eye's is returned.
-        drawn: called with the index of each image when it is in `canvas.resolved`, before the next
-        one overwrites it. Raises ValueError if the sheet's pose is not finite.
+        eyes (1 or 2, 3): positions, world frame, m; None for the eyes of the scene. Two eyes share
+        the image, except in the mode frame_sequential. This mode has two images, of which the image
+        of the left eye is returned. drawn: function that receives the index of each image when the
+        image is in `canvas.resolved`. Raise ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite; check the poses of the arms")
@@ -270,7 +280,7 @@ class SceneRenderer:
         )
 
     def place_check_marks(self, sheet: SheetPose) -> CheckMarks:
-        """Store the projected marks that check the calibrations; the next images contain them."""
+        """Place the projected marks that check the calibrations. The next images contain them."""
         note, pushed_point, deeper = self.note, sheet.pushed_point, None
         if pushed_point is not None and self.sheet_shape == "reduced_order" and self.basis:
             deeper_point = pushed_point - FINGER_STEP_M * sheet.world_from_sheet[:3, 2]
@@ -282,7 +292,10 @@ class SceneRenderer:
         return self.check_marks
 
     def _draw_check_marks(self, part: ImagePart) -> None:
-        """Draw white squares into a part of the image; the display stretches it to the whole."""
+        """Draw the check marks as white squares into a part of the image.
+
+        The display stretches the part to the size of the image.
+        """
         canvas, (left, bottom, width, height) = self.canvas, part.viewport
         scale = np.array([width / canvas.width_px, height / canvas.height_px])
         side_px = self.check_marks.side_px
@@ -303,7 +316,10 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw the projector's image like `draw`, by two_pass with a given mesh of the sheet."""
+        """Draw the projector's image by the method two_pass with a given mesh of the sheet.
+
+        The arguments and the result are those of `draw`.
+        """
 
         whole = self.canvas.width_px, self.canvas.height_px
 
@@ -326,7 +342,7 @@ class SceneRenderer:
     ) -> EyeView:
         """Return the geometry of one eye's image.
 
-        screen: actual screen for which the image is corrected, or None.
+        eye (3,): position, world frame, m. screen: sheet for which the image is corrected, or None.
         """
         projector = self._world_from_projector[:3, 3]
         return EyeView(eye, projector, screen, self._clip_from_screen, self._lens, grey)
@@ -362,9 +378,10 @@ class SceneRenderer:
         return image
 
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
-        """Return the sheet's mesh, computed by the method `sheet_shape`.
+        """Compute the mesh of the sheet by the method `sheet_shape`.
 
-        Without deflection shapes, four triangles replace reduced_order. `note` reports limits.
+        Without deflection shapes, four triangles replace the method reduced_order. The attribute
+        `note` then reports limits.
         """
         if self.sheet_shape != "reduced_order" or self.basis is None:
             lacks_shapes = self.sheet_shape == "reduced_order"
@@ -378,7 +395,7 @@ class SceneRenderer:
         return mesh
 
     def _range_note(self, sheet: SheetPose) -> str:
-        """Return a note if the push is too deep for four triangles, else an empty text."""
+        """Return a note if the push is too deep for four triangles, otherwise an empty text."""
         if sheet.pushed_point is None:
             return ""
         depth_m = -float(apply(inverse(sheet.world_from_sheet), sheet.pushed_point)[2])
@@ -386,11 +403,11 @@ class SceneRenderer:
             return ""
         return (
             f"the push depth of {1e3 * depth_m:.0f} mm exceeds the maximum for four triangles, "
-            f"{1e3 * MAX_TRIANGLES_DEPTH_M:g} mm; use sheet_shape: reduced_order"
+            f"{1e3 * MAX_TRIANGLES_DEPTH_M:g} mm; set sheet_shape to reduced_order"
         )
 
     def _report_folds(self, mesh: SheetMesh, eye: Floats) -> None:
-        """Compute the fraction of the sheet that gets no light due to folds; add it to `note`."""
+        """Compute the fraction of the sheet that gets no light due to folds, and report it."""
         self.occluded_fraction = occluded_fraction(mesh, eye, self._world_from_projector[:3, 3])
         if self.occluded_fraction > MIN_REPORTED_FRACTION:
             folds = (
@@ -399,7 +416,7 @@ class SceneRenderer:
             self.note = "; ".join(filter(None, (self.note, folds)))
 
     def _window(self, eye: Floats) -> ScreenRectangle:
-        """Return the rectangle of the imaginary screen that the object covers, seen from an eye.
+        """Return the rectangle of the plane z = 0 that the object covers as seen from an eye (3,).
 
         Points that are not in front of the eye are excluded. `MAX_WINDOW_M` limits the rectangle.
         """

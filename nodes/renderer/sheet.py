@@ -18,15 +18,15 @@ from flexsheet.nodes.renderer.correction import (
 )
 
 MIN_EDGE_DISTANCE_M = 0.05
-"""Minimum plausible distance between the sheet's edges."""
+"""The minimum plausible distance between the sheet's edges."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPose:
-    """Sheet as predicted for the display time of a frame.
+    """The sheet as predicted for the display time of a frame, in the world frame.
 
-    world_from_sheet: (4, 4). corners: (4, 3), world: left bottom, right bottom, right top, left
-    top. pushed_point: (3,), world, fingertip that pushes the sheet, or None.
+    world_from_sheet (4, 4): pose. corners (4, 3): left bottom, right bottom, right top, left
+    top, m. pushed_point (3,): fingertip that pushes the sheet, m, or None.
     """
 
     world_from_sheet: Floats
@@ -45,7 +45,7 @@ class SheetPose:
 
     @property
     def contact_point(self) -> Floats:
-        """Return the pushed point (3,), world; if there is no push, the centre of the sheet."""
+        """Return the pushed point (3,), m, or the centre of the sheet if there is no push."""
         return self.plane.point if self.pushed_point is None else self.pushed_point
 
 
@@ -60,10 +60,10 @@ def estimate_sheet(
 ) -> SheetPose | None:
     """Predict the sheet from the measured poses (4, 4) of its edges.
 
-    twist_world: (6,), linear and angular velocity of the sheet. ahead_s: time of the prediction
-    after the measurement. finger_tip: (3,), world, at that time, or None; it pushes the sheet if it
-    is below the sheet's plane and within its outline. Return None if the edges are closer than
-    `MIN_EDGE_DISTANCE_M`, or a value is not finite.
+    twist_world (6,): linear (m/s) and angular (rad/s) velocity of the sheet. ahead_s: time from the
+    measurement to the prediction. finger_tip (3,): predicted fingertip, world frame, m, or None. It
+    pushes the sheet if it is below the plane and within the outline of the sheet. Return None if
+    the edges are closer than `MIN_EDGE_DISTANCE_M`, or if a value is not finite.
     """
     left, right = world_from_left_edge, world_from_right_edge
     if not all(np.isfinite(each).all() for each in (left, right, twist_world)):
@@ -84,9 +84,9 @@ def estimate_sheet(
 
 
 def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
-    """Return the screen for the equations of the module `correction`.
+    """Return the screen for which a method corrects the image.
 
-    Return None for correction methods that do not use these equations.
+    Return None for the methods none and two_pass, which need no such screen.
     """
     if method in ("none", "two_pass"):
         return None

@@ -1,4 +1,4 @@
-"""Build the mesh of the sheet for the two-pass correction: flat, four triangles, or deflected."""
+"""Build a flat, four-triangle or deflected mesh of the sheet for the two-pass correction."""
 
 from __future__ import annotations
 
@@ -19,18 +19,20 @@ from flexsheet.nodes.renderer.sheet import SheetPose
 Indices = NDArray[np.int32]
 
 MAX_TRIANGLES_DEPTH_M = 0.0035
-"""Maximum push depth for which four triangles are as accurate as required."""
+"""The push depth at which the shape of four triangles causes an rms error of half a millimetre, the
+maximum for this method."""
 
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
-"""Vertex indices of the triangles between adjacent corners (0 to 3) and the pushed point (4)."""
+"""The vertex indices of the triangles between adjacent corners (0 to 3) and the pushed point
+(4)."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetMesh:
-    """Mesh of the sheet.
+    """A mesh of the sheet.
 
-    vertices: (n, 3), world. triangles: (m, 3), counter-clockwise as seen by the user. note: reason
-    why the shape is inaccurate; empty if it is accurate.
+    vertices (n, 3): world frame, m. triangles (m, 3): counter-clockwise as seen by the user. note:
+    reason why the shape is inaccurate; empty if the shape is accurate.
     """
 
     vertices: Floats
@@ -39,20 +41,24 @@ class SheetMesh:
 
 
 def flat_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the mesh of a sheet that nothing pushes: four triangles between corners and centre."""
+    """Return the mesh of an undeflected sheet, with four triangles between corners and centre."""
     vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
     return SheetMesh(vertices, PYRAMID)
 
 
 def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
-    """Return the four triangles between corners and pushed point that Furukawa et al. 2007 use."""
+    """Return the mesh of four triangles between the corners of the sheet and the pushed point.
+
+    Source: Furukawa et al. 2007.
+    """
     if sheet.pushed_point is None:
         return flat_mesh(sheet)
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)
 
 
 def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
-    """Return the same surface with smaller triangles, since lens distortion acts on vertices only.
+    """Return the same surface with smaller triangles, because lens distortion is applied at
+    vertices.
 
     halvings: number of times that each edge is halved.
     """
@@ -71,7 +77,8 @@ def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
 
 
 _grid_triangles = cache(triangulate_grid)
-"""Cached `triangulate_grid`. Equal grids share one array, so that they are recognised quickly."""
+"""A cached version of `triangulate_grid`. Equal grids share one array, which makes comparisons
+fast."""
 
 
 def deflected_mesh(
@@ -79,9 +86,8 @@ def deflected_mesh(
 ) -> SheetMesh:
     """Return the mesh of a sheet that is stretched, sags by its weight and is pushed by a finger.
 
-    Without deflection, the sheet is the ruled surface between its edges. The deflection of a flat
-    sheet is added to it. Sag and indentation are superposed: the indentation is the depth of the
-    finger below the sagging sheet.
+    The deflection of a flat sheet is added to the ruled surface between the edges. Sag and
+    indentation are superposed. The indentation is the depth of the finger below the sagging sheet.
     """
     rubber = basis.rubber
     stretch = sheet.edge_distance_m / rubber.width_m
@@ -123,10 +129,11 @@ def deflected_mesh(
 
 
 def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
-    """Estimate the fraction (0..1) of the sheet's visible area that is dark because of folds.
+    """Estimate the fraction, from 0 to 1, of the sheet's visible area that is dark due to folds.
 
     A triangle gets no light if it faces away from the projector, or if the projector sees it
-    edge-on (`GRAZING_SINE`). Its area counts twice, since its shadow has about the same area.
+    edge-on. The area of such a triangle counts twice, because its shadow has about the same area.
+    eye, projector (3,): positions, world frame, m.
     """
     # One array for each coordinate is several times faster than an array of points.
     coordinates = np.ascontiguousarray(mesh.vertices.T)

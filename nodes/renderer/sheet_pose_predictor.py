@@ -16,10 +16,10 @@ from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 
 
 class SheetPosePredictor:
-    """Predictor of the sheet's pose from the measured flange poses of the arms.
+    """A predictor of the sheet's pose from the measured flange poses of the arms.
 
-    If there are no valid poses newer than `max_age`, it returns the last valid sheet, and `note`
-    contains the reason. Otherwise `note` is empty.
+    If there are no valid poses newer than `max_age`, the predictor returns the last valid sheet,
+    and the attribute `note` contains the reason. Otherwise, `note` is empty.
     """
 
     def __init__(self, max_age: MaxAge) -> None:
@@ -38,10 +38,10 @@ class SheetPosePredictor:
         horizon_s: float,
         eye: Floats,
     ) -> SheetPose:
-        """Return the sheet predicted for `horizon_s` from now.
+        """Return the sheet as predicted for a time `horizon_s` after the current time.
 
-        Before the first valid pose, return the sheet at rest. finger_tip: (3,), world, at the
-        predicted time, or None. eye: (3,), world, midpoint of the eyes.
+        Before the first valid pose, return the sheet at rest. finger_tip (3,): fingertip at the
+        predicted time, world frame, m, or None. eye (3,): midpoint of the eyes, world frame, m.
         """
         sheet, age_s = None, max(left.age_s(), right.age_s())
         if (
@@ -77,9 +77,9 @@ class SheetPosePredictor:
 def predict_fingertip(
     finger: Input[Fingertip], horizon_s: float, *, max_age_s: float
 ) -> Floats | None:
-    """Return the fingertip (3,), world, predicted for `horizon_s` from now.
+    """Return the fingertip (3,), world frame, m, at a time `horizon_s` after the current time.
 
-    Return None if the fingertip message is invalid, or older than `max_age_s`.
+    Return None if the fingertip message is invalid or older than `max_age_s`.
     """
     age_s = finger.age_s()
     if finger.message is None or not finger.message.valid or age_s > max_age_s:

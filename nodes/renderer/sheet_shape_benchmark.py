@@ -29,8 +29,8 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 )
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats], Floats]
-"""Function that returns points (n, 3), world, of the reference sheet. Its arguments are the scene,
-the poses (4, 4) of the sheet's left and right edge, and the fingertip (3,)."""
+"""A function that returns points (n, 3) of the reference sheet, world frame, m. Its arguments are
+the scene, the poses (4, 4) of the sheet's left and right edges, and the fingertip (3,), m."""
 
 WITHOUT_SHAPES = ("four_triangles",)
 METHODS = (*WITHOUT_SHAPES, "reduced_order", "membrane")
@@ -41,7 +41,8 @@ SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
     ("near the clamp", 0.29, 0.0),
     ("near the free edge", 0.0, 0.35),
 )
-"""Positions of the push: name, and x and y from the centre, as fractions of width and height."""
+"""The positions of the push: a name, and x and y from the centre as fractions of width and
+height."""
 
 
 def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
@@ -52,7 +53,7 @@ def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> F
     return Family(
         name="sheet-shape",
         unit="mm",
-        reference="the twin's membrane, rms height",
+        reference="the simulated membrane, rms height",
         methods=METHODS if solved else WITHOUT_SHAPES,
         trials=partial(_trials, reference, solved),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
@@ -119,7 +120,10 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 
 
 def height_error_mm(mesh: SheetMesh, *, truth: Floats) -> float:
-    """Return the rms error of a mesh's height (world z) at true points of the sheet (n, 3), mm."""
+    """Return the rms error of the height (world z) of a mesh, in mm.
+
+    truth (n, 3): points of the reference sheet, m.
+    """
     heights = LinearNDInterpolator(mesh.vertices[:, :2], mesh.vertices[:, 2])(truth[:, :2])
     errors = (heights - truth[:, 2])[np.isfinite(heights)]
     return 1e3 * float(np.sqrt(np.mean(errors**2)))

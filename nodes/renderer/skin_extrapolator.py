@@ -14,18 +14,19 @@ from flexsheet.messages.types import SoftBody
 
 HISTORY = 8
 MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
-"""Limits of the time between the older and the newest response. A shorter time amplifies noise, and
-a longer one causes lag."""
+"""The limits of the time between the older and the newest response. A shorter time amplifies noise,
+and a longer time causes lag."""
 
 MAX_PERIOD_S = 0.12
-"""Maximum time between the last two responses, which are used if the solver is slower."""
+"""The maximum time between the last two responses of a slow solver that are used for
+extrapolation."""
 
 MAX_EXTRAPOLATION_S = 0.06
-"""Maximum extrapolation time."""
+"""The maximum extrapolation time, in seconds."""
 
 
 class SkinExtrapolator:
-    """Linear extrapolator of the solver's recent responses."""
+    """A linear extrapolator of the recent responses of the soft-body solver."""
 
     def __init__(self) -> None:
         self._history: deque[tuple[int, SoftBody]] = deque(maxlen=HISTORY)
@@ -44,8 +45,8 @@ class SkinExtrapolator:
     def extrapolate(self, at_ns: int, clock_id: str) -> tuple[SoftBody | None, int]:
         """Return the response extrapolated to the time `at_ns` of a clock, and its time, ns.
 
-        Return the newest response unchanged if it has another clock, is later than `at_ns`, or no
-        earlier one is suitable. Return None and 0 before the first response.
+        Return the newest response unchanged if it has another clock, if it is later than `at_ns`,
+        or if no earlier response is suitable. Return None and 0 before the first response.
         """
         if not self._history:
             return None, 0
@@ -63,7 +64,7 @@ class SkinExtrapolator:
         return body, newest_ns + round(ahead_s * 1e9)
 
     def _before(self, newest_ns: int) -> tuple[SoftBody, float] | None:
-        """Return an older response that is suitable, and the time from it to the newest, s."""
+        """Return a suitable older response, and the time from it to the newest response, s."""
         older = [((newest_ns - at_ns) * 1e-9, body) for at_ns, body in list(self._history)[:-1]]
         for base_s, body in older:
             if MIN_BASE_S <= base_s <= MAX_BASE_S:

@@ -331,7 +331,7 @@ def _finish_mesh(
     order = np.lexsort((angle, nodes[:, 0], level))
     new = np.empty(len(nodes), dtype=np.int64)
     new[order] = np.arange(len(nodes))
-    nodes, angle, level = nodes[order], angle[order], level[order]
+    nodes, angle = nodes[order], angle[order]
     elements, faces, side, rim = new[elements], new[faces], new[side], np.sort(new[rim])
 
     fixed = np.zeros(len(nodes), dtype=bool)
@@ -347,7 +347,6 @@ def _finish_mesh(
     return SolidMesh(
         nodes=nodes,
         elements=elements,
-        slab=level // 2,
         fixed=fixed,
         skin=skin,
         skin_triangles=np.searchsorted(skin, faces[:, SUBTRIANGLES].reshape(-1, 3)).astype(

@@ -34,19 +34,15 @@ class UnfitMeshError(FlexsheetError, ValueError):
 class SolidMesh:
     """A solid mesh of 10-node tetrahedra.
 
-    nodes (n, 3): positions, m, mesh frame. elements (e, 10): node indices. slab (n,):
-    index of the slice along one axis that contains the node. The nodes of one element are in at
-    most two successive slabs, and nodes are sorted by slab. fixed (n,): whether each node is fixed.
-    skin (s,): nodes on the surface. skin_triangles (t, 3): indices into `skin`, ordered for outward
-    normals.
-    contact_nodes (m,): nodes that the finger can touch, a sorted subset of `skin`. contact_normals
-    (m, 3): outward normals at these nodes. contact_faces (f, 6): six-node
-    triangles as indices into `contact_nodes`, ordered for outward normals.
+    nodes (n, 3): positions, m, mesh frame. elements (e, 10): node indices. fixed (n,): whether each
+    node is fixed. skin (s,): nodes on the surface. skin_triangles (t, 3): indices into `skin`,
+    ordered for outward normals. contact_nodes (m,): nodes that the finger can touch, a sorted
+    subset of `skin`. contact_normals (m, 3): outward normals at these nodes. contact_faces (f, 6):
+    six-node triangles as indices into `contact_nodes`, ordered for outward normals.
     """
 
     nodes: Floats
     elements: Ints
-    slab: Ints
     fixed: Bools
     skin: Ints
     skin_triangles: NDArray[np.int32]
@@ -148,7 +144,7 @@ def make_solid_mesh(
     order = np.lexsort((nodes[:, 2], nodes[:, 1], nodes[:, 0], level))
     new = np.empty(len(nodes), dtype=np.int64)
     new[order] = np.arange(len(nodes))
-    nodes, level, elements = nodes[order], level[order], new[elements]
+    nodes, elements = nodes[order], new[elements]
     faces = boundary_faces(elements)
     skin = np.unique(faces)
     on_hull = np.zeros(len(nodes), dtype=bool)
@@ -157,7 +153,6 @@ def make_solid_mesh(
     whole = SolidMesh(
         nodes=nodes,
         elements=elements,
-        slab=level,
         fixed=fixed[order] & on_hull,
         skin=skin,
         skin_triangles=triangles.astype(np.int32),
