@@ -132,7 +132,6 @@ def test_the_requested_push_survives_scenes_and_lifting(scene: Scene) -> None:
 commands = st.one_of(
     st.tuples(st.just("push"), st.floats(0.0, 0.03)),
     st.tuples(st.just("move_to"), st.floats(-0.05, 0.05), st.floats(-0.03, 0.03)),
-    st.tuples(st.just("lift")),
     st.tuples(st.just("lift_or_lower")),
     st.tuples(st.just("scene"), st.booleans()),
 )
@@ -159,7 +158,7 @@ def test_the_finger_depends_only_on_the_present_request(
         elif name == "move_to":
             position = (values[0], values[1])
         else:
-            lifted = name == "lift" or not lifted
+            lifted = not lifted
     led = np.array([0.0, 0.0, 0.08])
     if commanded:
         ray = np.array([*position, 1.5]), np.array([0.0, 0.0, -1.0])

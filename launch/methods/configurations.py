@@ -21,7 +21,8 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.benchmarks import LINEAR_DEPTH_M
 from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetPush
 from flexsheet.nodes.planner.sheet_force import make_rubber
-from flexsheet.nodes.renderer.benchmarks import MAX_TRIANGLES_DEPTH_MM, is_in_range
+from flexsheet.nodes.renderer.benchmarks import is_in_range
+from flexsheet.nodes.renderer.sheet_mesh import MAX_TRIANGLES_DEPTH_M
 
 NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
     "marker": ("triangulator", "marker"),
@@ -127,7 +128,7 @@ def choose_cheapest(scene: Scene) -> Methods:
     corrections = ("one_plane", "four_triangles", "two_pass")
     limits = {"tilt_deg": min(float(tilt_deg), 50.0), "push_mm": 1e3 * depth_m}
     correction = next((one for one in corrections if is_in_range(one, **limits)), "two_pass")
-    is_flat = 1e3 * depth_m <= MAX_TRIANGLES_DEPTH_MM
+    is_flat = depth_m <= MAX_TRIANGLES_DEPTH_M
     return Methods.model_validate(
         {
             "marker": "moments",
