@@ -50,8 +50,7 @@ MALFORMED = (
     "the console cannot read this HTTP request; open the address of the console in a browser"
 )
 CLOSE_TIMEOUT_S = 1.0
-"""The time for which a refused connection stays open, so that the client can read the reason, in
-seconds."""
+"""The time for which a refused connection stays open so that the client can read the reason."""
 
 PageRequest = Callable[[Any, Request], Response | None]
 
@@ -66,8 +65,8 @@ class ConsoleError(FlexsheetError, RuntimeError):
 def read_token(path: Path) -> str:
     """Read the access token from a file.
 
-    Raise ConsoleError if the file cannot be read, if other users can read it, or if the token is
-    too short or contains other characters than letters and digits.
+    Raise ConsoleError if the file cannot be read or other users can read it. Also raise it if the
+    token is too short or contains other characters than letters and digits.
     """
     try:
         mode, text = path.stat().st_mode, path.read_text().strip()
@@ -111,10 +110,6 @@ class AccessControl:
             return make_bad_request()
 
     def _refusal(self, request: Request) -> Response | None:
-        """Return the response that refuses a request, or None if the request is allowed.
-
-        Raise ValueError or MultipleValuesError for a malformed request.
-        """
         repeated = [name for name in SINGLE_HEADERS if len(request.headers.get_all(name)) > 1]
         if repeated or "Host" not in request.headers:
             return make_bad_request()

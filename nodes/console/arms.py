@@ -54,8 +54,7 @@ BRACKET_WIDTH_M = 0.012
 """The width of the bar between a flange and its clamp."""
 
 CLAMP_SIZE_M = (0.012, 1.04, 0.012)
-"""The size of the bar that clamps the sheet: width, ratio of the length to that of the edge, and
-thickness."""
+"""The width, the ratio of length to edge length, and the thickness of the clamp of the sheet."""
 
 
 def compute_link_poses(
@@ -116,7 +115,6 @@ def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDAr
 
 
 def make_hull(points: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Return vertices (k, 3) and counter-clockwise triangles (t, 3) of the hull of points (n,
-    3)."""
+    """Return the convex hull of points (n, 3) as vertices (k, 3) and triangles (t, 3)."""
     hull = trimesh.convex.convex_hull(points)
     return np.asarray(hull.vertices), np.asarray(hull.faces, dtype=np.int32)

@@ -109,8 +109,7 @@ class SceneController:
         self._due_s = now_s + SETTLE_S
 
     def apply_sliders(self, now_s: float) -> bool:
-        """Publish the changed scene if the sliders have rested, and return whether it was
-        published.
+        """Publish the changed scene if the sliders rest, and return whether it was published.
 
         Raise SceneChoiceError for invalid slider positions.
         """

@@ -17,7 +17,7 @@ def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.in
     """Duplicate the vertices at sharp edges, so that each side of an edge has its own vertices.
 
     vertices (n, 3), triangles (t, 3): mesh. Return the index (k,) of the original vertex for each
-    of the k new vertices, and the triangles (t, 3) with indices of the new vertices.
+    new vertex, and the triangles (t, 3) with indices of the new vertices.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

@@ -141,8 +141,7 @@ class Console(Node):
         await asyncio.to_thread(self._server.stop)
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
-        """Store a message until it is drawn, or process it if all messages of its topic are
-        needed."""
+        """Store the message until it is drawn. Process it now if its topic needs every message."""
         source = self.inputs[port]
         source.counts.count(header, self.clock.now_ns())
         superseded = self._latest.put(source.topic.name, message)

@@ -182,7 +182,6 @@ class Operator:
             self._page.record.show_replay(replay)
 
     def _follow_scene(self) -> None:
-        """Draw the scene again when it has changed."""
         recorded = None
         if self.controller.replay.timeline is not None:
             recorded = self.source.latest("scene", Scene)

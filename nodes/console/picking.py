@@ -1,5 +1,4 @@
-"""Compute the fingertip position that the mouse selects on the object, and the path to the
-position."""
+"""Compute the fingertip position that the mouse selects on the object, and a path to it."""
 
 from __future__ import annotations
 

@@ -70,8 +70,7 @@ VIEWPOINTS: dict[str, tuple[Any, Any] | None] = {
     "near": ((0.13, 0.1, 0.6), (0.0, 0.0, 0.0)),
     EYE_VIEW: None,
 }
-"""The camera position and the target of each view, world frame, m; None for a position between the
-user's eyes."""
+"""The camera position and target of each view, world frame, m, or None for the user's eyes."""
 
 Drag = Callable[[Floats, Floats], None]
 """A callback that receives the origin (3,), m, and the direction (3,) of a ray, world frame, from
@@ -218,10 +217,7 @@ class SceneView:
         )
 
     def _add_arm(self, side: str, arm: ArmSpec, height_m: float) -> list[Any]:
-        """Add the frames and boxes of an arm's links, bracket and clamp, and return the frames.
-
-        height_m: height of the sheet.
-        """
+        """Add the frames and boxes of an arm's links, bracket and clamp, and return the frames."""
         frames = [
             self._add("Arms", self._scene.add_frame(f"/{side}/{link}", show_axes=False))
             for link in range(7)
@@ -319,7 +315,6 @@ class SceneView:
             )
 
     def _add_names(self, scene: Scene) -> None:
-        """Add the name labels of the devices, the finger and the sheet."""
         camera = scene.camera
         baseline_m = -float(camera.right_from_left[0, 3])
         centre = apply(pose_matrix(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0]))

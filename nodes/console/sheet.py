@@ -21,8 +21,7 @@ TRIANGLES = triangulate_grid(ROWS, COLUMNS)
 """The triangles (t, 3) of the sheet's grid, counter-clockwise as seen by the user."""
 MIN_EDGE_DISTANCE_M = 0.05
 NEAR = 6
-"""The number of rows and columns of cells around a vertex that are tested for an intersection with
-a ray."""
+"""The number of rows and columns of cells near a vertex that are tested against a ray."""
 
 MIRRORED = 2
 """The number of mirror images of the finger beyond each free edge."""

@@ -28,9 +28,9 @@ from flexsheet.nodes.models.shapes import Shape, make_shape
 QUICK_TABLE = "quick_table"
 """The name of the method that uses the coarse table, which is computed first from few snapshots."""
 LINEAR_ERROR_RATIO, TABLE_ERROR_RATIO, UNCORRECTED_RATIO, QUICK_EXTRA_RATIO = 0.25, 0.03, 0.15, 0.07
-"""The stated relative errors of the force of the linear method and of the complete table with and
-without correction by a push on a fine mesh, and the additional error of the coarse table. They hold
-at depths above 1 mm for 95 % of the touchable nodes (docs/soft-body-verification.md)."""
+"""The stated relative errors of the force. They belong to the linear method, the complete table
+with and without force correction, and the coarse table (additional error). They hold at depths
+above 1 mm for 95 % of the touchable nodes (docs/soft-body-verification.md)."""
 
 
 def state_force_error_ratio(method: str, geometry: Geometry) -> float:
@@ -48,8 +48,8 @@ def make_soft_body_spec(
     """Return the inputs of the precomputation for the object of a scene.
 
     skin_spacing_m: distance between skin nodes. sticking: whether the finger sticks to the skin.
-    Raise ValueError if the skin spacing exceeds the radius of the fingertip, because the force
-    would be too large, or if the axis of a cylinder points to the user.
+    Raise ValueError if the skin spacing exceeds the radius of the fingertip, or if the axis of a
+    cylinder points to the user.
     """
     if skin_spacing_m > scene.finger.radius_m:
         raise ValueError(
@@ -126,8 +126,7 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact, with the stiffness at the point nearest to the
-        user."""
+        """Return the response without contact, and the stiffness nearest to the user."""
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -272,8 +271,7 @@ def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: 
 
 
 def predict_position(fingertip: Fingertip, horizon_s: float) -> Floats:
-    """Return the predicted fingertip position (3,), m, world frame, for a time after the
-    exposure."""
+    """Return the fingertip position (3,), m, world frame, predicted for a time after exposure."""
     return interpolate_path(
         fingertip.predicted_path_world_m, fingertip.prediction_step_s, horizon_s
     )[0]

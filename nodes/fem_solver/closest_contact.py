@@ -50,9 +50,10 @@ def locate(
     """Return the contact of a fingertip at `point` (3,), m, and the anchor for the next call.
 
     anchor: anchor that the previous call returned, or None. The contact point is usually the
-    nearest surface point. It is the anchor if the fingertip is near the centre of curvature, or if
-    the nearest point is on the far side of the body. A finger pushed through a body therefore stays
-    in contact with the side that it entered. Raise ValueError for a point that is not finite.
+    nearest surface point. It is the anchor if the fingertip is near the centre of curvature. It is
+    also the anchor if the nearest point is on the far side of the body. A finger pushed through a
+    body therefore stays in contact with the side that it entered. Raise ValueError for a point that
+    is not finite.
     """
     if not np.isfinite(point).all():
         raise ValueError(
@@ -104,10 +105,7 @@ def slide_anchor(
 def _make_query(
     point: Floats, surface_point: Floats, normal: Floats, on_edge: bool
 ) -> ContactQuery:
-    """Return the contact of a fingertip at `point` (3,) with the tangent plane of a surface point.
-
-    on_edge: whether the surface point is on the edge of the surface.
-    """
+    """Return the contact of a fingertip at `point` with the tangent plane of a surface point."""
     depth = float((surface_point - point) @ normal)
     surface = point + depth * normal
     return ContactQuery(

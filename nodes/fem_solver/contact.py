@@ -26,16 +26,15 @@ from flexsheet.nodes.fem_solver.mesh.solid import triangle_shape_functions
 from flexsheet.nodes.models.shapes import Shape
 
 PENALTY_RATIO = 40.0
-"""The penalty stiffness of the contact, in Pa/m, divided by the ratio of Young's modulus to the
-finger radius."""
+"""The ratio of the penalty stiffness (Pa/m) to Young's modulus per finger radius."""
 POINT_SPACING_RATIO = 0.4
 """The maximum spacing of the contact points, in finger radii."""
 FLANK_RATIO = 0.9
-"""The distance from the push axis, in finger radii, beyond which the finger is modelled as the
-tangent cone of its sphere instead of the sphere."""
+"""The distance from the push axis (finger radii) beyond which a tangent cone replaces the
+sphere."""
 FACING = (0.2, 0.6)
-"""The range of the cosine of the angle between skin normal and contact normal in which the weight
-of the penetration rises from 0 to 1."""
+"""The range of the cosine between skin normal and contact normal in which the weight of the
+penetration rises from 0 to 1."""
 PAD_RATIO = 1.1
 """The half width of the contact patch at the end of the linear range, in finger radii."""
 TANGENTIAL_COMPLIANCE_RATIO = 0.004
@@ -333,11 +332,11 @@ def solve_penalty_contact(
 ) -> Floats:
     """Return the nodal forces (k,), N, that minimise the contact energy.
 
-    With weights W (q, k), compliance C (k, k), m/N, penalty d (q,), N/m, and depths t (q,), m, the
-    energy of the forces f is 1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2. Newton's method
-    starts from Hertz's estimate that points deeper than half of the maximum depth are in contact.
-    After `FULL_STEPS` steps, a line search damps the method. Raise ArithmeticError if it does not
-    converge.
+    The energy of the forces f is 1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2. weights W (q,
+    k): shape functions. compliance C (k, k): m/N. penalty d (q,): N/m. depths t (q,): m. Newton's
+    method starts from Hertz's estimate that points deeper than half of the maximum depth are in
+    contact. After `FULL_STEPS` steps, a line search damps the method. Raise ArithmeticError if it
+    does not converge.
     """
     compliance_at_points = weights @ compliance
     identity = np.eye(len(compliance))

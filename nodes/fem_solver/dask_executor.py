@@ -114,10 +114,7 @@ def _require_same_code(client: distributed.Client, address: str) -> None:
 
 
 def _run_stoppable(name: str, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-    """Run a function in a worker so that a dask event can stop it.
-
-    name: name of the event. If it is set, `precompute_table.stop_requested` returns true.
-    """
+    """Run a function in a worker so that a dask event can stop it."""
     stop_event = untyped.Event(name)
     token = precompute_table.stop_requested.set(stop_event.is_set)
     try:

@@ -15,8 +15,7 @@ from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.mesh import EDGES
 
 MAX_POISSON_RATIO = 0.4999
-"""The maximum Poisson's ratio. For larger ratios, rounding errors destroy
-the solution."""
+"""The maximum Poisson's ratio. For larger ratios, rounding errors destroy the solution."""
 MIN_VOLUME_RATIO = 1e-6
 """The minimum ratio of an element's Jacobian determinant to the cube of its edge length. For
 flatter elements, rounding errors destroy the solution."""

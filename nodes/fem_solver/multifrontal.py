@@ -191,8 +191,7 @@ class NestedDissection:
         return len(self._parts) - 1, present, counts
 
     def _bisect(self, members: Ints) -> tuple[Ints, Ints]:
-        """Divide elements into two halves along the axis for which the halves share fewest
-        nodes."""
+        """Divide elements along the axis for which the two halves share fewest nodes."""
         cuts = []
         for axis in range(3):
             order = members[np.argsort(self._centres[members, axis], kind="stable")]

@@ -30,16 +30,14 @@ from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, Ne
 Friction = Literal["none", "stick"]
 
 PENALTY_RATIO = 200.0
-"""The penalty stiffness of the contact, in Pa/m, divided by the ratio of Young's modulus to the
-finger radius."""
+"""The ratio of the penalty stiffness (Pa/m) to Young's modulus per finger radius."""
 ROUNDING_RATIO = 0.005
 """The penetration up to which the penalty pressure rises quadratically, in finger radii."""
 POINTS_PER_EDGE = 4
 MAX_STEP_RATIO = 0.35
 """The maximum displacement of the finger per load step, in finger radii."""
 MIN_STEP_FRACTION = 1.0 / 16.0
-"""The minimum fraction of a load step. A step that does not converge is halved down to this
-fraction."""
+"""The minimum fraction of a load step to which a step without convergence is halved."""
 MAX_ITERATIONS = 25
 REGULARIZATIONS = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.3), (0.0, 2.0), (0.0, 15.0))
 """The successive attempts to make the tangent stiffness positive definite. Each pair contains the
@@ -363,10 +361,7 @@ class NeoHookeanBody:
         )
 
     def _check_validity(self, displacement: Floats, centre: Floats) -> None:
-        """Raise NewtonNotConvergedError for inverted elements or a sphere centre inside the body.
-
-        No penalty acts on a finger that is completely inside the body.
-        """
+        """Raise NewtonNotConvergedError for inverted elements or a sphere inside the body."""
         ratio = self.solid.min_volume_ratio(displacement)
         if ratio <= 0.0:
             raise NewtonNotConvergedError(

@@ -238,8 +238,8 @@ def _solve_unit_loads(
 
     directions (m, p, 3): unit vectors. get_part: function that loads the stored part with an index,
     or computes and stores it. advance: function that receives the number of newly finished loads.
-    Return displacements per force, m/N, of the s skin nodes (m p, 3 s), and of the contact nodes
-    along each direction (m p, m p).
+    Return two arrays of displacements per force, m/N. They belong to the s skin nodes (m p, 3 s),
+    and to the contact nodes along each direction (m p, m p).
     """
     each = directions.shape[1]
     loads = len(mesh.contact_nodes) * each
@@ -292,8 +292,7 @@ def require_memory(required_bytes: int, what: str, remedy: str) -> None:
 
 
 STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""The names in the cache file, by field name, for fields whose names differ from those in the
-file."""
+"""The names in the cache file that differ from the field names, by field name."""
 
 
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:

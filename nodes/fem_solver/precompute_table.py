@@ -273,10 +273,7 @@ def _compute_table(
 def _interpolate_by(
     executor: Executor, on_progress: Callable[[int], None], jobs: Sequence[FillJob]
 ) -> list[FilledNodes]:
-    """Interpolate the snapshots at the nodes of all jobs in an executor.
-
-    on_progress: function that receives the number of finished nodes.
-    """
+    """Interpolate the snapshots at the nodes of all jobs in an executor."""
     filled: dict[int, FilledNodes] = {}
     _collect(
         {executor.submit(interpolate_nodes, job): number for number, job in enumerate(jobs)},

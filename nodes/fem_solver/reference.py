@@ -60,8 +60,7 @@ class ReferenceSolution:
         return bool((np.abs(depths - depth_m) < 1e-9).any())
 
     def evaluate(self, depth_m: float, points: Floats) -> tuple[Floats, float]:
-        """Return the displacement (q, 3), m, of skin points (q, 3) and the normal force, N, for 1
-        Pa.
+        """Return the displacement (q, 3), m, of skin points (q, 3), and the normal force for 1 Pa.
 
         depth_m: push depth, which must be one of the depths of the snapshot.
         """

@@ -24,8 +24,7 @@ displacement field decreases from 1 to 0."""
 NEIGHBOURS = 7
 CANDIDATES = 4
 RIDGE = 1e-2
-"""The relative ridge penalty on the slopes of the local fit, which may be underdetermined without a
-penalty."""
+"""The relative ridge penalty on the slopes of the local fit, which may be underdetermined."""
 FACE_COORDINATES = np.array(
     [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]
 )

@@ -30,11 +30,9 @@ DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0
 SPACING_RATIO = 0.35
 """The distance between skin nodes near the push, in finger radii."""
 NEAR_RATIO = 1.5
-"""The distance from the push within which skin nodes have the spacing `SPACING_RATIO`, in finger
-radii."""
+"""The distance from the push within which the mesh is fine, in finger radii."""
 STATIONS = (0.0, 0.4, 0.7, 0.9)
-"""The positions of the sample points along the axis of a cylinder, as fractions of its half
-length."""
+"""The positions of the sample points along a cylinder, as fractions of its half length."""
 ANGLE_STEP_RAD, RIM_RAD = 0.42, 0.25
 """The angle between sample points around a cylinder, and the angle between the last sample point
 and the edge of the touchable skin."""
@@ -53,8 +51,8 @@ QUICK_COUNT = 9
 FINE_DEPTHS_M = (0.0007, 0.0015, 0.003, 0.005, 0.010)
 FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
 """The parameters of the push on a fine mesh that corrects the forces. They are the depths, the
-ratio of the skin spacing to that of a snapshot, the distance from the push within which the mesh
-has this spacing, in finger radii, and the growth of the element size per distance (m/m)."""
+ratio of the skin spacing to that of a snapshot, the radius of the fine region in finger radii, and
+the growth of the element size per distance (m/m)."""
 SAME_RATIO = 1e-6
 
 

@@ -20,8 +20,7 @@ from flexsheet.nodes.fem_solver import body, precompute, precompute_table
 from flexsheet.nodes.fem_solver.table import Table
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
-"""A soft-body method, or `auto` for the nonlinear table if it is cached, and the linear method
-otherwise."""
+"""A soft-body method, or `auto` for the nonlinear table if it is cached, otherwise linear."""
 
 SKIN_SPACING_M = 0.003
 """The distance between skin nodes if neither a parameter nor the scene specifies it, in metres."""
@@ -164,8 +163,7 @@ class SoftBodyFactory:
 
     @contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
-        """Yield the executor that solves snapshots, and the number of its workers on this
-        machine."""
+        """Yield the executor of snapshots, and the number of its workers on this machine."""
         if self.scheduler is not None:
             from flexsheet.nodes.fem_solver.dask_executor import (
                 connect_workers,  # late: it is slow to import

@@ -402,8 +402,8 @@ class TableSoftBody:
     def project_to_surface(self, surface: Floats) -> tuple[Ints, Floats, float]:
         """Find the point of the touchable skin that is nearest to a surface point (3,).
 
-        Return the nodes (6,) of the nearest face, the shape functions (6,) at the found point, and
-        the distance (m) of the surface point from the touchable skin.
+        Return the nodes (6,) of the nearest face and the shape functions (6,) at the found point.
+        The third result is the distance (m) of the surface point from the touchable skin.
         """
         # The squared distances omit the square of `surface`, which is the same for all faces.
         squared = self._centre_squares - self._centres @ (2.0 * surface)

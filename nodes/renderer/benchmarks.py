@@ -181,10 +181,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 def _make_situation(
     scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
-    """Return the predicted sheet pose of a case, and a function that returns the error measure.
-
-    The function creates the measure in its first call only.
-    """
+    """Return the predicted sheet pose of a case, and a function that returns the error measure."""
     pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None

@@ -20,8 +20,7 @@ from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
 SIDE_M = 0.0053
-"""The side of a mark. The area of the mark equals that of a marker of 3 mm radius, so that the
-triangulator detects it."""
+"""The side of a mark, whose area equals that of a marker of 3 mm radius."""
 
 FINGER_STEP_M = 0.001
 """The displacement of the fingertip for which the displacements of the marks are computed."""

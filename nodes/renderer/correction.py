@@ -35,8 +35,7 @@ NEAR_M = 0.02
 """The minimum depth of drawn points in front of the eye."""
 
 MIN_PUSH_M = 1e-4
-"""The minimum push depth for a screen of four triangles. For smaller depths, the screen is a
-plane."""
+"""The minimum push depth for a screen of four triangles instead of a plane."""
 
 
 @dataclass(frozen=True, slots=True)

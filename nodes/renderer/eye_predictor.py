@@ -20,8 +20,7 @@ MIN_MESSAGES = 3
 newest position is used."""
 
 MAX_SPEED_M_PER_S = 1.0
-"""The maximum plausible speed of a head. Larger velocities are errors of the tracker and are
-ignored."""
+"""The maximum plausible speed of a head. Larger velocities are ignored."""
 
 MAX_AHEAD_S = 0.1
 """The maximum time over which a position is extrapolated."""

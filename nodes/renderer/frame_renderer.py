@@ -33,8 +33,7 @@ VISIBLE_CHANGE_M = 1e-4
 """The motion of the sheet that makes a new frame necessary, about a fifth of a pixel."""
 
 FLANGE_TO_SHEET_M = 0.15
-"""The maximum distance between a point of a sheet's edge and the flange of the arm that holds the
-edge."""
+"""The maximum distance of a point of a sheet's edge from the flange that holds the edge."""
 
 CHECK_MARKS_PERIOD_NS = 200_000_000
 """The period with which the projected check marks are placed on the moving sheet. It limits their

@@ -116,9 +116,9 @@ class SurfaceMaterial:
 
     colour: red, green and blue, from 0 to 1. texture: key of `TEXTURES`. pitch_m: period of the
     procedural textures. image (height, width, 3): texture image, starting with the top row, or
-    None. image_from_world (4, 4): map from points of the object at rest to image coordinates, which
-    are 0 at the left and bottom edges, and 1 at the opposite edges. object_from_world (4, 4):
-    inverse pose of the object.
+    None. image_from_world (4, 4): map from points of the object at rest to image coordinates. Image
+    coordinates are 0 at the left and bottom edges, and 1 at the opposite edges. object_from_world
+    (4, 4): inverse pose of the object.
     """
 
     colour: tuple[float, float, float] = (0.95, 0.72, 0.60)

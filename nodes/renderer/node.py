@@ -179,10 +179,7 @@ class Renderer(Node):
             self.frame.publish(frame, source_ns=source_ns)
 
     def _publish(self, frame: Frame, source_ns: int, swapped_ns: int) -> None:
-        """Publish a frame that the window has shown or replaced by a newer frame.
-
-        source_ns: exposure time of the data. swapped_ns: time of the swap; 0 for a replaced frame.
-        """
+        """Publish a frame that the window has shown or replaced by a newer frame."""
         if self._frame_renderer is not None:
             frame = self._frame_renderer.on_shown(frame, swapped_ns)
         self.frame.publish(frame, source_ns=source_ns)

@@ -32,8 +32,7 @@ Real = TypeVar("Real", np.float32, np.float64)
 MIN_AROUND = 128
 """The minimum number of vertices around a cylinder, sphere or ellipsoid, for a smooth outline."""
 CANDIDATES = 16
-"""The number of samples of the skin near a drawn vertex whose triangles are searched for the
-nearest point."""
+"""The number of nearby skin samples whose triangles are searched for the nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,8 +301,7 @@ def transfer_matrix(
 
 
 def _samples(corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Return sample points (n, 3) on triangles (t, 3, 3), and the triangle index (n,) of each
-    point.
+    """Return sample points (n, 3) on triangles (t, 3, 3), and their triangle indices (n,).
 
     Larger triangles have more samples. The nearest samples of a point therefore belong to the
     nearest triangles, even if triangle sizes differ.

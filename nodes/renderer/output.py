@@ -39,8 +39,8 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
         return (
             eyes,
             np.array([1.0, 0.0, 0.0]),
-            f"a tracked eye is {where} in front of the screen, which is too close; the eyes of the "
-            "scene are used",
+            f"a tracked eye is {where} from the screen, which is less than the minimum of "
+            f"{MIN_EYE_DISTANCE_M:g} m; the eyes of the scene are used",
         )
     return eyes.model_copy(update={"centre_world_m": tracked.centre_world_m}), across, ""
 

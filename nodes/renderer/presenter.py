@@ -25,8 +25,8 @@ from flexsheet.nodes.renderer.monitors import WindowError, glfw_errors
 SLOTS = 3
 IDLE_S = 0.1
 REDRAW_COUNT = 4
-"""The number of times that an image is shown again after the window was resized, because drivers
-may resize their buffers up to two swaps later."""
+"""The number of times that an image is shown again after the window was resized. Drivers may resize
+their buffers up to two swaps later."""
 
 _NO_WINDOW: Any = None
 GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
@@ -209,10 +209,7 @@ class _WindowQuad:
 
 
 def _function(name: str, result: Any, *arguments: Any) -> Any:
-    """Return an OpenGL function of the current context, or None if the driver does not provide it.
-
-    result, arguments: types of ctypes.
-    """
+    """Return an OpenGL function of the current context, or None if the driver lacks it."""
     address = glfw.get_proc_address(name)
     if not address:
         return None

@@ -66,8 +66,7 @@ WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
 """The margin of the rectangle around the object in the eye's image, and the step to which the edges
 of the rectangle are rounded. Rounding prevents flicker of the outline when the object moves."""
 MAX_WINDOW_M = 0.3
-"""The maximum distance of the edges of the drawn rectangle from the centre of the screen. The sheet
-is smaller."""
+"""The maximum distance of the edges of the drawn rectangle from the centre of the screen."""
 MIN_REPORTED_FRACTION = 0.005
 """The minimum fraction of the sheet without light due to folds that is reported."""
 NO_SHAPES_NOTE = (
@@ -215,8 +214,7 @@ class SceneRenderer:
         )
 
     def surface_point(self, world_point: Floats) -> Floats:
-        """Return the point (3,) of the undeformed object nearest to a point (3,), world frame,
-        m."""
+        """Return the point (3,), world frame, m, of the undeformed object nearest to a point."""
         start = None
         if self._near is not None:
             _, vertex = self._near.query(world_point)
@@ -292,10 +290,7 @@ class SceneRenderer:
         return self.check_marks
 
     def _draw_check_marks(self, part: ImagePart) -> None:
-        """Draw the check marks as white squares into a part of the image.
-
-        The display stretches the part to the size of the image.
-        """
+        """Draw the check marks as white squares into a part of the image."""
         canvas, (left, bottom, width, height) = self.canvas, part.viewport
         scale = np.array([width / canvas.width_px, height / canvas.height_px])
         side_px = self.check_marks.side_px

@@ -23,8 +23,7 @@ MAX_TRIANGLES_DEPTH_M = 0.0035
 maximum for this method."""
 
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
-"""The vertex indices of the triangles between adjacent corners (0 to 3) and the pushed point
-(4)."""
+"""The vertex indices of triangles between adjacent corners (0 to 3) and pushed point (4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +56,7 @@ def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
 
 
 def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
-    """Return the same surface with smaller triangles, because lens distortion is applied at
-    vertices.
+    """Return the same surface with smaller triangles, at whose vertices the lens is applied.
 
     halvings: number of times that each edge is halved.
     """
@@ -77,8 +75,7 @@ def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
 
 
 _grid_triangles = cache(triangulate_grid)
-"""A cached version of `triangulate_grid`. Equal grids share one array, which makes comparisons
-fast."""
+"""A cached `triangulate_grid`. Equal grids share one array, which makes comparisons fast."""
 
 
 def deflected_mesh(

@@ -41,8 +41,7 @@ SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
     ("near the clamp", 0.29, 0.0),
     ("near the free edge", 0.0, 0.35),
 )
-"""The positions of the push: a name, and x and y from the centre as fractions of width and
-height."""
+"""The names of push positions, with x and y from the centre as fractions of width and height."""
 
 
 def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:

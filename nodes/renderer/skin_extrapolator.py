@@ -18,8 +18,7 @@ MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
 and a longer time causes lag."""
 
 MAX_PERIOD_S = 0.12
-"""The maximum time between the last two responses of a slow solver that are used for
-extrapolation."""
+"""The maximum time between the last two responses of a slow solver for extrapolation."""
 
 MAX_EXTRAPOLATION_S = 0.06
 """The maximum extrapolation time, in seconds."""

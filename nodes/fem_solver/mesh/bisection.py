@@ -103,8 +103,7 @@ def _keys(points: Ints) -> Ints:
 
 
 def _find(vertices: Ints, points: Ints) -> Ints:
-    """Return the index (n,) of the vertex at each point (n, 3), or -1 for a point without
-    vertex."""
+    """Return the index (n,) of the vertex at each point (n, 3), or -1 if there is no vertex."""
     keys = _keys(vertices)
     order = np.argsort(keys)
     wanted_keys = _keys(points)

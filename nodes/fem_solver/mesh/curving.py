@@ -16,8 +16,7 @@ point at a larger distance is on another side of a thin part."""
 
 
 def curve_edges(nodes: Floats, elements: Ints, nearest: Callable[[Floats], Floats]) -> Floats:
-    """Move the midpoints of boundary edges to the nearest surface points and return all nodes (n,
-    3).
+    """Move midpoints of boundary edges to the nearest surface points and return all nodes (n, 3).
 
     nodes (n, 3), m, elements (e, 10): mesh with straight edges. nearest: function that returns the
     nearest surface points. The edges of an element remain straight if its Jacobian determinant

@@ -106,9 +106,6 @@ def cylinder_mesh(
 
 @dataclass(frozen=True, slots=True)
 class _Sizes:
-    """The required edge lengths on the curved side in the circumferential and the axial
-    direction."""
-
     element_m: float
     touch_angle: float
     radius_m: float
@@ -312,10 +309,7 @@ def _finish_mesh(
     half_support: float,
     touch_angle: float,
 ) -> SolidMesh:
-    """Build the mesh of 10-node elements, curve its edges, and find fixed and touchable nodes.
-
-    layer (k,): index of the cross-section of each corner.
-    """
+    """Build the mesh of 10-node elements, curve its edges, and find fixed and touchable nodes."""
     nodes, elements = add_midside_nodes(corners, tetrahedra)
     level = np.empty(len(nodes), dtype=np.int64)
     level[: len(corners)] = 2 * layer

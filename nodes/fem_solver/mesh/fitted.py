@@ -45,11 +45,10 @@ SURFACE_DISTANCE_RATIO = 0.5
 """The maximum distance between the surface and the nearest corner of a surface element, divided by
 the longest edge of the element."""
 CORE_DEPTH_RATIO = 0.4
-"""The minimum depth of a core vertex below the surface, divided by the shortest edge at the
-vertex."""
+"""The minimum depth of a core vertex below the surface, divided by its shortest edge."""
 MAX_THINNED_FRACTION = 0.05
-"""The maximum fraction of core vertices that may be removed. If more must be removed, the object is
-too thin."""
+"""The maximum fraction of core vertices that may be removed from an object of sufficient
+thickness."""
 GOOD_RATIO = 0.2
 ATTEMPTS = 5
 """The maximum number of fits. If the radius ratio of an element is below `GOOD_RATIO`, its core

@@ -47,17 +47,14 @@ VERSION = 1
 TOUCH_MARGIN_RAD = 0.45
 """The angle by which the touchable skin extends beyond the maximum tilt of the working range."""
 SLAB_DEPTHS = 2.0
-"""The ratio of the depth of the slab that represents a half-space to the push depth of the
-scene."""
+"""The ratio of the depth of a slab for a half-space to the push depth of the scene."""
 MIN_THICKNESS_SPACINGS = 4.0
-"""The minimum thickness of the object in skin spacings. Four spacings correspond to two
-elements."""
+"""The minimum thickness of the object in skin spacings, which equals two elements."""
 MAX_NODES = 250_000
 BYTES_PER_NODE = 6000
 """The peak memory per node while meshing, as measured by `benchmarks.meshing`."""
 SAMPLES = 16
-"""The number of sample points along each side of the bounding box, with which the number of nodes
-is estimated."""
+"""The number of samples per side of the bounding box in the estimate of the number of nodes."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
 CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
 """The measured ratios of the number of nodes to an estimate by integration. The first two apply to

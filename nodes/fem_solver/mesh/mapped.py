@@ -35,15 +35,13 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 from flexsheet.nodes.models.shapes import CuboidMap, Shape
 
 COARSENINGS = (8.0, 4.0, 2.0, 1.0, 0.85, 0.7)
-"""The widths of the lattice cells before bisection, divided by the minimum element size. Each width
-is tried."""
+"""The tried widths of the lattice cells before bisection, divided by the minimum element size."""
 ANCHORS = (30.0, 3.0, 0.3, 0.0)
 """The stiffnesses of the springs that hold corners at their mapped positions. The
 first value for which the radius ratios of all elements exceed `GOOD_RATIO` is used."""
 GOOD_RATIO = 0.2
 MAX_SURPLUS_RATIO = 2.0
-"""The maximum ratio between the number of elements of a lattice and that of the smallest
-lattice."""
+"""The maximum number of elements of a lattice, divided by that of the smallest lattice."""
 
 
 def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:

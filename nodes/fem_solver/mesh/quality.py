@@ -11,8 +11,7 @@ from flexsheet.nodes.arrays import Floats, Ints
 MIN_RADIUS_RATIO = 0.1
 """The minimum radius ratio of all elements of an accepted mesh."""
 MIN_JACOBIAN_RATIO = 0.1
-"""The minimum ratio of the Jacobian determinant of a curved element to that of the straight
-element."""
+"""The minimum ratio of the Jacobian determinants of a curved and the straight element."""
 
 _EDGE_OF = np.array([[-1, 4, 6, 7], [4, -1, 5, 8], [6, 5, -1, 9], [7, 8, 9, -1]])
 """The index of the node at the midpoint of the edge between two corners of an element."""
@@ -31,8 +30,8 @@ def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
     The ratio is 3 r / R, where r is the radius of the inscribed sphere and R that of the
     circumscribed sphere. It is 1 for a regular, 0 for a flat and negative for an inverted
     tetrahedron. Crelle's formula gives R from the volume V: 24 V R = sqrt(p (p - 2 a) (p - 2 b) (p
-    - 2 c)), where a, b and c are the products of the lengths of opposite edges, and p is the sum of
-    these products.
+    - 2 c)). In this formula, a, b and c are the products of the lengths of opposite edges, and p =
+    a + b + c.
     """
     corners = points[tetrahedra[:, :4]]
     volume = signed_volumes(points, tetrahedra)
@@ -60,9 +59,9 @@ def min_jacobian_ratios(nodes: Floats, elements: Ints) -> Floats:
 
     The bound is divided by the determinant of the tetrahedron with straight edges. The determinant
     is a cubic polynomial, which is bounded by its Bernstein coefficients. Each coefficient belongs
-    to three corners and is the mean, over all permutations of these corners, of the determinant of
-    the position derivatives at the corners. Source: Johnen, Remacle, Geuzaine, "Geometrical
-    validity of curvilinear finite elements", 2013.
+    to three corners. It is the mean determinant of the position derivatives at the corners, over
+    all permutations of these corners. Source: Johnen, Remacle, Geuzaine, "Geometrical validity of
+    curvilinear finite elements", 2013.
     """
     points = nodes[elements]
     slopes = np.empty((len(elements), 4, 4, 3))

@@ -20,8 +20,8 @@ from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
 from flexsheet.nodes.models.shapes import Shape
 
 Surface = Callable[[Floats], tuple[Floats, Floats]]
-"""A function that returns the nearest surface points (n, 3) and their outward normals (n, 3) for
-points (n, 3)."""
+"""A function that returns the surface points nearest to points (n, 3), and their outward
+normals."""
 
 SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """The spring stiffness in each round for a boundary that is initially up to one element off the
@@ -29,8 +29,7 @@ surface. The unit of length is the median edge length."""
 SPRINGS_ON_SURFACE = (300.0, 1000.0, 3000.0)
 """The spring stiffness in each round for a boundary that is initially on the surface."""
 MIN_FINAL_RADIUS_RATIO = 0.15
-"""The minimum radius ratio (`quality.radius_ratios`) of an element after its corners are moved onto
-the surface."""
+"""The minimum radius ratio of an element after its corners are moved onto the surface."""
 ROUND_STEPS = 20
 MEMORY = 8
 """The number of previous steps and gradient changes that the L-BFGS method uses."""

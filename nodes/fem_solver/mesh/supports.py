@@ -52,11 +52,7 @@ def select_fixed(
 
 
 def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
-    """Raise UnfitMeshError if all chosen points are collinear, because the body could rotate.
-
-    kind: kind of the support, for the error text. points (n, 3): skin points, m. chosen (n,):
-    whether each point is fixed.
-    """
+    """Raise UnfitMeshError if all chosen points are collinear, because the body could rotate."""
     some = points[chosen]
     extent = float(np.ptp(points, axis=0).max())
     if len(some) >= 3:
