@@ -19,7 +19,7 @@ from flexsheet.messages.scene import Lens
 from flexsheet.messages.types import Eye
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.camera import head_eyes, head_node
-from flexsheet.nodes.camera.head_eyes import OneEuroFilter, load_detector, locate_eyes
+from flexsheet.nodes.camera.head_eyes import EyeFilter, load_detector, locate_eyes
 from flexsheet.nodes.camera.head_node import HeadCamera, HeadCameraParameters
 from flexsheet.nodes.camera.image_pair import DeviceError
 from flexsheet.nodes.renderer.output import select_eyes
@@ -83,10 +83,10 @@ def test_the_filter_reduces_noise_at_rest_and_follows_a_motion() -> None:
     random = np.random.default_rng(5)
     times = np.arange(300) / 15.0
     noise = random.normal(0.0, 0.003, (300, 3))
-    still = OneEuroFilter(1.0, 20.0)
+    still = EyeFilter(1.0, 20.0)
     rest = np.array([still.update(*one) for one in zip(times, noise, strict=True)])
     assert rest[50:].std() < 0.6 * noise[50:].std()
-    moving = OneEuroFilter(1.0, 20.0)
+    moving = EyeFilter(1.0, 20.0)
     path = np.outer(times, [0.3, 0.0, 0.0])
     followed = np.array([moving.update(*one) for one in zip(times, path, strict=True)])
     lag_s = (path - followed)[50:, 0] / 0.3

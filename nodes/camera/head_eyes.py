@@ -13,12 +13,13 @@ import numpy as np
 from flexsheet.messages.scene import Lens
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.camera.image_pair import DeviceError, Image
+from flexsheet.nodes.models.one_euro import OneEuro
 from flexsheet.nodes.models.rigid import apply
 
 Detector = Callable[[Image], Floats | None]
-"""Function that returns the pixels (2, 2) of the user's left and right eye in a grey image.
+"""A function that returns the pixels (2, 2) of the user's left and right eye in a grey image.
 
-It returns None if the image contains no face.
+The function returns None if the image contains no face.
 """
 
 PACKAGES_MISSING = (
@@ -29,10 +30,11 @@ LANDMARKS_FILE = "shape_predictor_5_face_landmarks.dat"
 
 
 def load_detector(search_width_px: int) -> Detector:
-    """Load the face detector and the landmark model of dlib; raises DeviceError without them.
+    """Load the face detector and the landmark model of dlib.
 
-    search_width_px: maximum width of the image in which faces are searched. The landmarks are then
-    located in the full image. If there are several faces, the largest one is used.
+    search_width_px: width to which larger images are reduced for the face search. The eyes are then
+    located in the full image. If an image contains several faces, the largest face is used.
+    Raises DeviceError if dlib or its models are not installed.
     """
     # The module with the models is only located, because its import needs setuptools.
     models = find_spec("face_recognition_models")
@@ -66,9 +68,11 @@ def locate_eyes(
 ) -> tuple[Floats, Floats]:
     """Return the midpoint (3,) of the eyes and the vector (3,) from the left to the right eye.
 
-    Both are in the world frame, m. pixels: left and right eye (2, 2), px. interocular_m: distance
-    of the eyes; both are assumed to have the same depth. A head near the optical axis that is
-    rotated by an angle about the vertical is located too far away, by a factor of 1 / cos(angle).
+    Both results are in the world frame, m.
+    pixels: positions of the left and the right eye in the image, (2, 2) px.
+    interocular_m: distance between the eyes.
+    Both eyes are assumed to have the same depth. If the head is rotated by an angle about the
+    vertical, the distance from the camera is too large by a factor of about 1 / cos(angle).
     """
     matrix = np.array(
         [[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]]
@@ -82,40 +86,37 @@ def locate_eyes(
     return eyes.mean(axis=0), eyes[1] - eyes[0]
 
 
-class OneEuroFilter:
-    """Low-pass filter of a vector whose cutoff frequency increases with the speed.
+class EyeFilter:
+    """A 1 euro filter of the eyes' positions.
 
-    Source: Casiez, Roussel and Vogel, "1 € Filter", CHI 2012.
-    min_cutoff_hz: cutoff frequency at rest. cutoff_per_speed_hz: increase of the cutoff frequency
+    min_cutoff_hz: cut-off frequency at rest. cutoff_per_speed_hz: increase of the cut-off frequency
     per unit of speed.
     """
 
-    SPEED_CUTOFF_HZ = 1.0
-
     def __init__(self, min_cutoff_hz: float, cutoff_per_speed_hz: float) -> None:
-        self._min_hz, self._per_speed_hz = min_cutoff_hz, cutoff_per_speed_hz
+        self._low_pass = OneEuro(min_cutoff_hz, cutoff_per_speed_hz, speed_cutoff_hz=1.0)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past, so that the next value is returned unchanged."""
+        """Discard all earlier values. The next value then remains unfiltered."""
         self._last: tuple[float, Floats, Floats] | None = None
 
     def update(self, at_s: float, value: Floats) -> Floats:
-        """Return the filtered value; times must increase."""
+        """Return the filtered value (n,) after a new value (n,).
+
+        at_s: time of the value, later than that of the previous value.
+        """
         if self._last is None:
             self._last = at_s, value, np.zeros_like(value)
             return value
-        before_s, filtered, speed = self._last
+        before_s, filtered, velocity = self._last
         step_s = at_s - before_s
-        weight = _compute_weight(self.SPEED_CUTOFF_HZ, step_s)
-        speed = speed + weight * ((value - filtered) / step_s - speed)
-        cutoff_hz = self._min_hz + self._per_speed_hz * float(np.linalg.norm(speed))
-        filtered = filtered + _compute_weight(cutoff_hz, step_s) * (value - filtered)
-        self._last = at_s, filtered, speed
+        filtered, velocity, _ = self._low_pass.step(
+            filtered,
+            velocity,
+            value=value,
+            measured_velocity=(value - filtered) / step_s,
+            step_s=step_s,
+        )
+        self._last = at_s, filtered, velocity
         return filtered
-
-
-def _compute_weight(cutoff_hz: float, step_s: float) -> float:
-    """Return the weight of a new value in a low-pass filter of the first order."""
-    ratio = 2.0 * math.pi * cutoff_hz * step_s
-    return ratio / (1.0 + ratio)

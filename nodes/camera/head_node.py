@@ -17,7 +17,7 @@ from flexsheet.messages.types import Eye
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.camera.head_eyes import (
     Detector,
-    OneEuroFilter,
+    EyeFilter,
     load_detector,
     locate_eyes,
 )
@@ -98,7 +98,7 @@ class HeadCamera(Node):
 
     async def setup(self) -> None:
         p = self.parameters
-        self._filter = OneEuroFilter(p.min_cutoff_hz, p.cutoff_per_speed_hz)
+        self._filter = EyeFilter(p.min_cutoff_hz, p.cutoff_per_speed_hz)
         self._last_eye: Eye | None = None
         self._valid_ns: int | None = None
         self._published_ns: int | None = None

@@ -22,10 +22,10 @@ from functools import lru_cache
 import numpy as np
 
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.triangulator.filters import Estimate, Filter, OneEuro, Unfiltered
+from flexsheet.nodes.triangulator.filters import Estimate, Filter, OneEuroTracking, Unfiltered
 
 Model = tuple[float, float, float, float]
-"""Parameters of a motion model: spectral density of the acceleration noise, m^2/s^3, and of the
+"""The parameters of a motion model: spectral density of the acceleration noise, m^2/s^3, and of the
 jerk noise, m^2/s^5; frequency, Hz, and standard deviation, m, of the oscillator."""
 
 STATES = 5
@@ -49,11 +49,11 @@ SCORED_HORIZONS_S = (0.0, 0.05, 0.1)
 whole frames, and the first one is one frame.  Weights for other horizons are interpolated."""
 
 MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
-"""Age after which earlier filter states are no longer stored."""
+"""The age up to which earlier filter states are stored."""
 
 STAMP_JITTER_NS = 2_000_000
-"""Time by which a state may be younger than the horizon for which its error is measured.  It allows
-for jitter of the camera's timestamps."""
+"""The time by which a state may be younger than the horizon for which its error is measured.  It
+permits jitter of the camera's timestamps."""
 
 MEMORY_S, MEMORY_POINTS = 1.0, 60
 """Time constant for averaging the covariance of the filters' errors, and the minimum number of
@@ -62,28 +62,33 @@ points in that average."""
 RECENT_S, RECENT_POINTS = 0.2, 10
 OUTDATED_RATIO = 1.5
 OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
-"""Detection of an outdated error covariance, which was learnt from another kind of motion.  RECENT:
-time constant and minimum number of points for averaging recent mean square errors.  OUTDATED_RATIO:
-the covariance is outdated if the mean square error of the combination exceeds that of the best
-model by this factor.  OUTDATED_MEMORY: shorter averaging time and points that it then has."""
+"""The detection of an outdated error covariance, which was estimated during another kind of motion.
+
+RECENT: time constant and minimum number of points for averaging recent mean square errors.
+OUTDATED_RATIO: the covariance is outdated if the mean square error of the weighted sum exceeds that
+of the best model by this factor.
+OUTDATED_MEMORY: time constant and minimum number of points for averaging an outdated covariance.
+"""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
-"""Assumed initial error of every filter, and the number of points that this assumption counts as.
-The error has the unit m, since errors are divided by the square root of their size."""
+"""The initial variance of every filter's prediction errors, and the number of points that have the
+same weight as this initial value.  The unit is m instead of m^2, because errors are divided by the
+square root of their magnitude."""
 
 MIN_ERROR_M = 1e-9
-"""Constant added to the size of errors before they are divided by its square root."""
+"""A constant that is added to the magnitude of errors to avoid a division by zero."""
 
 SHRINKAGE = 0.02
-"""Regularisation of the weights towards equal weights, because the covariance of the errors covers
-only a few seconds.  It is a fraction of the mean square difference between the predictions."""
+"""The regularisation of the weights towards equal weights, as a fraction of the mean square
+difference between the predictions.  It is necessary because the covariance of the errors covers
+only a few seconds."""
 
 COMBINE_EVERY_POINTS = 4
 """Number of points after which the weights are computed again."""
 
 MIN_GAIN = 0.1
-"""Minimum gain of the filtered position.  The gain follows from the mean square innovation, which
-is known only to about a tenth."""
+"""The minimum gain of the filtered position.  The gain is computed from the mean square innovation,
+whose relative error is about 0.1."""
 
 START_POINTS = 32
 """Number of points at the start of a track for which the gains are those of a Kalman filter with
@@ -94,11 +99,12 @@ INITIAL_SPEED_M_PER_S, INITIAL_ACCELERATION = 0.1, 1.0
 
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.004, 0.15
 INTERVAL_RATIO, NOISE_RATIO = 1.08, 1.5
-"""Gains are computed and cached on a logarithmic grid: the range of the frame interval, and the
-ratios between adjacent intervals and between adjacent noise variances."""
+"""The logarithmic grid on which gains are computed and cached: the range of the frame interval, the
+ratio between adjacent intervals, and the ratio between adjacent noise variances."""
 
 TIME_STEP_S = 1e-5
-"""Resolution of the times for which transitions are cached: a finger at 0.1 m/s moves 1 um."""
+"""The resolution of the times for which transitions are cached.  In this time, a finger at 0.1 m/s
+moves by 1 um."""
 
 MAX_CORRELATION = 0.3
 """Correlation of the measurement noise between axes above which the axes are rotated."""
@@ -115,15 +121,18 @@ MODELS: tuple[Model, ...] = (
     *((0.0, 1e-2, frequency_hz, 1e-4) for frequency_hz in (5.0, 6.5, 8.0, 9.5, 11.5)),
     *((0.0, 1e1, frequency_hz, 1e-4) for frequency_hz in (6.0, 9.0)),
 )
-"""Motion models: slow and fast motion, voluntary motion around one point, tremor, and tremor during
-fast motion.  Few models are enough, since weighted sums cover the spectra between them."""
+"""The motion models: slow and fast motion, voluntary motion around one point, tremor, and tremor
+during fast motion.  Weighted sums of these models cover the motion spectra between them."""
 
 ACCELERATION_NOISE, JERK_NOISE, FREQUENCY_HZ, DEVIATION_M = np.array(MODELS).T
 FREQUENCY_RAD_PER_S = 2.0 * np.pi * FREQUENCY_HZ
 
 
 def _integrate_slow(dt: float) -> Floats:
-    """Return the matrix (3, 3) that advances position, velocity, decaying acceleration by dt, s."""
+    """Return the matrix (3, 3) that advances position, velocity and acceleration by dt, s.
+
+    The acceleration decays with the rate ACCELERATION_DECAY_PER_S.
+    """
     rate = ACCELERATION_DECAY_PER_S
     remaining, gone = math.exp(-rate * dt), -math.expm1(-rate * dt)
     if rate * dt < 1e-4:
@@ -151,7 +160,7 @@ def compute_transition(dt: float) -> Floats:
 
 
 def compute_process_noise(dt: float) -> Floats:
-    """Compute the covariance (models, 5, 5) that process noise adds to each state in dt, s."""
+    """Compute the covariance (models, 5, 5) that the process noise of dt, s, adds to each state."""
     acceleration, jerk = np.zeros((3, 3)), np.zeros((3, 3))
     for node, weight in zip(*np.polynomial.legendre.leggauss(4), strict=True):
         slow = _integrate_slow(0.5 * dt * (1.0 + node))
@@ -271,21 +280,21 @@ def _find_rows(horizons: bytes) -> Floats:
 
 
 @lru_cache(maxsize=512)
-def _find_shares(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
+def _find_factors(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
     """Return factors (scored horizons + 1, n, 1) that interpolate predictions to n horizons.
 
-    horizons: bytes of a float64 array (n,) s.
-    ages_ms: ages for which the weights of the scored horizons hold.
+    horizons: bytes of a float64 array (n,) s, because keys of the cache must be hashable.
+    ages_ms: age, ms, for which the weights of each scored horizon were computed.
 
-    The last factor is that of the correction by the filtered position.  It falls from one at
+    The last factor applies to the correction by the filtered position.  It decreases from one at
     horizon zero to zero at the first age.
     """
     times_ms = 1e3 * np.frombuffer(horizons)
     anchors_ms, counts = np.unique(ages_ms, return_counts=True)
     together = np.interp(times_ms, anchors_ms, counts)
-    shares = [np.interp(times_ms, anchors_ms, anchors_ms == age) / together for age in ages_ms]
+    factors = [np.interp(times_ms, anchors_ms, anchors_ms == age) / together for age in ages_ms]
     offset = np.interp(times_ms, [0.0, ages_ms[0]], [1.0, 0.0])
-    return np.stack([*shares, offset])[:, :, None]
+    return np.stack([*factors, offset])[:, :, None]
 
 
 def combine(covariance: Floats) -> Floats:
@@ -307,7 +316,7 @@ def combine(covariance: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class BankEstimate(Estimate):
-    """Estimate of the filter bank: states (models, 5, 3) at one time, and the learnt weights.
+    """The estimate of the filter bank: states (models, 5, 3) at one time, and adapted weights.
 
     covariance: (3, 3) m^2, noise of the newest measured point in the world frame.
     axes: (3, 3), columns are the axes of the states, in the world frame.  The measurement noise is
@@ -341,7 +350,7 @@ class BankEstimate(Estimate):
 
 @dataclass(frozen=True, slots=True)
 class AdaptiveBank:
-    """Tracking method that combines the predictions of the bank of Kalman filters."""
+    """A tracking method that predicts by a weighted sum of the predictions of Kalman filters."""
 
     max_speed_m_per_s: float
 
@@ -444,8 +453,8 @@ class AdaptiveBank:
         paths = np.empty((len(weighted) + 1, len(horizons_s), 3))
         np.matmul(_find_rows(horizons), weighted.reshape(len(weighted), -1, 3), out=paths[:-1])
         paths[-1] = estimate.position - (weighted[0, :, 0] + weighted[0, :, 3]).sum(axis=0)
-        shares = _find_shares(horizons, estimate.scored_ages_ms)
-        return np.asarray((shares * paths).sum(axis=0) @ estimate.axes.T)
+        factors = _find_factors(horizons, estimate.scored_ages_ms)
+        return np.asarray((factors * paths).sum(axis=0) @ estimate.axes.T)
 
 
 def _forget(dt: float, memory_s: float, memory_points: int) -> float:
@@ -471,15 +480,16 @@ def _prediction_errors(
     point: Floats,
     innovations: Floats,
 ) -> tuple[Floats, tuple[int, ...]]:
-    """Return how far the predictions of earlier states are from a newly measured point.
+    """Return the errors of earlier predictions for a newly measured point.
 
-    times_ns, states: earlier states, oldest first.
+    times_ns, states: times and earlier states, oldest first.
     at_ns, point: time and position (3,) m of the new point, along the axes of the states.
     innovations: (models, 3) m, errors of the predictions from the newest state.
 
-    The first result are the errors (scored horizons, 3, models) m, and those at the first horizon
-    are the innovations.  At each other horizon they are those of the newest state that is at least
-    as old as the horizon, or of the oldest one.  The second result are these states' ages, ms.
+    The first result contains the errors (scored horizons, 3, models) m.  At the first horizon they
+    are the innovations.  At every other horizon they are the errors of the newest state that is at
+    least as old as the horizon, or of the oldest state.  The second result contains the ages of the
+    states that were used, ms.
     """
     errors = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS)))
     errors[0] = innovations.T
@@ -495,7 +505,7 @@ def _prediction_errors(
 
 
 def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Floats]:
-    """Rotate an estimate's axes if the noise of a new point is correlated between them.
+    """Rotate the axes of an estimate if the noise of a new point is correlated between the axes.
 
     covariance: (3, 3) m^2, noise of the new point.
     Returns the estimate and the noise variances (3,) m^2 along its axes.
@@ -528,7 +538,8 @@ def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Fl
 
 TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
     "none": Unfiltered,
-    "one_euro": OneEuro,
+    "one_euro": OneEuroTracking,
     "adaptive": AdaptiveBank,
 }
-"""Tracking methods by name: functions that make a filter, given the finger's maximum speed, m/s."""
+"""The functions that make the filter of each tracking method from the finger's maximum speed, m/s.
+"""

@@ -1,4 +1,4 @@
-"""Benchmark the marker and triangulation methods: time per image pair, error over many pairs."""
+"""Benchmark the marker methods and the triangulation methods: their computing times and errors."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from flexsheet.nodes.triangulator.triangulation import (
 CASE_POINTS = 2000
 NOISES_PX = (0.01, 0.025, 0.1, 2.0)
 BASELINES_M = (0.012, 0.06, 0.1205, 0.24)
-"""Baselines of the stereo cameras.  The smallest, a tenth of the usual one, gives nearly parallel
-rays."""
+"""The benchmarked baselines of a stereo camera.  The smallest baseline is a tenth of the usual
+baseline and gives nearly parallel rays."""
 
 MAX_NOISE_PX = 0.1
-"""Maximum standard deviation of a marker's centre for which the methods may be used."""
+"""The maximum standard deviation of a marker's centre for which the methods may be used."""
 
 
 def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
     """Yield a trial for each pixel noise, baseline and slab of the box that the finger can reach.
 
-    The points of a trial are random in one of three slabs, at increasing height.  The scene's
-    baseline replaces the nearest of BASELINES_M.  Trials in the methods' range have at least this
-    baseline, and at most the noise MAX_NOISE_PX.  Trials in the scene's range have exactly its
-    baseline, and at most the noise that the scene's tolerance allows.
+    The points of a trial are random in one of three slabs of increasing height.  The scene's
+    baseline replaces the nearest element of BASELINES_M.  Trials in the methods' range have at
+    least this baseline, and at most the noise MAX_NOISE_PX.  Trials in the scene's range have
+    exactly the scene's baseline, and at most the noise that the scene's tolerance permits.
     """
     low, high = scene.finger.volume_min_m, scene.finger.volume_max_m
     own_m = float(np.linalg.norm(scene.camera.right_from_left[:3, 3]))
@@ -89,7 +89,10 @@ def _triangulation_trial(
     method, rig, (left, right) = TRIANGULATION_METHODS[name], geometry.right_from_left, seen
 
     def error_mm(_: Floats) -> Interval:
-        """Return the root mean square error, mm; the error of a lost point is set to its depth."""
+        """Return the root mean square error, mm.
+
+        The error of a point that is not found is set to its depth.
+        """
         points = rigid.apply(geometry.world_from_left, method(left, right, rig))
         away = np.linalg.norm(points - truth, axis=1)
         depth = rigid.apply(geometry.left_from_world, truth)[:, 2]
@@ -122,22 +125,22 @@ RAYS = 5
 BLUR_PX = 0.7
 GROUND_LEVEL, MARKER_LEVEL = 70.0, 215.0
 GROUND_REACH_PX = 10.0
-"""Distance from the marker's centre up to which the background has a gradient."""
+"""The distance from the marker's centre up to which the background has a gradient."""
 
 MARKER_CASES = (
     *((radius_px, noise, 0.0, 0.0) for radius_px in (1.6, 3.2, 6.0) for noise in (1.0, 2.0, 4.0)),
     *((3.2, 1.0, motion_px, 0.0) for motion_px in (2.0, 4.0, 8.0)),
     *((radius_px, 1.0, 0.0, 3.0) for radius_px in (1.6, 3.2, 6.0)),
 )
-"""Radius (px), noise (multiple of the sensor's noise), motion during the exposure (px), background
-gradient (levels per px).  A marker with 3 mm radius appears with 3.2 px at half a metre, 6 px at
-0.27 m and 1.6 px at 1 m.  At 1 m/s it moves by 4 px in 4 ms.  A finger that is lit from the side
-has a gradient of 2 or 3 levels per px."""
+"""The benchmarked cases: radius (px), noise (multiple of the sensor's noise), motion during the
+exposure (px) and background gradient (levels per px).  A marker with a radius of 3 mm has 3.2 px at
+half a metre, 6 px at 0.27 m and 1.6 px at 1 m.  At 1 m/s it moves by 4 px in 4 ms.  A finger that
+is lit from the side has a gradient of 2 or 3 levels per px."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnDisc:
-    """Parameters of a synthetic disc: centre, radius, motion and blur (standard deviation), px.
+    """The parameters of a synthetic disc: centre, radius, motion and blur (standard deviation), px.
 
     marker, ground: grey levels of the disc and of the background.
     slope: gradient of the background along y, levels per px.
@@ -152,7 +155,7 @@ class DrawnDisc:
     slope: float = 0.0
 
     def levels(self) -> Floats:
-        """Render the image without noise, by supersampling instead of the fit's edge model."""
+        """Render the image (IMAGE_PX, IMAGE_PX) of the disc by supersampling, without noise."""
         fine = (np.arange(IMAGE_PX * RAYS) - 0.5 * (RAYS - 1)) / RAYS
         x, y = fine[None, :] - self.centre[0], fine[:, None] - self.centre[1]
         steps = 1 + int(4.0 * np.linalg.norm(self.motion))
@@ -177,8 +180,8 @@ def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Ima
 def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
     """Return the Cramer-Rao bound on the standard deviation of a disc's centre, px per axis.
 
-    All parameters of the disc are unknown.  The derivatives are central differences.  Rounding is
-    neglected, and so is the information in the noise, which depends on the levels.
+    All parameters of the disc are unknown.  The derivatives are central differences.  The rounding
+    of grey levels and the dependence of the noise on the parameters are neglected.
     """
     levels = disc.levels()
     weights = 1.0 / (noise.read_levels**2 + levels / noise.photons_per_level)
@@ -203,9 +206,9 @@ def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
 
 
 def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
-    """Return cases (as in `MARKER_CASES`) for the scene: a marker at the screen's centre.
+    """Return cases (see `MARKER_CASES`) for a marker at the centre of the scene's screen.
 
-    It is at rest or moves at the scene's speed.
+    The marker is at rest or moves at the speed of the scene's working range.
     """
     left_from_world = StereoGeometry.of(scene.camera).left_from_world
     px_per_m = scene.camera.left.fx_px / float(rigid.apply(left_from_world, np.zeros(3))[2])
@@ -220,8 +223,8 @@ def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
 def _marker_trials(scene: Scene) -> Iterator[Trial]:
     """Yield trials with discs at random subpixel positions that move in random directions.
 
-    The noise of the images is a multiple of the scene's sensor noise.  The fit always assumes the
-    scene's noise.
+    The noise of the images is a multiple of the scene's sensor noise, but the fit always assumes
+    the scene's sensor noise.
     """
     scene_cases = _scene_cases(scene)
     sensor = PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level)
@@ -276,9 +279,9 @@ def _marker_trial(
         return refine([image] * len(blobs), blobs, appearance, sensor)
 
     def error_px(_: list[Marker]) -> Interval:
-        """Return the rms error per axis, px.
+        """Return the root mean square error per axis, px.
 
-        An image in which not exactly one marker is found counts with the size of the image.
+        If not exactly one marker is found in an image, its error is the size of the image.
         """
         found = [markers_in(image) for image in images]
         off = [
@@ -299,17 +302,17 @@ def _marker_trial(
 
 
 def _marker_tolerance_px(scene: Scene) -> float:
-    """Return the standard deviation of a marker's centre, px, that the scene's tolerance allows.
+    """Return the standard deviation of a marker's centre, px, that the scene permits.
 
-    It causes an error of scene.tolerances.fingertip_m at the centre of the screen.
+    This deviation causes an error of scene.tolerances.fingertip_m at the centre of the screen.
     """
     geometry = StereoGeometry.of(scene.camera)
     left, right = geometry.project(np.zeros(3))
     one_px = measure(geometry, left, right, covariance=np.eye(2))
     if one_px is None:
         raise ValueError(
-            "scene: camera: the centre of the screen (the world's origin) is not in front of both "
-            "cameras; correct camera.world_from_left"
+            "scene: the centre of the screen (the world's origin) is not in front of both cameras; "
+            "correct camera.world_from_left"
         )
     return scene.tolerances.fingertip_m / one_px.deviation_m
 

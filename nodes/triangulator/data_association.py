@@ -24,20 +24,22 @@ from flexsheet.nodes.triangulator.tracking import Tracker
 from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 
 TrackStatus = Literal["tentative", "ambiguous", "clutter"]
-"""Status of a track other than the finger's.
+"""The status of a track that is not the finger's track.
 
-tentative: may start the finger's track.  ambiguous: may be the finger or clutter, so it must not
-start the track yet.  clutter: certainly not the finger.
+tentative: the marker may be the finger and may start its track.
+ambiguous: the marker may be the finger or clutter, and must not start the finger's track yet.
+clutter: the marker is not the finger.
 """
 
 POSITION_SIGMA_M = 0.0005
 ACCELERATION_SIGMA_M_PER_S2 = 1.0
 STUDENT_T_DOF = 2.0
-"""Scale per axis of a marker's deviation from motion at constant velocity: constant part, and
-acceleration.  Deviations follow Student's t distribution with STUDENT_T_DOF degrees of freedom."""
+"""The scale per axis of a marker's deviation from motion at constant velocity: a constant part, and
+a part by acceleration.  Deviations have Student's t distribution with STUDENT_T_DOF degrees of
+freedom."""
 
 MERGE_DISTANCE_M = 0.002
-"""Distance below which two detected markers are considered as one marker, detected twice."""
+"""The distance below which two detected markers are considered as the same marker."""
 
 MAX_POSITION_SIGMA_M = 0.1
 """Upper bound of the predicted position error."""
@@ -57,14 +59,15 @@ NEW_TRACK_COST = 6.0 * math.log(MAX_POSITION_SIGMA_M) + 2.0 * float(
     np.log(POPULATION_APPEARANCE_SIGMA).sum()
 )
 INFEASIBLE_COST = 1e9
-"""Costs of assigning a marker to a new track (see `_association_cost`), and to a track that cannot
-contain it."""
+"""The costs of assigning a marker to a new track (see `_association_cost`), and to a track to which
+the marker cannot belong."""
 
 AMBIGUITY_MARGIN = 9.0
-"""Two assignments are ambiguous if their costs differ by less than this: 3 sigma, squared."""
+"""The cost difference below which two assignments are ambiguous: the square of three standard
+deviations."""
 
 MAX_APPEARANCE_DIST_SQ = 16.0
-"""Squared appearance distance, in squared standard deviations, above which two markers differ."""
+"""The maximum squared appearance distance of the same marker, in squared standard deviations."""
 
 VELOCITY_TIME_CONSTANT_S = 0.05
 """Time constant of the low-pass filter for a clutter track's velocity."""
@@ -73,11 +76,13 @@ CLUTTER_SEARCH_PERIOD_S = 0.1
 """Period of the search of the full images while the finger is tracked."""
 
 LATE_GATE_M = 0.03
-"""Maximum distance between the finger's newest position and its marker in a late image."""
+"""The maximum distance between the finger's newest position and its marker in an image pair that
+arrives late."""
 
 STATIONARY_RADIUS_M = 3e-4
 STATIONARY_TIME_S = 1.5
-"""A marker is stationary if it stays within this radius for this time.  A finger never does."""
+"""The radius and the time that define a stationary marker, which stays within the radius for this
+time.  A finger always moves more."""
 
 TRACK_TIMEOUT_S = 1.0
 STATIONARY_TRACK_TIMEOUT_S = 10.0
@@ -88,15 +93,16 @@ TENTATIVE_TRACK_TIMEOUT_S = 0.1
 """Timeout of a tentative track with fewer than MIN_HITS detections."""
 
 SOLE_CANDIDATE_TIME_S = 1.0
-"""Time after which an ambiguous marker is assigned to the finger if it is the only one in view."""
+"""The time after which the only visible marker is assigned to the finger, even if it is ambiguous.
+"""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""Time since the finger was last seen after which moving clutter may be the finger."""
+"""The time since the last detection of the finger after which moving clutter may be the finger."""
 
 
 @dataclass(slots=True)
 class Track:
-    """Track of a marker: position (3,) m, velocity (3,) m/s, appearance (2,) and its variance."""
+    """A track of a marker: position (3,) m, velocity (3,) m/s, appearance (2,) and its variance."""
 
     point: Floats
     velocity: Floats
@@ -129,11 +135,11 @@ class Track:
 
 @dataclass(slots=True)
 class ClutterTrack(Track):
-    """Track of a marker that is not known to be the finger.
+    """A track of a marker that is not known to be the finger.
 
     stationary_point, stationary_since_ns: centre (3,) m of the ball with radius STATIONARY_RADIUS_M
-        that the marker has not left since this time.
-    sole_since_ns: time since which it is the only marker in view.
+        that contains the marker, and the time since which the marker has been in the ball.
+    sole_since_ns: time since which no other marker has been visible.
     hits: number of detections.
     """
 
@@ -170,7 +176,7 @@ class ClutterTrack(Track):
     def update(self, marker: Candidate, at_ns: int, *, is_sole: bool) -> None:
         """Update the track with a detection.
 
-        is_sole: whether it is the only marker in its image pair.
+        is_sole: whether the image pair contains no other marker.
         """
         since_s = (at_ns - self.at_ns) * 1e-9
         weight = 1.0 if self.hits == 1 else -math.expm1(-since_s / VELOCITY_TIME_CONSTANT_S)
@@ -184,7 +190,11 @@ class ClutterTrack(Track):
             self.sole_since_ns = at_ns
 
     def is_alive(self, at_ns: int) -> bool:
-        """Return whether the last detection is neither too old for the track nor in the future."""
+        """Return whether the track still exists at `at_ns`.
+
+        A track ends if its last detection is too old. It also ends if its last detection is in the
+        future, because the clock was then set back.
+        """
         timeout_s = TRACK_TIMEOUT_S
         if self.is_stationary and self.status == "clutter":
             timeout_s = STATIONARY_TRACK_TIMEOUT_S
@@ -194,7 +204,7 @@ class ClutterTrack(Track):
 
 
 class DataAssociation:
-    """Selector of the finger's marker in each image pair, which also tracks the clutter."""
+    """A selector of the finger's marker in each image pair, which also tracks the clutter."""
 
     def __init__(self) -> None:
         self.clutter_tracks: list[ClutterTrack] = []
@@ -207,7 +217,7 @@ class DataAssociation:
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
         """Select the finger's marker among the detections of an image pair, and update the tracker.
 
-        Return "ok" or the reason why there is no fingertip, and the triangulated marker.
+        Return "ok" or the reason why no finger was found, and the triangulated marker.
         """
         if tracker.is_late(at_ns):
             return self._associate_late(at_ns, detection, tracker)
@@ -228,7 +238,7 @@ class DataAssociation:
         """Select the finger in an image pair that is older than the newest one.
 
         The selection uses only the distance from the finger, since past clutter is not stored.
-        Several late pairs in a row mean that the clock was set back, so they restart the track.
+        Several consecutive late pairs restart the track, because the clock was then set back.
         """
         markers = detection.markers
         if len(markers) > 1 and self._finger is not None:
@@ -246,11 +256,11 @@ class DataAssociation:
         return result, marker.measured
 
     def is_clutter_search_due(self, at_ns: int) -> bool:
-        """Return whether it is time to search the full images for clutter again."""
+        """Return whether the full images must be searched for clutter at `at_ns`."""
         return not 0 <= at_ns - self._clutter_searched_ns < 1e9 * CLUTTER_SEARCH_PERIOD_S
 
     def track_clutter(self, at_ns: int, detection: StereoDetection) -> None:
-        """Update the clutter tracks with the detections in full images that contain the finger."""
+        """Update the clutter tracks with the markers that were detected in full images."""
         self._clutter_searched_ns = at_ns
         seen = [one.point for one in self.clutter_tracks if one.at_ns == at_ns]
         if self._finger is not None:
@@ -315,7 +325,7 @@ class DataAssociation:
         return "no_marker" if is_all_clutter else "two_markers"
 
     def _select_candidate(self, at_ns: int) -> ClutterTrack | None:
-        """Return the track that is most likely the lost finger; None if none is certain enough."""
+        """Return the track that is most likely the lost finger, or None if this is uncertain."""
         finger = self._finger
         absence_s = math.inf if finger is None else (at_ns - finger.at_ns) * 1e-9
         candidates: list[tuple[float, ClutterTrack]] = []
@@ -352,8 +362,8 @@ class DataAssociation:
     ) -> list[ClutterTrack | None]:
         """Assign the markers of an image pair to tracks, and update or create the clutter tracks.
 
-        finger: track of the finger, if any.
-        Return the track of each marker; None stands for the finger's track.
+        finger: track of the finger, or None if the finger is not tracked.
+        Return the clutter track of each marker, or None for the finger's marker.
         """
         self.clutter_tracks = [track for track in self.clutter_tracks if track.is_alive(at_ns)]
         if not markers:
@@ -393,10 +403,10 @@ class DataAssociation:
 def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
     """Return the cost of assigning a marker to a track.
 
-    It is twice the negative log likelihood of the marker's position and appearance, up to a
+    The cost is twice the negative log likelihood of the marker's position and appearance, up to a
     constant.
     """
-    if one.at_ns == at_ns:  # it was already updated by this image pair
+    if one.at_ns == at_ns:  # The track was already updated by this image pair.
         return INFEASIBLE_COST
     point, sigma_m = one.predict(at_ns)
     residual = math.dist(marker.point, point) / sigma_m
@@ -408,10 +418,11 @@ def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
 
 
 def assign_columns(costs: Floats) -> list[int]:
-    """Return the column of each row that gives the smallest sum of costs (n, m), n <= m.
+    """Assign a different column to each row so that the sum of the costs is minimal.
 
-    Shortest augmenting paths (Jonker and Volgenant, 1987). SciPy's function would take a third of a
-    second to import, which delays the restart of the node.
+    costs: (n, m), with n <= m.
+    The method is that of shortest augmenting paths (Jonker and Volgenant, 1987). The import of the
+    equivalent function of SciPy would delay the start of the node by a third of a second.
     """
     nearest: list[int] = costs.argmin(axis=1).tolist()
     if len(set(nearest)) == len(nearest):
@@ -443,10 +454,11 @@ def assign_columns(costs: Floats) -> list[int]:
 
 
 def _ambiguous_rows(costs: Floats, columns: Sequence[int], finger: int) -> set[int]:
-    """Return the rows (markers) for which it is ambiguous whether they are the finger.
+    """Return the rows of the markers that may be the finger or clutter.
 
     costs: cost of assigning each marker (row) to each track (column).
-    columns: track assigned to each marker.  finger: column of the finger's track.
+    columns: column of the track that is assigned to each marker.
+    finger: column of the finger's track.
     """
     finger_row = next((row for row, column in enumerate(columns) if column == finger), None)
     ambiguous = set[int]()

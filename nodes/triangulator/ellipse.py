@@ -24,12 +24,12 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats
 
 NODE_SPACING = 1.4
-"""Maximum distance between integration nodes on the edge, in standard deviations of the blur.  The
-error of the light is then below 0.001."""
+"""The maximum distance between integration nodes on the edge, in standard deviations of the blur.
+The error of the computed light is then below 0.001."""
 
 MIN_NODES, MAX_NODES = 12, 64
-"""Bounds on the number of nodes.  The maximum is enough for a sharp marker with a radius of 11 px,
-and limits the time for a large bright spot."""
+"""The bounds on the number of integration nodes.  The maximum is sufficient for a sharp marker with
+a radius of 11 px, and limits the computing time for a large bright spot."""
 
 
 def integrate_ellipse(shapes: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:

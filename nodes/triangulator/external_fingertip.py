@@ -1,4 +1,4 @@
-"""Track fingertip positions that a program outside the graph measures."""
+"""Track fingertip positions that an external program measures."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from flexsheet.nodes.triangulator.tracking import (
 
 
 class ExternalFingertip:
-    """Filter of external fingertip positions, with the same tracker as those from the camera.
+    """A tracker of fingertip positions that an external program measures.
 
-    noise_m: standard deviation of the positions.
+    noise_m: standard deviation of the positions per axis.
     """
 
     def __init__(self, scene: Scene, noise_m: float) -> None:
@@ -38,7 +38,7 @@ class ExternalFingertip:
         self._horizons_s = make_horizons_s(limits.prediction_horizon_s)
 
     def update(self, at_ns: int, measured_m: Floats) -> Fingertip:
-        """Return the fingertip after a measured position (3,), world, m."""
+        """Add a measured position (3,), world frame, m, and return the tracked fingertip."""
         low, high = self._volume
         reason: FingertipReason = "outside_volume"
         if ((measured_m >= low) & (measured_m <= high)).all():
@@ -46,7 +46,7 @@ class ExternalFingertip:
         return self._make(at_ns, reason, measured_m)
 
     def predict(self, at_ns: int) -> Fingertip:
-        """Return the invalid fingertip of a time at which no position has arrived."""
+        """Return an invalid fingertip for a time at which no position has arrived."""
         return self._make(at_ns, "no_marker", None)
 
     def _make(self, at_ns: int, reason: FingertipReason, measured_m: Floats | None) -> Fingertip:

@@ -1,9 +1,6 @@
-"""Estimate the finger's position from measured points, and predict it.
+"""Define filters that estimate and predict the finger's position from measured points.
 
-Each method is a filter with four functions that make or use an immutable estimate.  `initialize`
-makes the estimate from one measurement, and `update` adds a later one.  `moments` returns position,
-velocity and their covariance, and `predict` returns positions at future times.  Points are (3,) in
-the world frame, m, with covariances (3, 3) m^2.
+Points are (3,) in the world frame, m, with covariances (3, 3) m^2.
 """
 
 from __future__ import annotations
@@ -14,11 +11,15 @@ from typing import Protocol
 import numpy as np
 
 from flexsheet.nodes.arrays import Floats
+from flexsheet.nodes.models.one_euro import OneEuro
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """State of a filter at one time, and a covariance, whose shapes depend on the method."""
+    """The state of a filter at the time `at_ns`, and its covariance.
+
+    The tracking method determines the shapes of both arrays.
+    """
 
     at_ns: int
     state: Floats
@@ -26,16 +27,19 @@ class Estimate:
 
 
 class Filter(Protocol):
-    """Interface of a tracking method."""
+    """The interface that every tracking method implements.  Estimates are immutable."""
 
     def initialize(self, at_ns: int, measured: Floats, covariance: Floats) -> Estimate:
-        """Return the estimate after one measured point."""
+        """Make the first estimate from a measured point (3,) m with a covariance (3, 3) m^2."""
         ...
 
     def update(
         self, before: Estimate, at_ns: int, measured: Floats, covariance: Floats
     ) -> Estimate:
-        """Return the estimate after a later measured point."""
+        """Return the estimate `before` after an update with a later measured point (3,) m.
+
+        covariance: (3, 3) m^2 of the measured point.
+        """
         ...
 
     def moments(self, estimate: Estimate) -> tuple[Floats, Floats, Floats]:
@@ -49,7 +53,7 @@ class Filter(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Unfiltered:
-    """Tracking method without a filter: every prediction is the last measured point."""
+    """A tracking method that always predicts the last measured point."""
 
     max_speed_m_per_s: float
 
@@ -69,18 +73,18 @@ class Unfiltered:
         return np.repeat(estimate.state[None], len(horizons_s), axis=0)
 
 
-@dataclass(frozen=True, slots=True)
-class OneEuro:
-    """Low-pass filter whose cut-off rises with speed (Casiez, Roussel, Vogel, CHI 2012).
+LOW_PASS = OneEuro(min_cutoff_hz=6.0, cutoff_per_speed=400.0, speed_cutoff_hz=4.0)
 
-    The state is (smoothed position, smoothed velocity, last measured point).  Predictions assume
-    that the smoothed velocity stays constant.
+
+@dataclass(frozen=True, slots=True)
+class OneEuroTracking:
+    """A tracking method that uses the 1 euro filter and predicts motion at constant velocity.
+
+    The state (9,) contains the filtered position, the filtered velocity and the last measured
+    point.
     """
 
     max_speed_m_per_s: float
-    min_cutoff_hz: float = 6.0
-    cutoff_per_speed: float = 400.0
-    velocity_cutoff_hz: float = 4.0
 
     def initialize(self, at_ns: int, measured: Floats, covariance: Floats) -> Estimate:
         return Estimate(at_ns, np.concatenate([measured, np.zeros(3), measured]), covariance)
@@ -90,12 +94,13 @@ class OneEuro:
     ) -> Estimate:
         dt = (at_ns - before.at_ns) * 1e-9
         position, velocity, last = before.state.reshape(3, 3)
-        velocity = velocity + _low_pass_weight(self.velocity_cutoff_hz, dt) * (
-            (measured - last) / dt - velocity
+        position, velocity, weight = LOW_PASS.step(
+            position,
+            velocity,
+            value=measured,
+            measured_velocity=(measured - last) / dt,
+            step_s=dt,
         )
-        speed = float(np.linalg.norm(velocity))
-        weight = _low_pass_weight(self.min_cutoff_hz + self.cutoff_per_speed * speed, dt)
-        position = position + weight * (measured - position)
         smoothed = (1.0 - weight) ** 2 * before.covariance + weight**2 * covariance
         return Estimate(at_ns, np.concatenate([position, velocity, measured]), smoothed)
 
@@ -105,11 +110,6 @@ class OneEuro:
 
     def predict(self, estimate: Estimate, horizons_s: Floats) -> Floats:
         return estimate.state[:3] + horizons_s[:, None] * estimate.state[3:6]
-
-
-def _low_pass_weight(cutoff_hz: float, dt: float) -> float:
-    """Return the weight of the newest value in a first-order low-pass filter with step dt, s."""
-    return 1.0 / (1.0 + 1.0 / (2.0 * np.pi * cutoff_hz * dt))
 
 
 def _with_unknown_velocity(position_covariance: Floats, max_speed: float) -> Floats:

@@ -1,7 +1,8 @@
 """Detect the fingertip's marker in a stereo image pair.
 
 Bright blobs are detected in each image and matched to pairs.  The markers of likely pairs are
-refined to subpixel accuracy and triangulated.  A pair that cannot be the marker gets a reason.
+refined to subpixel accuracy and triangulated.  A pair that cannot be the marker gets a rejection
+reason.
 """
 
 from __future__ import annotations
@@ -42,47 +43,54 @@ from flexsheet.nodes.triangulator.triangulation import (
 Origin = tuple[int, int]
 
 SIZE_SIGMA = 0.2
-"""Standard deviation of the log ratio of a blob's radius to the marker's expected radius there."""
+"""The standard deviation of the logarithm of a blob's radius divided by the radius that a marker
+has at the blob's depth."""
 
 HEIGHT_SIGMA = 0.25
-"""Standard deviation of the log ratio of a marker's brightness above its surroundings in the left
-view to that in the right view."""
+"""The standard deviation of the logarithm of a marker's brightness in the left view divided by its
+brightness in the right view."""
 
 MISFIT_SIGMA_PX = 0.5
-"""Standard deviation of the distance between a marker's two rays, projected into the images, before
-the centres are refined."""
+"""The standard deviation of the distance between a marker's two rays, projected into the images,
+before the centres are refined."""
 
 MAX_SIZE_DEVIATION = 0.6
-"""Maximum log ratio of a blob's radius to the expected one, which allows 0.55 to 1.8 times it."""
+"""The maximum absolute logarithm of a blob's radius divided by the expected radius.  A blob may
+have 0.55 to 1.8 times the expected radius."""
 
 SIZE_SIGMAS = 3.5
+"""The maximum deviation of a refined marker's radius from the expected radius, in standard
+deviations.  A larger deviation shows that the marker is partly occluded, or merged with another
+bright spot."""
+
 MARKER_SIZE_SIGMA = 0.035
-"""Maximum deviation of a refined marker's radius from the expected one, in standard deviations, and
-the relative standard deviation of the radii of real markers.  A marker that deviates more is partly
-occluded, or merged with another bright spot."""
+"""The relative standard deviation of the radii of real markers."""
 
 STEREO_SIZE_SIGMAS = 4.5
+"""The maximum difference of a marker's radius between both views, in standard deviations.  A larger
+difference shows that the marker is partly occluded in one view."""
+
 MAX_MOTION_DIFFERENCE_PX = 2.5
-"""Maximum differences between both views of a marker, in radius (standard deviations) and in motion
-during the exposure.  A marker that differs more is partly occluded, or merged with another bright
-spot, in one view."""
+"""The maximum difference of a marker's motion during the exposure between both views."""
 
 WINDOW_MARGIN_PX = 5
-"""Margin that a search window includes around the region in which the marker is expected."""
+"""The margin of a search window around the region in which the marker is expected."""
 
 GATE_RADIUS_SIGMAS = 4.0
-"""Radius of a gate (see `tracking.Gate`), in standard deviations of the expected position."""
+"""The radius of a gate (see `tracking.Gate`), in standard deviations of the expected position."""
 
 MAX_FLAT_PAIRS = 4
-"""Maximum number of pairs that are refined as flat markers, in the order of their costs."""
+"""The maximum number of blob pairs that are refined as flat markers.  The pairs with the lowest
+costs are refined."""
 
 AMBIGUITY_MARGIN = 9.0
-"""Minimum cost by which other matches must exceed a unique one, in squared standard deviations."""
+"""The minimum cost difference between the best pair and the second best pair, in squared standard
+deviations.  With a smaller difference, the marker is ambiguous."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
-    """Settings of the detection, refinement and triangulation of markers.
+    """The settings of the detection, refinement and triangulation of markers.
 
     blob_filter: criteria for a blob that may be the marker.
     refine, triangulate: functions of the selected methods.
@@ -105,13 +113,13 @@ class DetectorConfig:
 
 @dataclass(frozen=True, slots=True)
 class BlobPair:
-    """Pair of blobs, left and right, that may be one marker.
+    """A pair of blobs in the left and the right image that may show one marker.
 
     depth_m: depth in the left camera's frame at which the rays of both blobs meet.
     gate_fraction: ratio of the distance from the gate's centre to the gate's radius; 0 if there
         is no gate.
-    cost: mismatch of rays, sizes, heights and distance from the gate's centre, in squared standard
-        deviations.
+    cost: sum of the squared deviations of rays, sizes, heights and distance from the gate's centre,
+        in squared standard deviations.
     rejection_reason: None if the pair may be a marker in the box that the finger can reach.
     """
 
@@ -125,7 +133,7 @@ class BlobPair:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Detection that may be the finger's marker.
+    """A detected marker that may be the finger's marker.
 
     measured: triangulated position.
     appearance: (2,) logarithms of the grey level of the marker and of that of its surroundings,
@@ -143,10 +151,11 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class StereoDetection:
-    """Detections in an image pair.
+    """The markers that were detected in an image pair.
 
-    reason: "ok", or why no finger was found.
-    measured: triangulated point, if any; see `detect_all`.
+    reason: "ok", or why the finger was not found.
+    measured: triangulated point of the finger's marker or of a rejected marker; None if no two rays
+        meet.
     markers: candidates inside the gate, sorted by cost.
     clutter: candidates outside the gate.
     """
@@ -159,7 +168,7 @@ class StereoDetection:
 
 @dataclass(frozen=True, slots=True)
 class DetectionInput:
-    """Arguments of `detect_all`, where they are described."""
+    """The arguments of `detect_all`; images and origins are (left, right)."""
 
     images: tuple[Image, Image]
     origins: tuple[Origin, Origin]
@@ -180,15 +189,14 @@ def detect_all(
     left_origin_px: Origin = (0, 0),
     right_origin_px: Origin = (0, 0),
 ) -> StereoDetection:
-    """Detect the finger's marker in an image pair, and return all other markers with it.
+    """Detect the finger's marker and all other markers in an image pair.
 
     left, right: images (height, width).
     volume: minimum and maximum corner (3,) m of the region that the finger may reach, world frame.
     gate: region to search.  None searches both images, which must then contain one marker only.
-    left_origin_px, right_origin_px: column and row of the sensor where each image begins.
+    left_origin_px, right_origin_px: column and row of each image's first pixel on its sensor.
 
-    If two rays meet, a point is also returned for a marker that is not valid.  If the finger is not
-    found inside its gate, the full images are searched for other markers.
+    If the finger is not found inside its gate, the full images are searched for other markers.
     """
     images, origins = (left, right), (left_origin_px, right_origin_px)
     inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
@@ -200,7 +208,7 @@ def detect_all(
 
 
 def _finite_gate(gate: Gate | None) -> Gate | None:
-    """Return the gate; None (search the full images) if its centre is not finite."""
+    """Return the gate, or None if its centre is not finite."""
     return gate if gate is not None and np.isfinite(gate.point).all() else None
 
 
@@ -214,7 +222,10 @@ def _detect_in(
 
 
 def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
-    """Return the window of each image that shows the gate; None twice unless both views show it."""
+    """Return the part of each image that shows the gate.
+
+    The result is (None, None) if there is no gate, or if one of the images does not show it.
+    """
     if inputs.gate is None:
         return None, None
     geometry, found = inputs.geometry, list[Window]()
@@ -250,7 +261,7 @@ def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window
 def _match_in(
     inputs: DetectionInput, windows: tuple[Window | None, Window | None]
 ) -> StereoDetection:
-    """Detect markers in one window of each image; None as window means the full image."""
+    """Detect markers in one window of each image; a window None is the full image."""
     left, right = (
         detect_blobs(image, inputs.config.blob_filter, window)
         for image, window in zip(inputs.images, windows, strict=True)
@@ -328,10 +339,11 @@ def _match_blobs(
 
 @dataclass(frozen=True, slots=True)
 class RefinedPair:
-    """Pair of blobs with refined markers.
+    """A pair of blobs with refined markers.
 
     rejection_reason: None for a valid marker.
-    cost: cost of the pair plus mismatch of the refined radii, in squared standard deviations.
+    cost: cost of the blob pair plus the squared deviations of the refined radii, in squared
+        standard deviations.
     """
 
     pair: BlobPair
@@ -341,10 +353,10 @@ class RefinedPair:
 
 
 def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
-    """Select the pair that is the finger's marker, from pairs that are likely markers.
+    """Select the finger's marker from pairs of blobs that are likely markers.
 
-    Among pairs with similar costs, only those that are discs after refinement remain.  These are
-    round markers, or flat ones that are seen at an angle.
+    Pairs with similar costs are refined.  Those that are not round markers are refined again as
+    flat markers that are seen at an angle.
     """
     refined = _refine_and_rank(inputs, likely)
     rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + AMBIGUITY_MARGIN]
@@ -367,7 +379,7 @@ def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetect
 
 
 def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[RefinedPair]:
-    """Refine the markers of pairs; return them sorted by their cost before the refinement."""
+    """Refine the markers of blob pairs, and sort them by their cost before the refinement."""
     ordered = sorted(pairs, key=lambda pair: pair.cost)
     found = []
     for pair, markers in zip(ordered, _refine_markers(inputs, ordered), strict=True):
@@ -378,7 +390,7 @@ def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[Refi
 
 
 def _refine_flat(inputs: DetectionInput, rejected: Sequence[RefinedPair]) -> list[RefinedPair]:
-    """Refine pairs that are not round markers as flat ones; return those that are flat markers."""
+    """Refine rejected pairs as flat markers, and return those that are flat markers."""
     refine = FLAT_METHODS.get(inputs.config.refine)
     if refine is None:
         return []
@@ -397,13 +409,13 @@ def _refine_flat(inputs: DetectionInput, rejected: Sequence[RefinedPair]) -> lis
 def _check_flat_pair(
     inputs: DetectionInput, markers: tuple[Marker, Marker]
 ) -> tuple[Marker, Marker] | None:
-    """Check that two ellipses are one flat marker, and correct their centres for perspective.
+    """Check whether two ellipses show one flat marker, and correct their centres for perspective.
 
-    Return both markers with the image of the marker's centre as centre, and the major semi-axis as
-    radius.  Return None if they are not one flat marker.
+    Return both markers with corrected centres, and with the major semi-axis as radius.  Return None
+    if the ellipses do not show one flat marker.
 
-    The mismatch of the two shapes increases the covariance.  A strip that an obstacle covers
-    changes the semi-axis and the centre by the same amount, so the mismatch shows the error.
+    The mismatch of both shapes is added to the covariance, because an obstacle that covers a strip
+    of the marker changes the semi-axis and the centre by the same amount.
     """
     measured = _triangulate(inputs, markers)
     if measured is None:
@@ -452,10 +464,10 @@ def _flat_pose(
 def _unique_candidates(
     inputs: DetectionInput, refined: Sequence[RefinedPair]
 ) -> tuple[Candidate, ...]:
-    """Return the unique markers among refined pairs, sorted by cost.
+    """Return the markers of refined pairs that do not share blobs, sorted by cost.
 
-    Blobs of two markers can match crosswise and give wrong pairs.  A pair is therefore dropped if
-    pairs with lower cost contain both its blobs, or if one with much lower cost contains one blob.
+    Blobs of two markers can form wrong pairs.  A pair is therefore dropped if pairs with lower cost
+    contain both its blobs, or if a pair with much lower cost contains one of its blobs.
     """
     unique: list[RefinedPair] = []
     for one in sorted(
@@ -560,11 +572,11 @@ def _triangulate(
 
 
 def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
-    """Estimate the variance that partial occlusion adds to a centre, from the radii in both views.
+    """Estimate the variance of a centre, px^2, that partial occlusion of the marker causes.
 
     An obstacle that covers a strip of a disc shifts its centre by half the strip's width, and
-    reduces the radius by the same amount.  The squared difference of the radii is therefore the
-    variance, less the variance of the estimated radii.
+    reduces the radius by the same amount.  The variance is therefore the squared difference of the
+    radii in both views, less the variance of the estimated radii.
     """
     one, other = markers
     noise_px = one.radius * math.hypot(one.radius_deviation, other.radius_deviation)

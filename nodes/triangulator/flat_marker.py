@@ -1,4 +1,6 @@
-"""Check that two ellipses are one flat round marker, and correct their centres for perspective.
+"""Check whether two ellipses show one flat round marker, and correct their centres.
+
+The correction is necessary because perspective shifts the centre of an ellipse.
 
 A disc with radius R and normal n has the image A A^T = R^2 J (I - n n^T) J^T.  A is the matrix of
 the ellipse's edge (module `ellipse`), J the derivative of the pixel with respect to the point.
@@ -19,7 +21,7 @@ from flexsheet.nodes.arrays import Floats
 
 @dataclass(frozen=True, slots=True)
 class DiscView:
-    """One camera's view of a disc.
+    """A flat disc as seen by one camera.
 
     camera_from_left: (3, 3) rotation from the left camera's axes to those of this camera.
     point: (3,) m, centre of the disc in this camera's frame.
@@ -35,11 +37,13 @@ class DiscView:
 
 @dataclass(frozen=True, slots=True)
 class FlatPose:
-    """Normal (3,) of a disc, in the left camera's axes, that fits its two images best.
+    """The orientation of a flat disc, estimated from its images in two cameras.
 
-    mismatch_px: largest difference of a semi-axis between a measured ellipse and the disc's image.
-    centre_offsets_px: (2, 2), for each view, centre of the disc's image minus the image of the
-        disc's centre.  They differ because of perspective.
+    normal: normal (3,) of the disc in the left camera's axes.
+    mismatch_px: largest difference between a semi-axis of a measured ellipse and the same semi-axis
+        of the computed image.
+    centre_offsets_px: (2, 2), one row per camera: centre of the ellipse minus the image of the
+        disc's centre.  Perspective causes this offset.
     """
 
     normal: Floats
@@ -48,7 +52,7 @@ class FlatPose:
 
 
 def estimate_flat_pose(views: Sequence[DiscView], radius_m: float) -> FlatPose:
-    """Find the normal for which a disc's images in two views fit the measured ellipses best."""
+    """Find the disc orientation whose computed images fit the ellipses of two views best."""
     found = [list(_possible_normals(view, radius_m)) for view in views]
     normals = [normal for normals in found for normal in normals]
     for one in found[0]:
@@ -65,7 +69,7 @@ def estimate_flat_pose(views: Sequence[DiscView], radius_m: float) -> FlatPose:
 
 
 def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
-    """Yield both normals (3,), in the left camera's axes, that explain the ellipse of one view."""
+    """Yield the two normals (3,), in the left camera's axes, that one ellipse permits."""
     sideways, triangle = np.linalg.qr(view.jacobian.T)
     back = np.linalg.solve(triangle.T, view.axes) / radius_m
     values, vectors = np.linalg.eigh(back @ back.T)
@@ -79,8 +83,9 @@ def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
 
 
 def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
-    """Return the largest difference of a semi-axis between the measured ellipse and the disc's
-    image for a normal (3,) in this camera's axes.
+    """Return the largest semi-axis difference of measured and computed ellipse, px.
+
+    normal: normal (3,) of the disc in this camera's axes.
     """
     along = view.jacobian @ normal
     square = radius_m**2 * (view.jacobian @ view.jacobian.T - np.outer(along, along))
@@ -94,7 +99,7 @@ def _centre_offset_px(view: DiscView, normal: Floats, radius_m: float) -> Floats
     """Return the centre of a disc's image minus the image of the disc's centre (2,), px.
 
     normal: (3,) of the disc in the left camera's axes.
-    The image's centre follows from the dual conic of the disc, with linearised lens distortion.
+    The dual conic of the disc gives the centre of its image.  The lens distortion is linearised.
     """
     in_camera, point = view.camera_from_left @ normal, view.point
     conic = radius_m**2 * (np.eye(3) - np.outer(in_camera, in_camera)) - np.outer(point, point)

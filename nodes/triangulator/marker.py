@@ -16,40 +16,49 @@ import cv2
 import numpy as np
 
 from flexsheet.nodes.arrays import Floats, Image
-from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs, fit_ellipses
+from flexsheet.nodes.triangulator.subpixel import (
+    DiscFit,
+    DiscStart,
+    PixelNoise,
+    fit_discs,
+    fit_ellipses,
+)
 
 Window = tuple[slice, slice]
 """Rows and columns of a part of an image."""
 
 NEIGHBOURHOOD_PX = 31
-"""Side of the square around a pixel whose mean grey level is the local threshold."""
+"""The side of the square around a pixel whose mean grey level is the local threshold."""
 
 SURROUND_PX = 3
-"""Width of the border around a blob; the outermost pixels of the border are its surroundings."""
+"""The width of the border around a blob.  The outermost pixels of the border are the blob's
+surroundings."""
 
 SURROUND_RANK = 0.75
-"""Quantile of the surrounding pixels' grey levels that is used as their common level.  A high
+"""The quantile of the surrounding pixels' grey levels that is used as their common level.  A high
 quantile is needed if a bright finger is on one side of the marker and the other side is dark."""
 
 SKIRT_FRACTION = 0.1
-"""Fraction of the marker's height (its grey levels above its surroundings) below which the light of
-a pixel is ignored as noise."""
+"""The fraction of the marker's height (its grey levels above its surroundings) below which the
+light of a pixel is ignored as noise."""
 
 MAX_REGIONS = 64
-"""Maximum number of bright regions to search; if there are more, the smallest are skipped."""
+"""The maximum number of bright regions to search.  If an image has more, the smallest regions are
+skipped."""
 
 WHITE_LEVEL = 250
 WHITE_FRACTION = 0.2
-"""An image is overexposed if more than this fraction of its pixels has at least this grey level."""
+"""The criterion for overexposed images: more than WHITE_FRACTION of the pixels have at least the
+grey level WHITE_LEVEL."""
 
 
 @dataclass(frozen=True, slots=True)
 class BlobFilter:
-    """Criteria for blobs that may be a marker, and for refined markers.
+    """The criteria for blobs that may be a marker, and for refined markers.
 
-    min_contrast: minimum difference of grey levels between its brightest pixel and its
+    min_contrast: minimum difference of grey levels between a blob's brightest pixel and its
         surroundings.
-    min_area_px, max_area_px: limits on the number of pixels brighter than half that contrast.
+    min_area_px, max_area_px: limits on the number of pixels brighter than half the contrast.
     window_half_px: half the side of the smallest search window around an expected position.
     max_motion_px: maximum motion during an exposure.
     max_blur: maximum standard deviation of the edge of a marker in focus, as a fraction of the
@@ -69,14 +78,14 @@ class BlobFilter:
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """Bright blob that may be a marker; lengths are pixels of the searched image.
+    """A bright blob that may be a marker; lengths are pixels of the searched image.
 
-    centre: centroid of its light.
+    centre: centroid of the blob's light.
     radius: radius of the disc with the same area as the pixels above half the height.
-    motion: (x, y) displacement during the exposure, estimated from the second moments of its light.
-    spread: smallest second moment of its light, relative to that of a uniform disc of this radius.
-    peak, surround: grey levels of its brightest pixel and of its surroundings.
-    window: part of the image that contains its pixels and their surroundings.
+    motion: (x, y) displacement during the exposure, estimated from the second moments of the light.
+    spread: smallest second moment of the light, divided by that of a uniform disc of this radius.
+    peak, surround: grey levels of the brightest pixel and of the surroundings.
+    window: part of the image that contains the blob and its surroundings.
     """
 
     centre: tuple[float, float]
@@ -103,14 +112,14 @@ MarkerRejection = Literal["merged", "blurred"]
 
 @dataclass(frozen=True, slots=True)
 class Marker:
-    """Refined image of a marker: centre (2,) px with covariance (2, 2) px^2.
+    """A marker in an image, refined to subpixel accuracy: centre (2,) px, covariance (2, 2) px^2.
 
     radius: radius of the disc, px, or mean semi-axis of the ellipse.
     radius_deviation: standard deviation of the estimated radius, as a fraction of the radius.
     blur: standard deviation of the edge blur, px.
     motion: (x, y) px displacement during the exposure; its sign is unknown.
     elongation: (e, f) px of a flat marker that is seen at an angle; see the module `ellipse`.
-    height: grey levels above its surroundings.
+    height: difference of grey levels between the marker and its surroundings.
     rejection_reason: None for a valid marker.
     """
 
@@ -126,13 +135,14 @@ class Marker:
 
 
 Refine = Callable[[Sequence[Image], Sequence[Blob], BlobFilter, PixelNoise], list[Marker]]
-"""Function that refines blobs to markers.  Blob i belongs to image i."""
+"""A function that refines blobs to markers.  Blob i belongs to image i."""
 
 
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
-    """Return the window of 2 half_px + 1 pixels around a pixel, clipped to the image.
+    """Return the square window around a pixel (x, y), clipped to the image.
 
-    shape: (height, width) of the image.  Return None if the window is outside the image.
+    The window extends by half_px pixels on each side.  shape: (height, width) of the image.
+    Return None if the window is outside the image.
     """
     x, y = pixel.tolist()
     if not abs(x) + abs(y) < 1e6:  # also rejects NaN
@@ -154,10 +164,10 @@ def is_overexposed(image: Image, window: Window | None = None) -> bool:
 def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = None) -> list[Blob]:
     """Detect all blobs in an image, or in a window of it, that may be a marker.
 
-    First find regions that are brighter than the mean of their neighbourhood.  In each region, the
-    pixels above the middle between the levels of the peak and the surroundings form blobs.  This
-    finds a marker on a bright finger or next to a brighter spot.  Blobs at the image border are
-    dropped, because their centre would be wrong.
+    Regions that are brighter than the mean of their neighbourhood are searched.  In each region,
+    the pixels above half the contrast form blobs.  Two thresholds are necessary to find a marker on
+    a bright finger or next to a brighter spot.  Blobs at the image border are dropped, because
+    their centre would be wrong.
     """
     top, left = (0, 0) if window is None else (window[0].start, window[1].start)
     part = image if window is None else image[window]
@@ -277,15 +287,15 @@ def _light_moments(cut: Image, surround: float, peak: float) -> dict[str, float]
 
 
 SHARP_PX = 1.2
-"""Maximum standard deviation of the blur of an edge that is in focus."""
+"""The maximum standard deviation of the blur of an edge that is in focus."""
 
 MAX_SPREAD = 1.7
-"""Maximum value of `Blob.spread`; a blob with a larger one is too blurred to be a marker."""
+"""The maximum value of `Blob.spread`.  A blob with a larger spread is not a marker."""
 
 
 @dataclass(frozen=True, slots=True)
 class SystematicError:
-    """Systematic errors of the centre by a refinement method, one standard deviation per axis.
+    """The systematic errors of a refinement method, in standard deviations per axis.
 
     still_px: error from the pixel grid and an uneven background.
     moving: additional error of a moving marker, as a fraction of its motion during the exposure.
@@ -302,8 +312,8 @@ class SystematicError:
 
 BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
 BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
-"""Systematic errors of the methods.  They were chosen such that errors in simulation, divided by
-their predicted standard deviations, have unit variance (`tests/test_marker.py`)."""
+"""The systematic errors of the methods.  With these values, the errors in simulations divided by
+their predicted standard deviations have unit variance (`tests/test_marker.py`)."""
 
 
 def moments(
@@ -341,69 +351,60 @@ def subpixel_fit(
     images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
 ) -> list[Marker]:
     """Refine blobs by a maximum-likelihood fit of a motion-blurred disc (module `subpixel`)."""
-    markers = []
-    for blob, fit in zip(blobs, fit_discs(images, _fit_starts(blobs), noise), strict=True):
-        rejection_reason: MarkerRejection | None = None
-        if fit.blur > max(blob_filter.max_blur * fit.radius, SHARP_PX):
-            rejection_reason = "blurred"
-        if (
-            not fit.converged
-            or fit.misfit > blob_filter.max_misfit
-            or math.hypot(*fit.motion) > blob_filter.max_motion_px
-        ):
-            rejection_reason = "merged"
-        markers.append(
-            Marker(
-                centre=fit.centre,
-                covariance=fit.covariance + BY_SUBPIXEL_FIT.covariance(fit.motion),
-                radius=fit.radius,
-                radius_deviation=0.02,
-                blur=fit.blur,
-                motion=fit.motion,
-                height=blob.height,
-                rejection_reason=rejection_reason,
-            )
+    return [
+        _make_marker(
+            blob,
+            fit,
+            fit.motion,
+            is_blurred=fit.blur > max(blob_filter.max_blur * fit.radius, SHARP_PX),
+            is_merged=fit.misfit > blob_filter.max_misfit
+            or math.hypot(*fit.motion) > blob_filter.max_motion_px,
         )
-    return markers
+        for blob, fit in zip(blobs, fit_discs(images, _fit_starts(blobs), noise), strict=True)
+    ]
+
+
+def _make_marker(
+    blob: Blob, fit: DiscFit, motion: tuple[float, float], *, is_blurred: bool, is_merged: bool
+) -> Marker:
+    """Make a marker from a fit; motion: (x, y) px, which increases the systematic error."""
+    rejection_reason: MarkerRejection | None = "blurred" if is_blurred else None
+    return Marker(
+        centre=fit.centre,
+        covariance=fit.covariance + BY_SUBPIXEL_FIT.covariance(motion),
+        radius=fit.radius,
+        radius_deviation=0.02,
+        blur=fit.blur,
+        motion=fit.motion,
+        height=blob.height,
+        rejection_reason="merged" if is_merged or not fit.converged else rejection_reason,
+        elongation=fit.elongation,
+    )
 
 
 MAX_ELLIPSE_MISFIT = 0.035
 MAX_ODD_MISFIT = 0.03
-"""Maximum root mean square residual of a fitted ellipse, and of the residuals' odd part about the
-centre, as a fraction of the marker's height.  They are smaller than the limit for a disc, because
-an ellipse fits a partly covered disc well, except for the odd part."""
+"""The maximum root mean square residual of a fitted ellipse, and the maximum of its part that is
+odd about the centre, as fractions of the marker's height.  Both are smaller than the limit for a
+disc, because an ellipse fits a partly covered disc well, except for the odd part."""
 
 
 def fit_flat_markers(
     images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
 ) -> list[Marker]:
-    """Refine blobs by a maximum-likelihood fit of an ellipse at rest (module `subpixel`)."""
-    markers = []
-    for blob, fit in zip(blobs, fit_ellipses(images, _fit_starts(blobs), noise), strict=True):
-        rejection_reason: MarkerRejection | None = None
-        minor = fit.radius - math.hypot(*fit.elongation)
-        if fit.blur > max(blob_filter.max_blur * minor, SHARP_PX):
-            rejection_reason = "blurred"
-        if (
-            not fit.converged
-            or fit.misfit > min(blob_filter.max_misfit, MAX_ELLIPSE_MISFIT)
-            or fit.odd_misfit > MAX_ODD_MISFIT
-        ):
-            rejection_reason = "merged"
-        markers.append(
-            Marker(
-                centre=fit.centre,
-                covariance=fit.covariance + BY_SUBPIXEL_FIT.covariance(blob.motion),
-                radius=fit.radius,
-                radius_deviation=0.02,
-                blur=fit.blur,
-                motion=(0.0, 0.0),
-                height=blob.height,
-                rejection_reason=rejection_reason,
-                elongation=fit.elongation,
-            )
+    """Refine blobs by a maximum-likelihood fit of an ellipse without motion blur."""
+    return [
+        _make_marker(
+            blob,
+            fit,
+            blob.motion,
+            is_blurred=fit.blur
+            > max(blob_filter.max_blur * (fit.radius - math.hypot(*fit.elongation)), SHARP_PX),
+            is_merged=fit.misfit > min(blob_filter.max_misfit, MAX_ELLIPSE_MISFIT)
+            or fit.odd_misfit > MAX_ODD_MISFIT,
         )
-    return markers
+        for blob, fit in zip(blobs, fit_ellipses(images, _fit_starts(blobs), noise), strict=True)
+    ]
 
 
 def _fit_starts(blobs: Sequence[Blob]) -> list[DiscStart]:
@@ -419,5 +420,5 @@ MARKER_METHODS: dict[str, Refine] = {
 }
 
 FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
-"""For each method that refines round markers, the one that refines flat markers.  Methods without
+"""The refinement of flat markers that belongs to each refinement of round markers.  Methods without
 an entry do not detect flat markers."""

@@ -55,19 +55,19 @@ from flexsheet.nodes.triangulator.triangulation import (
 )
 
 TIMEOUT_PERIODS = 2.5
-"""Minimum timeout of a track in periods of the camera, so that one image pair may be missing."""
+"""The minimum timeout of a track, in periods of the camera.  One image pair may then be missing."""
 
 
 SAME_POINT_M = 0.001
-"""Maximum distance between two positions of one marker in two searches of one image pair."""
+"""The maximum distance between the positions of one marker in two searches of an image pair."""
 
 
 class Triangulator(Node):
-    """Node that detects the fingertip in each stereo pair and tracks it.
+    """A node that detects and tracks the fingertip in stereo image pairs.
 
     The marker on the finger is tracked. The fingertip is the point of the finger's pad that touches
-    the sheet. Its offset from the marker is constant, since the cameras cannot see the finger's
-    rotation.
+    the sheet. The offset between marker and fingertip is constant, since the cameras cannot measure
+    the finger's rotation.
     """
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame"})

@@ -1,4 +1,4 @@
-"""Publish eyes and fingertip from a tracking program that sends messages of OSC 1.0 by UDP."""
+"""Publish the eyes and the fingertip that a tracking program sends as OSC 1.0 messages by UDP."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from flexsheet.nodes.triangulator.external_fingertip import ExternalFingertip
 from flexsheet.nodes.triangulator.osc_packet import read_packet
 
 MAX_PACKET_BYTES = 2048
-"""Maximum size of a packet, which also limits how deep bundles can be nested."""
+"""The maximum size of a packet, which also limits the nesting of bundles."""
 
 POSITION, POSE = 3, 7
-"""Number of numbers in a message with a position, and with a position and a quaternion."""
+"""The number of values in a message with a position, and with a position and a quaternion."""
 
 Row = tuple[Finite, Finite, Finite, Finite]
 IDENTITY: tuple[Row, Row, Row] = (
@@ -45,18 +45,18 @@ IDENTITY: tuple[Row, Row, Row] = (
 
 
 class OscStream(LimitedModel):
-    """OSC address whose messages contain a position, and the transform to the world frame."""
+    """An OSC address whose messages contain positions, and their transform to the world frame."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     address: Annotated[str, Field(pattern="^/")] = Field(
-        description="OSC address; its messages contain x, y, z, or x, y, z and a quaternion x, y, "
-        "z, w; texts in them are ignored"
+        description="OSC address. Its messages contain x, y, z, or x, y, z and a quaternion x, y, "
+        "z, w. Texts in the messages are ignored"
     )
     world_from_source: tuple[Row, Row, Row] = Field(
         default=IDENTITY,
-        description="affine transform from the sender's coordinates to the world, m, row by row; "
-        "it may contain a unit and a mirrored axis",
+        description="affine transform from the sender's coordinates to the world, m, row by row. "
+        "It may convert units and mirror an axis",
     )
     delay_s: NonNegative = Field(
         default=0.0, description="time from the measurement to the arrival of its message, s"
@@ -76,8 +76,8 @@ class OscInputParameters(NodeParameters):
     )
     eye: OscStream | None = Field(
         default=OscStream(address="/flexsheet/eye"),
-        description="midpoint between the eyes; x of its quaternion points from the left to the "
-        "right eye; null: the topic eye is not published",
+        description="midpoint between the eyes. The x axis of its quaternion points from the left "
+        "to the right eye; null: the topic eye is not published",
     )
     fingertip: OscStream | None = Field(
         default=None,
@@ -87,10 +87,11 @@ class OscInputParameters(NodeParameters):
         default=0.001, description="standard deviation of the fingertip's positions, m"
     )
     silence_s: Positive = Field(
-        default=0.2, description="time without a valid message until an input is invalid, s"
+        default=0.2,
+        description="time without a valid message after which an input is published as invalid, s",
     )
     watch_hz: Positive = Field(
-        default=20.0, description="rate at which missing messages are checked, Hz"
+        default=20.0, description="rate at which the node checks for missing messages, Hz"
     )
 
     @field_validator("host")
@@ -111,14 +112,18 @@ class OscInputParameters(NodeParameters):
     def _check_streams(self) -> Self:
         addresses = [one.address for one in (self.eye, self.fingertip) if one is not None]
         if not addresses or len(set(addresses)) < len(addresses):
-            raise ValueError("eye and fingertip need different addresses, and at least one of them")
+            raise ValueError(
+                "osc_input: eye and fingertip are both null or have the same address; give at "
+                "least one of them, and different addresses"
+            )
         return self
 
 
 class OscInput(Node):
-    """Node that publishes the eyes and the fingertip that a tracking program sends by OSC.
+    """A node that publishes the eyes and the fingertip that a tracking program sends by OSC.
 
-    Without messages the topics become invalid. The renderer then uses the scene's eyes.
+    If no messages arrive, the node publishes invalid eyes and fingertips. The renderer then uses
+    the eyes of the scene.
     """
 
     opens_devices: ClassVar[bool] = True
@@ -165,7 +170,11 @@ class OscInput(Node):
                 make_protocol, local_addr=(p.host, p.port)
             )
         except OSError as error:
-            self._report(OSError(f"cannot listen on {p.host}, UDP port {p.port}: {error}"))
+            text = (
+                f"cannot listen on {p.host}, UDP port {p.port}: {error}; end the program that uses "
+                "the port, or change the parameter port of osc_input"
+            )
+            self._report(OSError(text))
             return
         self._problem = ""
 
@@ -181,7 +190,7 @@ class OscInput(Node):
         self._last_eye = Eye(valid=False, centre_world_m=scene.eyes.centre_world_m)
 
     def _receive(self, data: bytes) -> None:
-        """Publish the positions in a packet; count messages that are rejected or ignored."""
+        """Publish the positions in a packet, and count the rejected and the ignored messages."""
         now_ns = self.clock.now_ns()
         if len(data) > MAX_PACKET_BYTES:
             self.rejected[Rejection.MALFORMED] += 1
@@ -225,7 +234,7 @@ class OscInput(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Reopen the port if it is closed; publish invalid messages while an input is silent."""
+        """Reopen the port if it is closed, and publish invalid messages if an input is silent."""
         if self.transport is None:
             await self._open()
         else:
@@ -251,8 +260,6 @@ class OscInput(Node):
 
 
 class _Receiver(asyncio.DatagramProtocol):
-    """Protocol that passes each packet to a function."""
-
     def __init__(self, receive: Callable[[bytes], None]) -> None:
         self._receive = receive
 

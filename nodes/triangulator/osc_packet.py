@@ -7,16 +7,16 @@ from collections.abc import Iterator
 
 BUNDLE = b"#bundle\0"
 HEADER_BYTES = 16
-"""Size of a bundle's name and time."""
+"""The size of the name and time at the beginning of a bundle."""
 
 FORMATS = {"i": ">i", "f": ">f", "h": ">q", "d": ">d"}
 WITHOUT_DATA = "TFNI"
 
 
 def read_packet(data: bytes) -> Iterator[tuple[str, list[float]]]:
-    """Yield the address and the numbers of each message in a packet; texts are skipped.
+    """Yield the address and the numbers of each message in a packet, and skip texts.
 
-    Raises ValueError or struct.error for bytes that are no packet of OSC.
+    Raises ValueError or struct.error if the bytes are not an OSC packet.
     """
     if not data.startswith(BUNDLE):
         yield _read_message(data)
@@ -26,7 +26,7 @@ def read_packet(data: bytes) -> Iterator[tuple[str, list[float]]]:
         (size,) = struct.unpack_from(">i", data, offset)
         end = offset + 4 + size
         if size <= 0 or end > len(data):
-            raise ValueError(f"element of {size} bytes in a bundle of {len(data)} bytes")
+            raise ValueError(f"OSC bundle of {len(data)} bytes: an element states {size} bytes")
         yield from read_packet(data[offset + 4 : end])
         offset = end
 
@@ -35,7 +35,7 @@ def _read_message(data: bytes) -> tuple[str, list[float]]:
     address, offset = _read_text(data, 0)
     tags, offset = _read_text(data, offset)
     if not address.startswith("/") or not tags.startswith(","):
-        raise ValueError("a message begins with an address and types")
+        raise ValueError("OSC message: it does not begin with an address and a type tag string")
     numbers = []
     for tag in tags[1:]:
         if tag in FORMATS:
@@ -45,7 +45,7 @@ def _read_message(data: bytes) -> tuple[str, list[float]]:
         elif tag == "s":
             _, offset = _read_text(data, offset)
         elif tag not in WITHOUT_DATA:
-            raise ValueError(f'unknown type "{tag}"')
+            raise ValueError(f'OSC message {address}: the type tag "{tag}" is unknown')
     return address, numbers
 
 

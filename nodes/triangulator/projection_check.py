@@ -1,9 +1,10 @@
-"""Compare the positions of projected marks on the sheet with the expected ones.
+"""Compare the positions of projected marks on the sheet with their expected positions.
 
 A mark lies on the ray of its projector pixel, wherever the sheet is.  Its distance from this ray
-thus concerns only the projector and the camera, and its distance from the surface of the sheet only
-the arms and the camera.  Near a finger that pushes the sheet, the surface follows the true finger
-pad in a known ratio.  An error of the measured depth of the pad is therefore visible, too.
+therefore shows errors of the projector and the camera.  Its distance from the expected surface of
+the sheet shows errors of the arms and the camera.  Near a finger that pushes the sheet, the surface
+moves with the true finger pad in a known ratio.  The marks there show errors of the pad's measured
+depth.
 """
 
 from __future__ import annotations
@@ -19,45 +20,51 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.residuals import ResidualMonitor
 
 RAY_THRESHOLD_M = 7e-4
-"""Maximum distance of the marks from their rays (root mean square).  The standard deviation per
-axis is 0.12 mm from a calibrated camera and 0.03 mm from a calibrated projector."""
+"""The maximum distance of the marks from their rays (root mean square).  A calibrated camera causes
+a standard deviation of 0.12 mm per axis, and a calibrated projector 0.03 mm."""
 
 SURFACE_THRESHOLD_M = 1.2e-3
-"""Maximum mean distance of the marks from the sheet's surface, about five standard deviations: of
-0.12 mm from the camera, and for each arm 0.2 mm from base and clamp and 0.2 mm from the zero
-positions of its joints (docs/apparatus.md)."""
+"""The maximum mean distance of the marks from the sheet's surface: about five standard deviations.
+The camera contributes 0.12 mm.  Each arm contributes 0.2 mm by base and clamp, and 0.2 mm by the
+zero positions of its joints (docs/apparatus.md)."""
 
 FINGER_THRESHOLD_M = 2e-3
-"""Maximum error of the finger's depth in the sheet.  Its standard deviation is 0.3 mm from the
-marker's offset, 0.12 mm from the camera, 0.25 mm from the arms and 0.2 mm from noise."""
+"""The maximum error of the finger's depth in the sheet.  The contributions to its standard
+deviation are 0.3 mm by the marker's offset, 0.12 mm by the camera, 0.25 mm by the arms and 0.2 mm
+by noise."""
 
 LATENCY_THRESHOLD_S = 0.01
-"""Deviation of the display latency above which it is suspected to be wrong, ten standard deviations
+"""The maximum deviation of the display latency from its configured value: ten standard deviations
 of a measurement by photodiode (1 ms)."""
 
 LATENCY_MEMORY_S = 4.0
-"""Time constant of the mean latency: the few images taken while an old mark is still shown
-contain the deviation."""
+"""The time constant of the mean latency.  It is long because a wrong latency is visible in few
+images: those that are taken while the projector still shows the previous frame."""
 
 MATCH_RADIUS_M = 0.012
-"""Maximum distance of a detected point from the expected position of a mark."""
+"""The maximum distance of a detected point from the expected position of a mark."""
 
 MAX_SPREAD_M = 0.004
-"""Maximum deviation of a mark from the median of all; a point beyond it is not the mark."""
+"""The maximum deviation of a mark's offset from the median offset of all marks.  A point with a
+larger deviation is not a mark."""
 
 MAX_AGE_NS = 2_000_000_000
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
-"""Speed of the marks up to which positions are checked, and from which latency is checked."""
+"""The maximum speed of the marks at which positions are checked, and the minimum speed at which the
+latency is checked."""
 
 MIN_RATIO_RANGE = 0.1
-"""Minimum range of the marks' displacement ratios, from which the finger's depth is estimated."""
+"""The minimum difference between the displacement ratios of the marks.  The finger's depth is
+estimated only if their difference is larger."""
 
 
 class ProjectionCheck:
-    """Self-checks of the poses of projector, arms and finger marker, by projected marks."""
+    """The self-checks of projector, arms and finger marker that use projected marks.
+
+    projector: projector of the scene.  Without a projector or marks, nothing is checked.
+    """
 
     def __init__(self, projector: Projector | None) -> None:
-        """Use the marks of the projector; without a projector or marks, do nothing."""
         marks = () if projector is None else projector.check_marks_sheet_m
         self._projector_m = (
             np.zeros(3)
@@ -73,7 +80,7 @@ class ProjectionCheck:
         self._latency = ResidualMonitor(1, threshold=LATENCY_THRESHOLD_S, memory_s=LATENCY_MEMORY_S)
 
     def on_frame(self, frame: Frame) -> None:
-        """Add the expected positions of the marks in a frame that the projector shows."""
+        """Store the expected positions of the marks in a frame that the projector shows."""
         if frame.light_ns and self._count and len(frame.marks_world_m) == self._count:
             normal = frame.world_from_sheet[:3, 2]
             expected = (frame.light_ns, frame.marks_world_m, frame.marks_finger_ratio, normal)
@@ -81,13 +88,15 @@ class ProjectionCheck:
 
     @property
     def expected_world_m(self) -> Floats:
-        """Return the newest expected positions (n, 3) of the marks."""
+        """Return the newest expected world positions (n, 3) of the marks, m."""
         return self._frames[-1][1] if self._frames else np.zeros((0, 3))
 
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
-        """Check the positions (3,) m of all bright points in an image pair.
+        """Compare the bright points (3,) m of an image pair with the expected marks.
 
-        camera_shift_m: apparent shift (3,) of the fixed reference marks, caused by the camera.
+        camera_shift_m: shift (3,) of the fixed reference marks, which an error of the camera's pose
+            causes.
+        at_ns: time of the image pair.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]
         if not shown or len(points) < 2:
@@ -123,9 +132,9 @@ class ProjectionCheck:
             self._latency.add(np.array([late]), at_ns)
 
     def _velocity(self, number: int) -> Floats | None:
-        """Return the marks' mean velocity (3,) in frame `number`, perpendicular to their rays.
+        """Return the marks' mean velocity (3,) m/s in a frame, perpendicular to their rays.
 
-        Returns None if it is unknown.
+        number: index of the frame in `_frames`.  Returns None if the velocity is unknown.
         """
         if number == 0:
             return None
@@ -140,7 +149,10 @@ class ProjectionCheck:
         return np.asarray(velocity - (velocity @ ray) * ray)
 
     def _add_surface(self, heights_m: Floats, ratios: Floats, at_ns: int) -> None:
-        """Add the heights (n,) of the marks above the expected surface of the sheet."""
+        """Add the heights (n,) m of the marks above the expected surface of the sheet.
+
+        ratios: (n,) displacements of the marks as fractions of the finger's displacement.
+        """
         if not ratios.any():
             self._surface.add(np.array([heights_m.mean()]), at_ns)
         elif len(ratios) >= 3 and float(np.ptp(ratios)) >= MIN_RATIO_RANGE:
@@ -151,10 +163,10 @@ class ProjectionCheck:
             self._finger.add(np.array([finger_m]), at_ns)
 
     def results(self, *, camera_checked: bool) -> dict[SuspectedCause, SelfCheck]:
-        """Return the results of those checks for which there is data, by cause.
+        """Return the results of all checks that have data, by cause.
 
-        camera_checked: whether reference marks show the shift of the camera, which separates it
-        from the projector and the arms.
+        camera_checked: whether the shift of the camera is measured by reference marks. An error of
+        the camera is then distinguished from errors of the projector and the arms.
         """
         ray, surface = self._ray, self._surface
         found: dict[SuspectedCause, SelfCheck] = {}

@@ -1,9 +1,9 @@
 """Check the stereo camera and the marker by residuals of triangulated points.
 
-There are three independent residuals.  The reprojection error shows that one camera has moved
-relative to the other.  The position of fixed reference marks shows that the whole stereo camera has
-moved.  The position of a finger that rests at a known point, less the shift of the reference marks,
-shows that the marker has moved on the finger.
+Three residuals are monitored.  The reprojection error increases if one camera has moved relative to
+the other camera.  The positions of fixed reference marks change if the whole stereo camera has
+moved.  The position of a finger that rests at a known point changes if the marker has moved on the
+finger.
 """
 
 from __future__ import annotations
@@ -22,35 +22,36 @@ from flexsheet.nodes.triangulator.fingertip import StereoDetection
 from flexsheet.nodes.triangulator.projection_check import ProjectionCheck
 
 REPROJECTION_THRESHOLD_PX = 0.2
-"""Maximum mean reprojection error.  It is 0.024 px after a calibration, and about 0.1 px after the
-right camera has drifted by 0.2 mrad.  A vertical shift of one camera by 1 mm, with the finger at
-half a metre, causes 0.5 px."""
+"""The maximum mean reprojection error.  The error is 0.024 px after a calibration, and about 0.1 px
+after a drift of the right camera by 0.2 mrad.  A vertical shift of one camera by 1 mm causes 0.5 px
+if the finger is at half a metre."""
 
 MARK_THRESHOLD_M = 6e-4
-"""Maximum shift of the reference marks, five standard deviations.  The standard deviation per axis
-is 0.12 mm after a calibration (docs/apparatus.md)."""
+"""The maximum shift of the reference marks, five standard deviations.  The standard deviation per
+axis is 0.12 mm after a calibration (docs/apparatus.md)."""
 
 MARKER_THRESHOLD_M = 1.5e-3
-"""Maximum distance of a resting finger from the known point, more than four standard deviations.
-Per axis, these are 0.3 mm from the calibrated marker offset, 0.12 mm from the camera and 0.1 mm of
-noise."""
+"""The maximum distance of a resting finger from the known point, more than four standard
+deviations. The contributions per axis are 0.3 mm by the calibrated marker offset, 0.12 mm by the
+camera and 0.1 mm by noise."""
 
 MARK_RADIUS_M = 0.008
+"""The maximum distance of a detected point from a reference mark with which it is identified."""
+
 TOUCH_RADIUS_M = 0.012
-"""Maximum distance of a detected point from the reference mark that it is taken for, and of a
-finger that is considered to be at the known point."""
+"""The maximum distance from the known point of a finger that is considered to rest there."""
 
 STILL_S = 0.7
 STILL_M = 2.5e-4
-"""A finger is at rest if its standard deviation over this time is below this limit.  A finger that
-hovers moves more."""
+"""The criterion for a finger at rest: over the time STILL_S, the standard deviation of its position
+is at most STILL_M.  A finger that hovers moves more."""
 
 
 class CameraCheck:
-    """Self-checks of the stereo camera and of the marker.
+    """The self-checks of the stereo camera and of the marker.
 
     reference_marks: world positions (n, 3) m of fixed marks that look like the finger's marker.
-    touch_point: world position (3,) m of the known point, or None.
+    touch_point: world position (3,) m of a known point that the finger can touch, or None.
     projector: projector of the scene, which may project check marks on the sheet, or None.
     """
 
@@ -68,11 +69,15 @@ class CameraCheck:
         self._resting: deque[tuple[int, Floats]] = deque()
 
     def on_frame(self, frame: Frame) -> None:
-        """Add the expected positions of projected check marks."""
+        """Store the expected positions of the check marks that a frame contains."""
         self._projection.on_frame(frame)
 
     def on_marks(self, points: Sequence[Floats], at_ns: int) -> None:
-        """Check fixed and projected marks; points: positions (3,) m of all bright points."""
+        """Check the fixed marks and the projected marks.
+
+        points: world positions (3,) m of all bright points in an image pair.
+        at_ns: time of the image pair.
+        """
         self._check_reference_marks(points, at_ns)
         self._projection.on_points(points, self._camera_shift_m, at_ns)
 
@@ -94,9 +99,10 @@ class CameraCheck:
             self._camera.add(np.median(offsets[rows, nearest][seen], axis=0), at_ns)
 
     def exclude_marks(self, detection: StereoDetection, *, tracked: bool) -> StereoDetection:
-        """Return a detection without the fixed and projected marks; the finger is not among them.
+        """Remove the fixed marks and the projected marks from a detection.
 
-        tracked: whether the finger was searched in a gate, so that a marker there is the finger's.
+        tracked: whether the finger was searched in a gate. Markers inside the gate then remain,
+        because they may be the finger's marker.
         """
         marks = np.concatenate([self._marks, self._projection.expected_world_m])
         if not len(marks):
@@ -112,7 +118,7 @@ class CameraCheck:
         return replace(detection, markers=markers, clutter=clutter)
 
     def on_finger(self, point: Floats, reprojection_px: float, at_ns: int) -> None:
-        """Add the finger pad (3,) m by its triangulated marker, with the reprojection error."""
+        """Add the position (3,) m of the finger pad and its marker's reprojection error, px."""
         self._reprojection.add(np.array([reprojection_px]), at_ns)
         if self._touch_point is None:
             return
@@ -130,7 +136,7 @@ class CameraCheck:
         self._marker.add(offset - self._camera_shift_m, at_ns)
 
     def results(self) -> tuple[SelfCheck, ...]:
-        """Return the results of those checks for which there is data."""
+        """Return the results of all checks that have data."""
         by_marks = self._projection.results(camera_checked=self._camera.has_data)
         found = []
         if self._reprojection.has_data:

@@ -22,7 +22,9 @@ def compensate_skew(
     velocity: Floats,
     velocity_covariance: Floats,
 ) -> TriangulatedPoint:
-    """Correct a triangulated point to the mean time of both exposures.
+    """Correct a triangulated point of a moving finger for the time between both exposures.
+
+    The corrected point is the finger's position at the mean time of both exposures.
 
     skew_s: time of the right exposure minus that of the left one.
     velocity: (3,) m/s of the finger in the world, with its covariance (3, 3).
@@ -57,7 +59,11 @@ def compensate_detection_skew(
     velocity: Floats,
     velocity_covariance: Floats,
 ) -> StereoDetection:
-    """Apply `compensate_skew` to all detections of an image pair, with the finger's velocity."""
+    """Correct all detections of an image pair for the time between both exposures.
+
+    skew_s: time of the right exposure minus that of the left exposure.
+    velocity: (3,) m/s of the finger in the world, with its covariance (3, 3).
+    """
 
     def corrected(measured: TriangulatedPoint) -> TriangulatedPoint:
         return compensate_skew(measured, geometry, skew_s, velocity, velocity_covariance)

@@ -46,15 +46,15 @@ WHITE = 255
 MARGIN_PX = 3.0
 MIN_MARGIN_PX = 1.25
 MARGIN_PER_MOTION = 0.5
-"""Width of the surroundings that the fit uses.  They suffice to estimate the ground, but exclude
-the finger's edge, where the ground is not linear.  A moving marker comes closer to that edge, so
-its margin is reduced by MARGIN_PER_MOTION times the motion, at most to MIN_MARGIN_PX."""
+"""The width of the surroundings of a disc that the fit uses.  They are wide enough to estimate the
+ground, but exclude the finger's edge, where the ground is not linear.  For a moving marker, the
+width is reduced by MARGIN_PER_MOTION times the motion, down to MIN_MARGIN_PX."""
 
 PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
-"""Inverse variances of the parameters' starting values.  They matter only where the pixels contain
-no information, for example about the level of a saturated marker."""
+"""The inverse variances of the parameters' starting values.  They affect only parameters about
+which the pixels contain no information, such as the level of a saturated marker."""
 
 MIN_SHAPE = np.array([0.5, 0.3])
 MAX_SHAPE = np.array([40.0, 8.0])
@@ -62,18 +62,18 @@ MAX_SHAPE = np.array([40.0, 8.0])
 
 MAX_ELONGATION = 0.6
 START_ELONGATION = 0.45
-"""Maximum ratios of an ellipse's elongation to its radius: in the fit, and for the starting value.
-The ratio of the minor to the major axis is then at least a quarter."""
+"""The maximum ratios of an ellipse's elongation to its radius in the fit and in the starting value.
+With the first ratio, the minor axis is a quarter of the major axis."""
 
 ELLIPSE_BLUR_PX = 0.8
-"""Starting value of the blur of an ellipse.  The blob's spread gives no estimate of it, because it
-also depends on the elongation."""
+"""The starting value of the blur of an ellipse.  The spread of a blob cannot provide this value,
+because the spread also depends on the elongation."""
 
 MOTION_STEP_PX = 1.8
 """Maximum distance between the positions over which a moving disc is averaged."""
 
 MIN_MOTION_PX = 2.0
-"""Minimum motion that is fitted; a shorter one cannot be distinguished from blur."""
+"""The minimum motion that is fitted.  A shorter motion cannot be distinguished from blur."""
 
 PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 
@@ -87,7 +87,7 @@ CONVERGED_ELONGATION_PX = 0.05
 
 MAX_STEP_PX = 0.7
 MAX_SHIFT_PX = 2.0
-"""Maximum change of a parameter in one step, and of the centre in the whole fit."""
+"""The maximum change of a shape parameter in one step, and of the centre in the whole fit."""
 
 MIN_VARIANCE_RATIO = 0.7
 """Minimum ratio of the noise variance estimated from the residuals to that of the sensor model."""
@@ -95,7 +95,10 @@ MIN_VARIANCE_RATIO = 0.7
 
 @dataclass(frozen=True, slots=True)
 class PixelNoise:
-    """Noise of a sensor: a grey level L has the variance read_levels^2 + L / photons_per_level."""
+    """The noise of an image sensor.
+
+    A grey level L has the variance read_levels^2 + L / photons_per_level.
+    """
 
     read_levels: float = 1.5
     photons_per_level: float = 40.0
@@ -103,7 +106,7 @@ class PixelNoise:
 
 @dataclass(frozen=True, slots=True)
 class DiscStart:
-    """Starting values of a fit: centre (x, y), radius, blur and motion (x, y), px.
+    """The starting values of a fit: centre (x, y), radius, blur and motion (x, y), px.
 
     marker, ground: grey levels of the disc and of the background.
     """
@@ -118,14 +121,14 @@ class DiscStart:
 
 @dataclass(frozen=True, slots=True)
 class DiscFit:
-    """Fitted disc or ellipse.
+    """A disc or ellipse that was fitted to an image.
 
     centre: (2,) px with covariance (2, 2) px^2.
     radius, blur, motion: px; motion is (x, y).  The radius of an ellipse is the mean semi-axis.
     elongation: (e, f) px of an ellipse; see the module `ellipse`.
     height: difference of the grey levels of marker and ground.
     misfit: root mean square residual in excess of the noise, as a fraction of the height.
-    odd_misfit: like misfit, but for the part of the residuals that is odd about the centre.
+    odd_misfit: misfit of the part of the residuals that is odd (antisymmetric) about the centre.
     converged: whether the fit converged to a disc that is brighter than the ground.
     """
 
@@ -142,13 +145,13 @@ class DiscFit:
 
 
 RenderDiscs = Callable[[Floats, Floats, Floats], tuple[Floats, Floats]]
-"""Function that renders images of discs and their derivatives; see `_render_disc`."""
+"""A function that renders images of discs and their derivatives, such as `_render_disc`."""
 
 
 def fit_discs(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> list[DiscFit]:
-    """Fit one disc in each image (height, width), all in the same array operations.
+    """Fit one disc in each image (height, width).
 
     Pixels outside the image and outside the disc's surroundings are excluded.  A saturated (white)
     pixel is used only in iterations in which the model is darker than it.
@@ -170,10 +173,12 @@ def fit_discs(
 def fit_ellipses(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> list[DiscFit]:
-    """Fit one ellipse at rest in each image; `fit_discs` does the same for discs.
+    """Fit one ellipse without motion blur in each image (height, width).
 
-    Starting values describe a moving disc; the ellipse starts with the same second moments.  Each
-    ellipse is fitted alone, because the time grows with the third power of its size.
+    starts: starting values of moving discs.  Each ellipse starts with the second moments of its
+        disc.
+    The ellipses are fitted one after the other, because the computing time increases with the third
+    power of the largest ellipse's size.
     """
     found = []
     for image, one in zip(images, starts, strict=True):
@@ -210,7 +215,7 @@ def _fit(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> list[DiscF
 
 @dataclass(frozen=True, slots=True)
 class DiscSolution:
-    """Result of the Gauss-Newton iteration for n discs in cut-outs of s x s pixels.
+    """The result of the Gauss-Newton iteration for n discs in cut-outs of s x s pixels.
 
     found: (n, parameters) after the last step.
     residuals: (n, s s), image minus model before the last step.
@@ -261,11 +266,12 @@ def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolu
 
 
 def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]]:
-    """Return for each fit: weighted squared residuals, number of pixels, sum of weights, and ratio.
+    """Return four numbers about the residuals of each fit.
 
-    The ratio is that of the variance of the residuals' odd part to the variance of the sensor
-    noise.  The odd part is the difference of pixels that are mirrored about the centre.  No other
-    part affects the fitted centre.
+    They are the weighted sum of squared residuals, the number of pixels, the sum of weights, and a
+    variance ratio.  The ratio is the variance of the odd part of the residuals divided by that of
+    the sensor noise.  The odd part is the difference between pixels that are mirrored about the
+    centre.  Only this part affects the fitted centre.
     """
     residuals, weights, gains = solved.residuals, solved.weights, solved.gains
     squares = np.einsum("ni,ni,ni->n", residuals, residuals, weights) - gains.sum(axis=1)
@@ -288,7 +294,7 @@ def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]
 
 @dataclass(frozen=True, slots=True)
 class DiscCutouts:
-    """Square cut-outs of n images, s x s pixels, each around the starting centre of a disc.
+    """Cut-outs (s x s pixels) of n images around the starting centres of discs.
 
     corners: column and row of each cut-out's first pixel, the origin of its coordinates.
     offsets: starting centres in these coordinates.
@@ -410,7 +416,10 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Render ellipses; return arrays like those of `_render_disc`."""
+    """Render ellipses; return grey levels (n, s s) and derivatives (n, parameters, s s).
+
+    found: (n, parameters) of the ellipses.  x, y: coordinates of pixels, (1, 1, s) and (1, s, 1).
+    """
     x, y = (each.ravel() for each in np.broadcast_arrays(x[0], y[0]))
     coverage, by_shape = integrate_ellipse(found[:, ELLIPSE], x, y)
     columns = found.T[:, :, None]
@@ -427,7 +436,7 @@ def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats
 
 
 def _elongation(start: DiscStart) -> tuple[float, float]:
-    """Return the elongation (e, f), px, of the ellipse with a moving disc's second moments."""
+    """Return the elongation (e, f), px, of an ellipse with the second moments of a moving disc."""
     length = math.hypot(*start.motion)
     if length == 0.0:
         return 0.0, 0.0
@@ -438,7 +447,7 @@ def _elongation(start: DiscStart) -> tuple[float, float]:
 
 
 def _bound_elongation(found: Floats) -> None:
-    """Limit the elongations of ellipses to MAX_ELONGATION, in the array (n, parameters) itself."""
+    """Limit the elongations of ellipses (n, parameters) to MAX_ELONGATION, in place."""
     elongation = found[:, ELONGATION]
     length = np.maximum(np.hypot(*elongation.T), 1e-12)
     elongation *= np.minimum(MAX_ELONGATION * found[:, RADIUS] / length, 1.0)[:, None]
@@ -453,7 +462,7 @@ def _make_fit(
     is_ellipse: bool,
     converged: bool,
 ) -> DiscFit:
-    """Make the result of one fit; its covariance increases if residuals exceed the noise.
+    """Make the result of one fit; increase its covariance if the residuals exceed the noise.
 
     found: fitted parameters.  corner: column and row of the cut-out's first pixel.
     fitness: one element of the result of `_fit_residuals`.

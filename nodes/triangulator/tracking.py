@@ -16,27 +16,28 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
 
 GateResult = Literal["ok", "too_fast", "unconfirmed"]
-"""Result for a measured point.
+"""The result of adding a measured point to a tracker.
 
-ok: added to the track.  too_fast: farther away than a finger can move.  unconfirmed: the point may
-start a track, or arrived late; a late point is inserted into the track or dropped.
+ok: the point was added to the track.
+too_fast: the point is farther away than a finger can move.
+unconfirmed: the point may start a new track, or it arrived late.
 """
 
 PREDICTION_STEP_S = 0.01
-"""Time between the points of the predicted path, a tenth of the period of a 10 Hz tremor."""
+"""The time between the points of the predicted path: a tenth of the period of a tremor of 10 Hz."""
 
 GATE_SIGMAS = 5.0
-"""Margin of the gate for measurement and prediction errors, in their standard deviations."""
+"""The margin of the gate for measurement and prediction errors, in standard deviations."""
 
 
 def make_horizons_s(longest_s: float) -> Floats:
-    """Return the horizons (n,), s, of the points of a predicted path that exceeds `longest_s`."""
+    """Return the horizons (n,), s, of a predicted path that lasts at least `longest_s`."""
     return np.arange(0.0, longest_s + 1.5 * PREDICTION_STEP_S, PREDICTION_STEP_S)
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingSettings:
-    """Settings of the tracker.
+    """The settings of a tracker.
 
     max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger's motion.  Points outside these
         limits are rejected.
@@ -54,7 +55,7 @@ class TrackingSettings:
 
 @dataclass(frozen=True, slots=True)
 class PositionMeasurement:
-    """Measured marker position (3,) m at `at_ns`, with its covariance (3, 3) m^2."""
+    """A measured marker position (3,) m at the time `at_ns`, with its covariance (3, 3) m^2."""
 
     at_ns: int
     measured: Floats
@@ -69,7 +70,7 @@ class PositionMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """Ball around the predicted point (3,) m in which the finger's marker is expected."""
+    """A ball around the predicted point (3,) m in which the finger's marker is expected."""
 
     point: Floats
     radius_m: float
@@ -82,7 +83,7 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class TrackPrediction:
-    """Predicted state of the tracked point at one time, and its predicted path (n, 3) m.
+    """The predicted state of the tracked point at one time, and its predicted path (n, 3) m.
 
     covariance: (6, 6), joint covariance of position (3,) m and velocity (3,) m/s.
     """
@@ -94,11 +95,11 @@ class TrackPrediction:
 
 
 INITIAL_COVARIANCE = np.diag([1.0] * 3 + [10.0] * 3)
-"""Covariance of position (m) and velocity (m/s) that is reported before the first detection."""
+"""The covariance of position (m) and velocity (m/s) that is reported before the first detection."""
 
 
 class Tracker:
-    """Tracker of one finger, which accepts or rejects measured points and predicts the motion."""
+    """A tracker of one finger, which accepts or rejects measured points and predicts the motion."""
 
     def __init__(self, filter_: Filter, settings: TrackingSettings) -> None:
         self.filter, self.settings = filter_, settings
@@ -108,7 +109,7 @@ class Tracker:
 
     @property
     def estimate(self) -> Estimate | None:
-        """Return the newest estimate, also after the track is lost; None before the first point."""
+        """Return the newest estimate, even if the track is lost; None before the first point."""
         return self._history[-1][1] if self._history else None
 
     def is_late(self, at_ns: int) -> bool:
@@ -123,9 +124,9 @@ class Tracker:
         return "tracking" if at_ns == self.estimate.at_ns else "coasting"
 
     def gate(self, at_ns: int) -> Gate | None:
-        """Return the gate at a time after the newest point.
+        """Return the gate at a time after the newest point of the track.
 
-        Return None if there is no track, or if the time is at or before its newest point.
+        Return None if the finger is not tracked, or if `at_ns` is not after the newest point.
         """
         if not self._is_alive(at_ns) or self.is_late(at_ns):
             return None
@@ -148,8 +149,8 @@ class Tracker:
     def predict_at(self, at_ns: int, horizons_s: Floats) -> TrackPrediction:
         """Predict position, velocity and path at a time at or after the newest point.
 
-        horizons_s: (n,) times of the path's points after `at_ns`.  The first must be 0.
-        If the track is lost, the predicted finger stays at its last position.
+        horizons_s: (n,) times of the path's points after `at_ns`; the first time must be 0.
+        If the track is lost, the predicted path is the last position.
         """
         estimate = self.estimate
         if estimate is None:
@@ -166,7 +167,10 @@ class Tracker:
         return TrackPrediction(ahead[0], velocity, covariance, ahead)
 
     def velocity_at(self, at_ns: int) -> tuple[Floats, Floats]:
-        """Return the velocity (3,) m/s and its covariance (3, 3); without a track it is zero."""
+        """Return the velocity (3,) m/s and its covariance (3, 3) m^2/s^2 at `at_ns`.
+
+        If the finger is not tracked, the velocity is zero.
+        """
         if self.estimate is None or not self._is_alive(at_ns):
             return np.zeros(3), np.eye(3) * (self.settings.max_speed_m_per_s / 3.0) ** 2
         _, velocity, covariance = self.filter.moments(self.estimate)
@@ -212,9 +216,9 @@ class Tracker:
     def _extend_tentative_track(
         self, measurement: PositionMeasurement, unconfirmed_result: GateResult
     ) -> GateResult:
-        """Add a point to the tentative track, which replaces the track once it is long enough.
+        """Add a point to the tentative track, which replaces the track when it is long enough.
 
-        unconfirmed_result: result to return until then.
+        unconfirmed_result: result to return while the tentative track is too short.
         """
         self._tentative_track = self._consistent_run(self._tentative_track, measurement)
         if len(self._tentative_track) < self.settings.confirm_frames:
@@ -224,7 +228,11 @@ class Tracker:
     def _consistent_run(
         self, previous: list[PositionMeasurement], measurement: PositionMeasurement
     ) -> list[PositionMeasurement]:
-        """Append a point to a sequence; start a new one if the finger cannot have moved there."""
+        """Append a point to a sequence of points, or start a new sequence with the point.
+
+        A new sequence is started if the finger cannot have moved from the last point to the new
+        point.
+        """
         last = previous[-1] if previous else None
         if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
             return [measurement]
@@ -242,9 +250,9 @@ class Tracker:
     def _insert_late(self, measurement: PositionMeasurement) -> GateResult:
         """Insert a late point into the history, and filter the later points again.
 
-        Several late points in a row mean that the clock was set back, so the track restarts with
-        them.  A late point is dropped if it is older than the history or a duplicate.  It is also
-        dropped if no point is missing at its time, or if it is outside the gate.
+        Several consecutive late points restart the track, because the clock was then set back.  A
+        late point is dropped if it is older than the history, a duplicate or outside the gate.  It
+        is also dropped if no point is missing at its time.
         """
         self._late = self._consistent_run(self._late, measurement)
         if len(self._late) >= self.settings.confirm_frames:
@@ -265,7 +273,10 @@ class Tracker:
         return "unconfirmed"
 
     def _is_missing_between(self, previous: int, after: int) -> bool:
-        """Return whether the time between two points (indices) shows that one is missing."""
+        """Return whether a point is missing between two points of the history.
+
+        previous, after: indices of the two points.
+        """
         times_ns = np.array([entry[0].at_ns for entry in self._history])
         usual_ns = float(np.median(np.diff(times_ns)))
         return float(times_ns[after] - times_ns[previous]) > 1.5 * usual_ns

@@ -1,4 +1,4 @@
-"""Benchmark the tracking methods: the error of the predicted finger at the time of its use."""
+"""Benchmark the tracking methods by the error of the predicted finger position."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from flexsheet.nodes.triangulator.filters import Estimate, Filter
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 
 TruePath = Callable[[float], Floats]
-"""Function that returns the true fingertip (3,) m in the world at a given time, s."""
+"""A function that returns the true fingertip (3,) m in the world at a given time, s."""
 
 MARKER_NOISE_PX = 0.01
-"""Standard deviation of a marker's centre, found by the subpixel fit at a distance of half a metre
+"""The standard deviation of a marker's centre by the subpixel fit at a distance of half a metre
 (`flexsheet chart marker`)."""
 
 HORIZONS_S = (0.0, 0.02, 0.05)
-"""Prediction horizons after the exposure: none, until the image is displayed, and until the arms
-have moved, which includes their servo lag."""
+"""The prediction horizons after the exposure: no prediction, until the frame is displayed, and
+until the arms have moved."""
 
 WARM_UP_S = 0.4
 SPEED_STEP_S = 0.02
 SPEED_MARGIN = 1.5
-"""A path belongs to the scene if its speed is at most this factor times the scene's speed.  The
-factor allows for tremor and acceleration."""
+"""The maximum ratio of a path's speed to the scene's speed for which the path belongs to the scene.
+It permits tremor and acceleration."""
 WITHOUT_VELOCITY = ("none",)
-"""Methods that estimate no velocity.  They may be used for a resting finger, and for a moving one
-only without prediction."""
+"""The methods that do not estimate a velocity.  They may be used for a resting finger, and for a
+moving finger only without prediction."""
 
 
 @dataclass(frozen=True, slots=True)
 class TruePathCase:
-    """True path of a finger, starting at time 0.
+    """A true path of a finger that starts at time 0.
 
     resting: whether the finger has no motion except tremor.
     """
@@ -49,7 +49,7 @@ class TruePathCase:
 
     @property
     def speed_m_per_s(self) -> float:
-        """Return the speed, m/s, that the finger exceeds during a tenth of the time."""
+        """Return the 0.9 quantile of the finger's speed, m/s."""
         times = np.arange(WARM_UP_S, self.duration_s, SPEED_STEP_S)
         points = np.array([self.path(float(time)) for time in times])
         distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -58,7 +58,9 @@ class TruePathCase:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPath:
-    """Simulated measurements of a path: times (n,) ns, points (n, 3) m, covariances (n, 3, 3) m^2.
+    """The simulated measurements of a path.
+
+    times_ns: (n,).  points: (n, 3) m.  covariances: (n, 3, 3) m^2.
 
     truth: for each prediction horizon, the true points (n, 3) m at the predicted times.
     """
@@ -72,7 +74,7 @@ class MeasuredPath:
 def measure_path(
     scene: Scene, motion: TruePathCase, *, seed: int, noise_px: float = MARKER_NOISE_PX
 ) -> MeasuredPath:
-    """Simulate how the scene's stereo camera measures a path: triangulate markers with noise."""
+    """Simulate the measurement of a path by the scene's stereo camera, with noisy markers."""
     geometry, random = StereoGeometry.of(scene.camera), np.random.default_rng(seed)
     times = np.arange(0.0, motion.duration_s, 1.0 / scene.camera.rate_hz)
     covariance_px = noise_px**2 * np.eye(2)
@@ -99,9 +101,9 @@ def measure_path(
 
 
 def predict_path(filter_: Filter, seen: MeasuredPath, horizon_s: float) -> Floats:
-    """Run a filter over a measured path; return its predictions (n, 3) m at a horizon.
+    """Run a filter over n measurements, and return a prediction (n, 3) m after each of them.
 
-    There is one prediction for each measurement.
+    horizon_s: time from a measurement to the predicted position.
     """
     horizons, predicted = np.array([horizon_s]), np.empty_like(seen.points)
     estimate: Estimate | None = None
@@ -119,7 +121,7 @@ def predict_path(filter_: Filter, seen: MeasuredPath, horizon_s: float) -> Float
 def make_tracking_family(
     motions: Callable[[Scene], Mapping[str, TruePathCase]], noise_px: float = MARKER_NOISE_PX
 ) -> Family:
-    """Make the family of tracking methods for the benchmark.
+    """Define the benchmark of the tracking methods.
 
     motions: function that returns the true paths by name, for a scene.
     noise_px: standard deviation of a marker's centre.
@@ -153,9 +155,9 @@ def make_tracking_family(
 def _trial(
     scene: Scene, method: str, case: Case, seen: MeasuredPath, horizon_s: float, *, in_range: bool
 ) -> Trial:
-    """Make a trial that measures the time of one update with its prediction, and the error.
+    """Make a trial that measures the error of predictions and the time of one update.
 
-    The error is that of predictions at one horizon, without those in the first WARM_UP_S.
+    Predictions in the first WARM_UP_S are ignored.
     """
     filter_ = TRACKING_METHODS[method](scene.finger.max_speed_m_per_s)
     middle = len(seen.times_ns) // 2

@@ -25,19 +25,20 @@ Triangulate = Callable[[Floats, Floats, Floats], Floats]
 
 NEWTON_STEPS = 12
 MIN_DISTORTION_SLOPE = 0.05
-"""Minimum determinant of the distortion's Jacobian.  Near zero, the lens model is not invertible:
-it maps two rays to one pixel."""
+"""The minimum determinant of the distortion's Jacobian.  Near zero, the lens model is not
+invertible, because it maps two rays to one pixel."""
 
 MIN_SINE = 1e-6
-"""Minimum sine of the angle between two rays that are not considered parallel."""
+"""The minimum sine of the angle between two rays.  With a smaller sine they count as parallel."""
 
 MAX_DISTANCE_M = 1e4
-"""Maximum depth of a point.  The rays to a more distant one are parallel within rounding errors."""
+"""The maximum depth of a point.  The rays to more distant points are parallel within rounding
+errors."""
 
 
 @dataclass(frozen=True, slots=True)
 class StereoGeometry:
-    """Geometry of a stereo rig: camera matrices 3x3, distortions (5,), transforms 4x4."""
+    """The geometry of a stereo rig: camera matrices 3x3, distortions (5,), transforms 4x4."""
 
     device: str
     width_px: int
@@ -52,10 +53,10 @@ class StereoGeometry:
     def of(
         scene_camera: StereoCamera, calibration: StereoCalibration | None = None
     ) -> StereoGeometry:
-        """Make the geometry of the scene's stereo rig, with the optics of a calibration if given.
+        """Make the geometry of the scene's stereo rig.
 
-        The pose of the rig is always taken from the scene.  Raises CalibrationMismatchError if the
-        calibration belongs to another camera.
+        calibration: source of the optics; None: the scene.  The pose of the rig is always that of
+        the scene.  Raises CalibrationMismatchError if the calibration belongs to another camera.
         """
         optics: StereoCamera | StereoCalibration = scene_camera
         if calibration is not None:
@@ -95,7 +96,7 @@ def _matrix(lens: Lens) -> Floats:
 
 
 class ImageMismatchError(FlexsheetError, ValueError):
-    """Error for images of a wrong device, or larger than the sensor of the scene's camera."""
+    """An error for images that cannot come from the scene's camera."""
 
     code = "image-mismatch"
     remedy = "Set the camera in the scene to the one that took the images."
@@ -105,7 +106,8 @@ def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
     """Raise ImageMismatchError unless the images, full or cropped, can come from this rig."""
     if pair.device != geometry.device:
         raise ImageMismatchError(
-            f'the images are of device "{pair.device}", but the scene has "{geometry.device}"'
+            f'the images come from the device "{pair.device}", but the camera of the scene is '
+            f'"{geometry.device}"'
         )
     views = (("left", pair.left, pair.left_origin_px), ("right", pair.right, pair.right_origin_px))
     for side, image, (column, row) in views:
@@ -120,9 +122,9 @@ def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ClosestApproach:
-    """Solver for the closest approach of two camera rays.
+    """A solver for the closest approach of two camera rays.
 
-    The geometry is stored as plain numbers, since these are faster than small arrays.
+    The geometry is stored as Python numbers, which are faster than small arrays.
 
     rotation_rows: rows of the rotation from the right to the left camera's axes.
     origin: position of the right camera in the left camera's frame, m.
@@ -145,7 +147,7 @@ class ClosestApproach:
         """Return the midpoint (3,) of the shortest segment between two rays, and its length, m.
 
         left, right: undistorted normalized coordinates (x, y) of the rays.
-        Return None if the rays are parallel or the segment is behind a camera.
+        Return None if the rays are parallel, or if the segment is behind a camera.
         """
         (ax, ay), (ox, oy, oz) = left, self.origin
         bx, by, bz = (row[0] * right[0] + row[1] * right[1] + row[2] for row in self.rotation_rows)
@@ -164,7 +166,7 @@ class ClosestApproach:
 
 
 def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
-    """Triangulate by the direct linear transform: linear least squares in homogeneous form.
+    """Triangulate by the direct linear transform, a homogeneous linear least-squares problem.
 
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 12.2.
     """
@@ -185,7 +187,7 @@ def project_with_jacobian(
 ) -> tuple[Floats, Floats]:
     """Return the pixel (2,) of a point (3,) m in a camera's frame, and its Jacobian (2, 3) px/m.
 
-    It computes with plain numbers, which are ten times faster than arrays with two elements.
+    The computation uses Python numbers, which are ten times faster than arrays with two elements.
     """
     px, py, pz = point.tolist()
     fx, fy, cx, cy = _intrinsics(matrix)
@@ -253,10 +255,10 @@ def _distort(
 
 @dataclass(frozen=True, slots=True)
 class TriangulatedPoint:
-    """Triangulated marker: position (3,) m, covariance (3, 3) m^2, rms reprojection error, px.
+    """A triangulated marker: position (3,) m, covariance (3, 3) m^2, rms reprojection error, px.
 
-    The covariance of the marker's centres in both images is propagated to first order.  For nearly
-    parallel rays it grows with the fourth power of the depth, so that they can be rejected by it.
+    The covariance follows to first order from the covariances of the centres in both images.  For
+    nearly parallel rays it increases with the fourth power of the depth.
     """
 
     point_world: Floats
@@ -265,7 +267,7 @@ class TriangulatedPoint:
 
     @property
     def deviation_m(self) -> float:
-        """Return the square root of the variances' sum over the axes, m."""
+        """Return the square root of the sum of the variances along x, y and z, m."""
         return float(np.sqrt(np.trace(self.covariance)))
 
 
@@ -280,11 +282,11 @@ def measure(
 ) -> TriangulatedPoint | None:
     """Triangulate a marker from its pixels (2,) in both views, with covariances (2, 2) px^2.
 
-    right_covariance: covariance of the right pixel; None: equal to that of the left one.  Return
-    None if the point is not in front of both cameras, or if a pixel is not finite or outside
-    the range of the lens model.  Both views have equal weights, as in the triangulation methods.
-    Pixel errors are thus propagated by (J^T J)^-1 J^T, with the Jacobian J of the four pixel
-    coordinates with respect to the point.
+    covariance, right_covariance: of the left and of the right pixel; None: both are equal.
+    Return None if the point is not in front of both cameras, or if a pixel is not finite or outside
+    the range of the lens model.  Both views have equal weights.  The covariances are therefore
+    propagated by (J^T J)^-1 J^T, with the Jacobian J of the four pixel coordinates with respect to
+    the point.
     """
     left = undistort_pixel(left_px, geometry.matrices[0], geometry.distortions[0])
     right = undistort_pixel(right_px, geometry.matrices[1], geometry.distortions[1])
