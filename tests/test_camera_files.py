@@ -207,13 +207,16 @@ def test_one_looping_pair_comes_at_the_given_rate(scene: Scene, tmp_path: Path) 
 @pytest.mark.parametrize(
     ("text", "printed"),
     [
-        ("t_ms\n1\n2\n", r"times\.csv: no column t_s"),
-        ("", r"times\.csv: no column t_s"),
-        ("t_s\n1\n", r"times\.csv: expected one row for each of 2 pairs, found 1"),
-        ("t_s\n1\nsoon\n", r"times\.csv, line 3: t_s: expected a number of seconds, found 'soon'"),
-        ("t_s\n1\nnan\n", r"times\.csv, line 3: t_s: expected a number of seconds, found 'nan'"),
-        ("x,t_s\n0,1\n0\n", r"times\.csv, line 3: t_s: expected a number of seconds, found None"),
-        ("t_s\n2\n2\n", r"times\.csv, line 3: t_s 2 is not after the previous one"),
+        ("t_ms\n1\n2\n", r"times\.csv: the column t_s is missing"),
+        ("", r"times\.csv: the column t_s is missing"),
+        ("t_s\n1\n", r"times\.csv has 1 rows for 2 image pairs"),
+        ("t_s\n1\nsoon\n", r"times\.csv, line 3: t_s is 'soon'; it must be a number of seconds"),
+        ("t_s\n1\nnan\n", r"times\.csv, line 3: t_s is 'nan'; it must be a number of seconds"),
+        ("x,t_s\n0,1\n0\n", r"times\.csv, line 3: t_s is None; it must be a number of seconds"),
+        (
+            "t_s\n2\n2\n",
+            r"times\.csv, line 3: t_s is 2 s, which is not after the time in the previous row",
+        ),
     ],
 )
 def test_wrong_times_are_named(tmp_path: Path, text: str, printed: str) -> None:
@@ -257,7 +260,7 @@ def test_a_side_by_side_video_has_the_scenes_size(scene: Scene, tmp_path: Path) 
 def test_times_that_are_not_text_are_reported(tmp_path: Path) -> None:
     times = tmp_path / "times.csv"
     times.write_text("t_s\n0.0\n0.1\n", encoding="utf-16")
-    with pytest.raises(DeviceError, match=r"times\.csv: cannot be read as UTF-8 CSV"):
+    with pytest.raises(DeviceError, match=r"times\.csv is not a CSV file with UTF-8 text"):
         read_times(times, 2)
 
 

@@ -117,7 +117,9 @@ def test_a_volume_around_the_camera_fills_the_image() -> None:
 @pytest.mark.parametrize("tilt_rad", [np.pi, 1.2], ids=["behind", "beside"])
 def test_a_camera_that_faces_elsewhere_is_reported(tilt_rad: float) -> None:
     scene = moved(SCENE, (0.0, 0.5, 0.9), tilt_rad)
-    with pytest.raises(DeviceError, match=r"the left view does not show finger\.volume"):
+    with pytest.raises(
+        DeviceError, match=r"the left view does not show the box from finger\.volume"
+    ):
         find_finger_regions(scene)
 
 

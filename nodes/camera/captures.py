@@ -1,10 +1,7 @@
 """Read cameras that the Python package of OpenCV does not support.
 
-The classes have the interface of cv2.VideoCapture.  `AravisCapture` reads one GenICam camera (GigE
-Vision or USB3 Vision), and `GstreamerCapture` reads a GStreamer pipeline.  `RealSenseCapture` reads
-the infrared pair of a RealSense camera, and returns both views side by side in one image.  The
-packages are optional and imported when a device is opened.  `settings.BACKENDS` defines the units
-of the controls.
+The classes have the interface of cv2.VideoCapture.  The packages that they need are optional, and
+are imported when a device is opened.  `settings.BACKENDS` defines the units of the controls.
 """
 
 from __future__ import annotations
@@ -23,7 +20,7 @@ from numpy.typing import NDArray
 from flexsheet.nodes.camera.image_pair import DeviceError, Image
 
 GRAB_S = 1.0
-"""Timeout of a grab, so that the reading thread can end when a camera sends no images."""
+"""The timeout of a grab.  The reading thread can then end even if a camera sends no images."""
 
 BUFFERS = 4
 
@@ -34,7 +31,7 @@ def _import(module: str, remedy: str) -> Any:
             warnings.simplefilter("ignore", ImportWarning)  # Importing gi causes such warnings.
             return importlib.import_module(module)
     except ImportError as error:
-        raise DeviceError(f"{module} cannot be imported ({error}); {remedy}") from error
+        raise DeviceError(f"cannot import the package {module} ({error}); {remedy}") from error
 
 
 def _import_introspected(name: str, version: str) -> Any:
@@ -51,14 +48,15 @@ def _import_introspected(name: str, version: str) -> Any:
 
 
 def _monotonic_ms(real_time_ns: int) -> float:
-    """Convert a time of the system clock (ns since 1970) to the monotonic clock, ms."""
+    """Convert a system time (ns since 1970) to a time of the monotonic clock, ms."""
     return (real_time_ns - time.time_ns() + time.monotonic_ns()) * 1e-6
 
 
 class CapturedDevice(ABC):
-    """Base class of captures: stores the requested format, and starts the device on first use.
+    """The base class of captures, which start their device when it is first used.
 
-    stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if there is none.
+    stamp_ms: timestamp of the grabbed frame on the monotonic clock, ms; 0 if it is unknown.
+    wanted: requested format by OpenCV property.
     """
 
     def __init__(self, device: str) -> None:
@@ -74,7 +72,7 @@ class CapturedDevice(ABC):
 
     @abstractmethod
     def _start(self) -> None:
-        """Start the device with the format in `wanted`; raises DeviceError."""
+        """Start the device with the format `wanted`; raise DeviceError if this fails."""
 
     def _ensure_started(self) -> None:
         if not self.started:
@@ -82,7 +80,10 @@ class CapturedDevice(ABC):
             self.started = True
 
     def set(self, property_id: int, value: float) -> bool:
-        """Set a control, or before the start a format property; return whether it is accepted."""
+        """Set an OpenCV property, and return whether the device accepts it.
+
+        Properties of the format can be set only before the device is started.
+        """
         if property_id in self.wanted and not self.started:
             self.wanted[property_id] = value
             return True
@@ -92,7 +93,7 @@ class CapturedDevice(ABC):
         return self._set_control(property_id, value)
 
     def get(self, property_id: int) -> float:
-        """Return the actual value of a property, or the frame's timestamp (ms); 0 if unknown."""
+        """Return the actual value of an OpenCV property; 0 if it is unknown."""
         if property_id == cv2.CAP_PROP_POS_MSEC:
             return self.stamp_ms
         self._ensure_started()
@@ -105,12 +106,15 @@ class CapturedDevice(ABC):
         return 0.0
 
     def retrieve(self) -> tuple[bool, Image | None]:
-        """Return whether there is a grabbed image, and the grey image (h, w)."""
+        """Return whether an image was grabbed, and the grey image (height, width) or None."""
         return self.image is not None, self.image
 
 
 class AravisCapture(CapturedDevice):
-    """GenICam camera read with Aravis; device: its name, or empty for the only camera."""
+    """A GenICam camera (GigE Vision or USB3 Vision) that is read with Aravis.
+
+    device: name of the camera, or empty for the only camera.
+    """
 
     def __init__(self, device: str) -> None:
         super().__init__(device)
@@ -121,11 +125,14 @@ class AravisCapture(CapturedDevice):
         self._camera = self._call(lambda: self._aravis.Camera.new(device or None), "open")
 
     def _call(self, call: Any, what: str) -> Any:
-        """Call a function of Aravis; raises DeviceError that names the device and the action."""
+        """Call a function of Aravis; raise DeviceError if it fails.
+
+        what: action for the error text, such as "start".
+        """
         try:
             return call()
         except Exception as error:  # GLib.Error, which is known only after the import.
-            raise DeviceError(f"{self.device!r}: Aravis cannot {what}: {error}") from error
+            raise DeviceError(f"camera {self.device!r}: Aravis cannot {what}: {error}") from error
 
     def _start(self) -> None:
         camera = self._camera
@@ -175,7 +182,7 @@ class AravisCapture(CapturedDevice):
         return 0.0
 
     def grab(self) -> bool:
-        """Wait for the next complete frame; return False if there is none."""
+        """Wait for the next complete frame; return False if none arrives within GRAB_S."""
         self._ensure_started()
         end_s = time.monotonic() + GRAB_S
         while (left_s := end_s - time.monotonic()) > 0.0:
@@ -201,10 +208,11 @@ class AravisCapture(CapturedDevice):
 
 
 class RealSenseCapture(CapturedDevice):
-    """Infrared pair of a RealSense camera; device: its serial number, or empty for any camera.
+    """The infrared pair of a RealSense camera, as one image with both views side by side.
 
+    device: serial number, or empty for any camera.
     The dot projector of the camera is switched off.  Both sensors are triggered together.  The
-    timestamp is the middle of the exposure, if the camera reports sensor timestamps.
+    timestamp is the middle of the exposure if the camera reports sensor timestamps.
     """
 
     def __init__(self, device: str) -> None:
@@ -230,9 +238,9 @@ class RealSenseCapture(CapturedDevice):
             profile = pipeline.start(config)
         except RuntimeError as error:
             raise DeviceError(
-                f"RealSense {self.device or '(any)'}: no infrared pair of {width}x{height} px at "
-                f"{rate_hz} Hz: {error}; set camera.width_px, height_px and rate_hz of the scene "
-                "to a mode that `rs-enumerate-devices` lists"
+                f"RealSense camera {self.device or '(any)'} cannot deliver an infrared pair of "
+                f"{width}x{height} px at {rate_hz} Hz: {error}; set camera.width_px, height_px and "
+                "rate_hz of the scene to a mode that `rs-enumerate-devices` lists"
             ) from error
         self._pipeline, self._sensor = pipeline, profile.get_device().first_depth_sensor()
         for option, value in (
@@ -274,7 +282,7 @@ class RealSenseCapture(CapturedDevice):
         return float(self._sensor.get_option(option))
 
     def grab(self) -> bool:
-        """Wait for the next pair; return False if there is none."""
+        """Wait for the next pair; return False if none arrives within GRAB_S."""
         self._ensure_started()
         found, frames = self._pipeline.try_wait_for_frames(round(1e3 * GRAB_S))
         if not found:
@@ -285,7 +293,7 @@ class RealSenseCapture(CapturedDevice):
         return True
 
     def _find_stamp_ms(self, frame: Any) -> float:
-        """Return the time of the middle of the exposure, monotonic clock, ms; 0 if unknown."""
+        """Return the middle of the exposure as a time of the monotonic clock, ms; 0 if unknown."""
         rs = self._rs
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return 0.0
@@ -301,16 +309,16 @@ class RealSenseCapture(CapturedDevice):
         return _monotonic_ms(round(1e6 * frame.get_timestamp())) - 1e-3 * back_us
 
     def release(self) -> None:
-        """Stop the camera."""
         if self._pipeline is not None:
             self._pipeline.stop()
         self._pipeline = self._sensor = None
 
 
 class GstreamerCapture(CapturedDevice):
-    """GStreamer pipeline; device: description up to raw video, like `v4l2src device=/dev/video0`.
+    """A GStreamer pipeline, which determines the image format and the controls.
 
-    The pipeline determines format and controls.  Timestamps come from the source element.
+    device: description of the pipeline up to raw video, such as `v4l2src device=/dev/video0`.
+    The source element of the pipeline provides the timestamps.
     """
 
     def __init__(self, device: str) -> None:
@@ -329,16 +337,21 @@ class GstreamerCapture(CapturedDevice):
         try:
             self._pipeline = gst.parse_launch(text)
         except Exception as error:  # GLib.Error, which is known only after the import.
-            raise DeviceError(f"{self.device!r}: no valid GStreamer pipeline: {error}") from error
+            raise DeviceError(
+                f"{self.device!r} is not a valid GStreamer pipeline: {error}; correct the camera "
+                "node's source"
+            ) from error
         self._sink = self._pipeline.get_by_name("sink")
         self._pipeline.use_clock(gst.SystemClock.obtain())
         self._pipeline.set_state(gst.State.PLAYING)
         if not self.grab_sample():
             self.release()
-            raise DeviceError(f"{self.device!r}: the GStreamer pipeline delivers no image")
+            raise DeviceError(
+                f"the GStreamer pipeline {self.device!r} delivers no image; test it with gst-launch"
+            )
 
     def grab_sample(self) -> bool:
-        """Wait for the next image of the running pipeline; return False if there is none."""
+        """Wait for the next image of the running pipeline; return False if none arrives."""
         gst = self._gst
         sample = self._sink.emit("try-pull-sample", round(1e9 * GRAB_S))
         if sample is None:
@@ -356,7 +369,7 @@ class GstreamerCapture(CapturedDevice):
         return True
 
     def grab(self) -> bool:
-        """Wait for the next image; return False if the pipeline has ended or delivers nothing."""
+        """Wait for the next image; return False if the pipeline has ended or delivers no image."""
         self._ensure_started()
         return self.grab_sample()
 
@@ -367,7 +380,6 @@ class GstreamerCapture(CapturedDevice):
         return 0.0
 
     def release(self) -> None:
-        """Stop the pipeline."""
         if self._pipeline is not None:
             self._pipeline.set_state(self._gst.State.NULL)
         self._pipeline = None
@@ -378,13 +390,14 @@ CAPTURES: dict[str, type[AravisCapture | GstreamerCapture | RealSenseCapture]] =
     "gstreamer": GstreamerCapture,
     "realsense": RealSenseCapture,
 }
-"""Capture classes by the value of `api` in the source parameter of a camera node."""
+"""The capture class of each value of `api` in the parameter `source` of a camera node."""
 
 
 def list_devices(sysfs: Path = Path("/sys/class/video4linux")) -> list[str]:
-    """Return a line of text for each camera found, with its `api` and its name.
+    """Return a line of text for each connected camera, with its `api` and its name.
 
-    Cameras whose optional package is not installed are not listed.
+    sysfs: folder in which Linux lists video devices.
+    A camera is not listed if its optional package is not installed.
     """
     found = []
     for node in sorted(sysfs.glob("video*")):

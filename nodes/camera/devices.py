@@ -1,4 +1,4 @@
-"""Open a source of images, and read it in a separate thread, to its end or in a loop."""
+"""Open a source of images, and read the images in a separate thread."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ MAX_RETRY_S = 30.0
 def open_reader(
     source: AnySource, camera: StereoCamera, now: Now, requested: Regions | None = None
 ) -> Reader:
-    """Open a source of images for a scene's camera; raises DeviceError.
+    """Open a source of images for a scene's camera.
 
-    now: returns the current time, ns.
-    requested: sensor regions that a device should read at least.
+    now: function that returns the current time, ns.
+    requested: sensor regions that a camera must deliver; None: full sensors.
+    Raises DeviceError if the source cannot be opened.
     """
     if isinstance(source, OpenCvSource):
         return CameraReader(source, camera, now, requested)
@@ -39,11 +40,11 @@ def open_reader(
         return VideoReader(source, camera.rate_hz)
     if isinstance(source, ImagesSource):
         return ImagesReader(source, camera)
-    raise DeviceError(f'source "{source.kind}" has no device or files to open')
+    raise DeviceError(f'the source "{source.kind}" is not a device or a file that can be opened')
 
 
 class ReaderThread(threading.Thread):
-    """Thread that reads a source to its end, reports failures and opens the source again.
+    """A thread that reads image pairs from a source, and reopens the source after a failure.
 
     deliver(images, lost): called for each image pair, with the total number of lost frames.
     fail(error): called for each DeviceError.  The source is then opened again after a delay, which
@@ -53,7 +54,7 @@ class ReaderThread(threading.Thread):
     finish(pairs): called at the end of the source, with the number of pairs.
     regions: sensor regions to deliver; None for the full images.
 
-    All functions are called in this thread.
+    All functions are called in the thread itself.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Read stereo image pairs from video or image files, with the times that the files give."""
+"""Read stereo image pairs from video files or image files."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from flexsheet.nodes.camera.stamps import Pairing
 
 @dataclass(frozen=True, slots=True)
 class FileFrame:
-    """Decoded frame and its time since the file's first frame."""
+    """A decoded frame and its time since the first frame of the file."""
 
     image: Image
     time_ns: int
 
 
 class VideoFile:
-    """Reader of one video file, frame by frame."""
+    """A video file that is read frame by frame.
+
+    rate_hz: frame rate; None: the frame times in the file are used.
+    Raises DeviceError if the file cannot be opened.
+    """
 
     def __init__(self, path: Path, rate_hz: float | None) -> None:
-        """Open a file.  Raises DeviceError.
-
-        rate_hz: frame rate; None: use the frame times in the file.
-        """
         if not path.is_file():
             raise DeviceError(f"{path}: file not found; correct the camera node's source")
         self.path, self._rate_hz = path, rate_hz
@@ -52,7 +52,7 @@ class VideoFile:
     def advance(self) -> bool:
         """Append the next frame to `frames`; return False at the end of the file.
 
-        Raises DeviceError.
+        Raises DeviceError if the frame times in the file do not increase.
         """
         image = self._capture.read()[1]
         if image is None:
@@ -64,8 +64,8 @@ class VideoFile:
             time_ns = round(1e6 * time_ms) if math.isfinite(time_ms) else self._newest_ns
             if time_ns <= self._newest_ns:
                 raise DeviceError(
-                    f"{self.path}: frame {self._number} at {time_ms:g} ms is not after the "
-                    "previous one: the file has no valid frame times; set rate_hz"
+                    f"{self.path}: the time of frame {self._number}, {time_ms:g} ms, is not after "
+                    "that of the previous frame; set rate_hz of the camera node's source"
                 )
         self._number += 1
         self._newest_ns = time_ns
@@ -76,13 +76,23 @@ class VideoFile:
         self._capture.release()
 
 
-class VideoReader:
-    """Reader of one video file with both views, or of two files whose frames are paired by time."""
+class FileReader:
+    """The base class of readers of files, in which reading never waits."""
 
     paced = True
     rate_hz: float | None = None
     warnings: tuple[str, ...] = ()
     opened: tuple[str, ...] = ()
+
+    def interrupt(self) -> None:
+        """Do nothing, since `read` does not wait."""
+
+    def close(self) -> None:
+        """Close all open files."""
+
+
+class VideoReader(FileReader):
+    """A reader of one video file with both views, or of two files that are paired by time."""
 
     def __init__(self, source: VideoSource, camera_rate_hz: float) -> None:
         self._source, self._camera_rate_hz = source, camera_rate_hz
@@ -105,7 +115,7 @@ class VideoReader:
         self._pairing = Pairing(1.0 / rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next image pair; None at the end.  Raises DeviceError."""
+        """Return the next image pair, or None at the end; raise DeviceError if this fails."""
         frames = self._next()
         if frames is None and self._source.loop:
             self.close()
@@ -136,7 +146,7 @@ class VideoReader:
     def _next(self) -> tuple[FileFrame, ...] | None:
         """Return the next two frames of a pair, or the next frame with both views.
 
-        Return None at the end of the shorter file.
+        Return None at the end of one of the files.
         """
         if len(self._files) == 1:
             (file,) = self._files
@@ -150,9 +160,6 @@ class VideoReader:
                 if not file.frames and not file.advance():
                     return None
 
-    def interrupt(self) -> None:
-        """Do nothing, since `read` does not wait."""
-
     def close(self) -> None:
         for file in self._files:
             file.close()
@@ -160,10 +167,10 @@ class VideoReader:
 
 
 class _LoopClock:
-    """Continuous time for a file that is read repeatedly.
+    """A clock whose time continues when a file is read again from its start.
 
     The interval between two passes equals the interval between the last two images of the file.
-    rate_hz: frame rate, which determines the interval for a file with a single image.
+    rate_hz: frame rate, which determines the interval if the file has a single image.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -172,7 +179,7 @@ class _LoopClock:
         self._newest_ns: int | None = None
 
     def continuous_ns(self, time_ns: int) -> int:
-        """Return an image's time since the start of the first pass; time_ns: time in this pass."""
+        """Convert a time in the current pass to a time since the start of the first pass, ns."""
         continuous_ns = self._start_ns + time_ns
         if self._newest_ns is not None:
             self._interval_ns = continuous_ns - self._newest_ns
@@ -186,24 +193,29 @@ class _LoopClock:
 
 
 def read_times(path: Path, pairs: int) -> list[int]:
-    """Read the times of image pairs, ns since the first one, from the column `t_s` of a CSV file.
+    """Read the times of image pairs from the column `t_s` of a CSV file, in s.
 
-    pairs: required number of rows.  The column contains times in s.  Raises DeviceError, with file
-    and line, unless these are ascending numbers.
+    pairs: required number of rows.
+    Returns the times in ns since the first image pair.  Raises DeviceError if the file cannot be
+    read, or if its times are not ascending numbers.
     """
     if not path.is_file():
-        raise DeviceError(f"{path}: file not found")
+        raise DeviceError(f"{path}: file not found; correct times of the camera node's source")
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = csv.DictReader(file, skipinitialspace=True)
             columns = rows.fieldnames or ()
             texts = [(rows.line_num, row.get("t_s")) for row in rows]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise DeviceError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
+        raise DeviceError(
+            f"{path} is not a CSV file with UTF-8 text: {error}; replace the file"
+        ) from error
     if "t_s" not in columns:
-        raise DeviceError(f"{path}: no column t_s; the first line must contain the column names")
+        raise DeviceError(f"{path}: the column t_s is missing; name it in the first line")
     if len(texts) != pairs:
-        raise DeviceError(f"{path}: expected one row for each of {pairs} pairs, found {len(texts)}")
+        raise DeviceError(
+            f"{path} has {len(texts)} rows for {pairs} image pairs; give one row for each pair"
+        )
     times_s: list[float] = []
     for line, text in texts:
         try:
@@ -212,34 +224,31 @@ def read_times(path: Path, pairs: int) -> list[int]:
             time_s = math.nan
         if not math.isfinite(time_s):
             raise DeviceError(
-                f"{path}, line {line}: t_s: expected a number of seconds, found {text!r}"
+                f"{path}, line {line}: t_s is {text!r}; it must be a number of seconds"
             )
         if times_s and time_s <= times_s[-1]:
             raise DeviceError(
-                f"{path}, line {line}: t_s {text} is not after the previous one; sort the rows by "
-                "time"
+                f"{path}, line {line}: t_s is {text} s, which is not after the time in the "
+                "previous row; sort the rows by time"
             )
         times_s.append(time_s)
     return [round(1e9 * (time_s - times_s[0])) for time_s in times_s]
 
 
-class ImagesReader:
-    """Reader of image files: one glob pattern for the left images, and one for the right images."""
-
-    paced = True
-    rate_hz: float | None = None
-    warnings: tuple[str, ...] = ()
-    opened: tuple[str, ...] = ()
+class ImagesReader(FileReader):
+    """A reader of left and right image files that match two glob patterns."""
 
     def __init__(self, source: ImagesSource, camera: StereoCamera) -> None:
         left, right = sorted(glob(str(source.left))), sorted(glob(str(source.right)))
         for pattern, paths in ((source.left, left), (source.right, right)):
             if not paths:
-                raise DeviceError(f"{pattern}: matches no file; correct the camera node's source")
+                raise DeviceError(
+                    f"the pattern {pattern} matches no file; correct the camera node's source"
+                )
         if len(left) != len(right):
             raise DeviceError(
-                f"{source.left} matches {len(left)} files, but {source.right} matches {len(right)}:"
-                " expected equal numbers"
+                f"the pattern {source.left} matches {len(left)} files, but {source.right} matches "
+                f"{len(right)} files; provide equal numbers of left and right images"
             )
         rate_hz = source.rate_hz or camera.rate_hz
         if source.times is None:
@@ -248,7 +257,8 @@ class ImagesReader:
             times_ns = read_times(source.times, len(left))
         else:
             raise DeviceError(
-                f"camera source: times ({source.times}) and rate_hz are both set; remove one"
+                f"the camera node's source has times ({source.times}) and rate_hz; remove one of "
+                "them"
             )
         self._note = f"at {rate_hz:g} Hz" if source.times is None else "times of the CSV file"
         self._pairs = list(zip(left, right, times_ns, strict=True))
@@ -256,7 +266,7 @@ class ImagesReader:
         self._clock = _LoopClock(rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next image pair; None at the end.  Raises DeviceError."""
+        """Return the next image pair, or None at the end; raise DeviceError if this fails."""
         if self._next == len(self._pairs):
             if not self._loop:
                 return None
@@ -268,15 +278,9 @@ class ImagesReader:
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
             if image is None:
                 raise DeviceError(
-                    f"{path}: cannot be read as an image; replace the file, or change the pattern"
+                    f"{path} cannot be read as an image; replace the file, or change the pattern"
                 )
             images.append(convert_to_gray(image))
         self._next += 1
         left, right = images
         return ImagePair(left, right, self._clock.continuous_ns(time_ns), notes=(self._note,))
-
-    def interrupt(self) -> None:
-        """Do nothing, since `read` does not wait."""
-
-    def close(self) -> None:
-        """Do nothing, since no file is open."""

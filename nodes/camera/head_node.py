@@ -1,4 +1,4 @@
-"""Publish the positions of the user's eyes that a camera in front of the user sees."""
+"""Publish the positions of the user's eyes, which a camera in front of the user measures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
 JOIN_S = 1.0
 DRAIN_NS = 10_000_000
-"""Time after a search in which images are discarded, because they waited in the driver's queue."""
+"""The time after a search in which images are discarded, because they waited in the driver's queue.
+"""
 PixelCount = Annotated[int, Field(gt=0)]
 
 
@@ -43,20 +44,21 @@ class HeadCameraParameters(NodeParameters):
     height_px: PixelCount = Field(default=480, description="height of the images, px")
     lens: Lens = Field(
         default=Lens(fx_px=600.0, fy_px=600.0, cx_px=319.5, cy_px=239.5),
-        description="lens of the camera for this image size; default: a usual webcam. An error of "
-        "1 % in the focal length is an error of 1 % in the distance",
+        description="lens of the camera for this image size; default: a typical webcam. An error "
+        "of 1 % in the focal length causes an error of 1 % in the distance of the eyes",
     )
     world_from_camera: Pose = Field(
         default=Pose(position_m=np.array([0.0, 0.25, 0.0]), rpy_rad=np.array([0.0, 0.0, np.pi])),
-        description="pose of the camera, with x right, y down and z along its optical axis",
+        description="pose of the camera in the world; its axes are x right, y down and z along the "
+        "optical axis",
     )
     max_rate_hz: Positive = Field(
         default=15.0, description="maximum rate at which images are searched for a face, Hz"
     )
     search_width_px: PixelCount = Field(
         default=480,
-        description="width to which larger images are reduced for the search, px; a face must "
-        "have at least 80 px in the reduced image",
+        description="width to which larger images are reduced for the face search, px. A face must "
+        "be at least 80 px wide in the reduced image",
     )
     delay_s: NonNegative = Field(
         default=0.03, description="time from the exposure to the arrival of an image, s"
@@ -66,26 +68,27 @@ class HeadCameraParameters(NodeParameters):
     )
     cutoff_per_speed_hz: NonNegative = Field(
         default=20.0,
-        description="increase of the cutoff frequency per speed of the head, Hz per m/s",
+        description="increase of the cutoff frequency with the speed of the head, Hz per m/s",
     )
     silence_s: Positive = Field(
         default=0.3,
-        description="time without eyes until the filter is reset, and without an image until the "
-        "eyes are invalid, s",
+        description="time without detected eyes after which the filter is reset, and time without "
+        "an image after which the eyes are published as invalid, s",
     )
     retry_s: Positive = Field(
-        default=2.0, description="time until a camera that failed is opened again, s"
+        default=2.0, description="time after a failure until the camera is opened again, s"
     )
     watch_hz: Positive = Field(
-        default=5.0, description="rate at which missing images are checked, Hz"
+        default=5.0, description="rate at which the node checks for missing images, Hz"
     )
 
 
 class HeadCamera(Node):
-    """Node that publishes the eyes which a UVC camera sees, for a display that follows the head.
+    """A node that publishes the positions of the user's eyes in the images of a UVC camera.
 
-    The interocular distance in the scene and the focal length give the distance. Without camera,
-    packages or face, `eye` is invalid; the renderer then uses the scene's eyes.
+    The distance of the eyes follows from the interocular distance in the scene and from the focal
+    length. If the camera, its packages or a face are missing, the node publishes invalid eyes. The
+    renderer then uses the eyes of the scene.
     """
 
     opens_devices: ClassVar[bool] = True
@@ -130,7 +133,10 @@ class HeadCamera(Node):
             self.report_error("source", error)
 
     def _receive(self, at_ns: int, pixels: Floats | None) -> None:
-        """Publish the eyes of one image.  pixels: (2, 2), or None without a face."""
+        """Publish the eyes of one image.
+
+        at_ns: time of the exposure.  pixels: (2, 2) px of both eyes, or None without a face.
+        """
         scene, last_ns = self.current_scene, self._published_ns
         if scene is None or (last_ns is not None and at_ns <= last_ns):
             return
@@ -152,8 +158,8 @@ class HeadCamera(Node):
             make_eye(centre, right, scene)  # An implausible position must not enter the filter.
         except RejectedError:
             x, y, z = centre
-            where = f"at ({x:.2f}, {y:.2f}, {z:.2f}) m, over 1 m from the scene's eyes"
-            self._publish_invalid(at_ns, f"the eyes are {where}: check lens and world_from_camera")
+            where = f"at ({x:.2f}, {y:.2f}, {z:.2f}) m, more than 1 m from the scene's eyes"
+            self._publish_invalid(at_ns, f"the eyes are {where}; check lens and world_from_camera")
             return
         filtered = self._filter.update(1e-9 * at_ns, np.concatenate([centre, right]))
         self._last_eye = make_eye(filtered[:3], filtered[3:], scene)
@@ -172,8 +178,8 @@ class HeadCamera(Node):
     async def watch(self) -> None:
         """Publish invalid eyes while no images arrive.
 
-        Their time is that since which they are missing, so that an image that is being searched is
-        newer.
+        The timestamp is `silence_s` in the past, so that the eyes of an image that is still being
+        searched are newer.
         """
         p = self.parameters
         at_ns = self.clock.now_ns() - round(1e9 * (p.delay_s + p.silence_s))
@@ -182,10 +188,12 @@ class HeadCamera(Node):
 
 
 class FaceReader(threading.Thread):
-    """Thread that reads a camera, searches the newest image for eyes, and opens it again if needed.
+    """A thread that searches the newest image of a camera for eyes.
 
-    deliver(at_ns, pixels): called for each searched image, with the time of its exposure.
-    fail(error): called for each DeviceError. Both are called in this thread.
+    deliver(at_ns, pixels): called for each searched image, with the time of its exposure and the
+    pixels (2, 2) of the eyes, or None without a face.
+    fail(error): called for each DeviceError. The camera is then opened again after a delay.
+    Both functions are called in the thread itself.
     """
 
     def __init__(
@@ -215,7 +223,7 @@ class FaceReader(threading.Thread):
                 self.stopping.wait(self._parameters.retry_s)
 
     def _read(self, detect: Detector) -> None:
-        """Search images until the thread is stopped.  Raises DeviceError."""
+        """Search images until the thread is stopped; raise DeviceError if the camera fails."""
         p = self._parameters
         capture = open_capture(p.device)
         try:
@@ -230,11 +238,13 @@ class FaceReader(threading.Thread):
                     continue
                 image = capture.retrieve()[1] if grabbed else None
                 if image is None:
-                    raise DeviceError(f"{p.device!r}: delivers no more images; check its cable")
+                    raise DeviceError(
+                        f"camera {p.device!r} does not deliver images any more; check its cable"
+                    )
                 height, width = image.shape[:2]
                 if (width, height) != (p.width_px, p.height_px):
                     raise DeviceError(
-                        f"{p.device!r}: delivers images of {width}x{height} px instead of "
+                        f"camera {p.device!r} delivers images of {width}x{height} px instead of "
                         f"{p.width_px}x{p.height_px} px; set width_px, height_px and the lens"
                     )
                 pixels = detect(convert_to_gray(image))

@@ -1,8 +1,4 @@
-"""Define the interface of readers, which read pairs of grey images from cameras or files.
-
-A reader is opened, read in a thread that may block, and closed.  After a `DeviceError` its source
-can be opened again.  At the end of the source, `read` returns None.
-"""
+"""Define the interface of readers, which read pairs of grey images from cameras or files."""
 
 from __future__ import annotations
 
@@ -24,7 +20,7 @@ Now = Callable[[], int]
 
 
 class DeviceError(FlexsheetError, RuntimeError):
-    """Error if a device or file cannot be read, or its images are not as expected."""
+    """An error for a device or file that cannot be read, or that delivers unexpected images."""
 
     code = "device"
     remedy = (
@@ -34,7 +30,7 @@ class DeviceError(FlexsheetError, RuntimeError):
 
 
 class Region(NamedTuple):
-    """Part of a sensor: column and row of its first pixel (from zero), width and height, px."""
+    """A part of a sensor: column and row of its first pixel (from zero), width and height, px."""
 
     column: Annotated[int, Field(ge=0)]
     row: Annotated[int, Field(ge=0)]
@@ -54,19 +50,19 @@ class Region(NamedTuple):
 
 
 Regions = tuple[Region, Region]
-"""Sensor regions of the left and the right camera."""
+"""The sensor regions of the left and the right camera."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImagePair:
-    """Left and right grey image (height, width) that were taken at about the same time.
+    """A left and a right grey image (height, width) that were taken at about the same time.
 
-    exposure_ns: mean of both mid-exposure times on the reader's clock.  For a paced reader (files),
-        time since the start of the file.
+    exposure_ns: mean of both mid-exposure times on the reader's clock.  For files, time since the
+        start of the file.
     exposure_s: duration of the exposure as reported by the device; None if unknown.
-    skew_s: time of the right exposure minus that of the left one.
+    skew_s: time of the right exposure minus time of the left exposure.
     regions: sensor regions of the images; None for full sensors.
-    notes: remarks for display to the user.
+    notes: remarks for the operator.
     """
 
     left: Image
@@ -79,11 +75,11 @@ class ImagePair:
 
 
 class Reader(Protocol):
-    """Interface of readers of image pairs.
+    """The interface of readers of image pairs.
 
     paced: whether `read` returns immediately, as for files.  The caller must then wait until each
         pair is due.
-    rate_hz: frame rate of a device, to count lost frames; None for files.
+    rate_hz: frame rate of a device, from which lost frames are counted; None for files.
     warnings: texts about settings that the device did not accept.
     opened: texts about the actual format and settings of each device; empty for files.
     """
@@ -94,11 +90,11 @@ class Reader(Protocol):
     opened: tuple[str, ...]
 
     def read(self) -> ImagePair | None:
-        """Wait for the next pair and return it; None at the end.  Raises DeviceError."""
+        """Wait for the next pair and return it, or None at the end; may raise DeviceError."""
         ...
 
     def interrupt(self) -> None:
-        """Make the current `read`, and every later one, return None soon.  Thread-safe."""
+        """Make the current `read` and all later calls return None soon.  Thread-safe."""
         ...
 
     def close(self) -> None: ...
@@ -107,9 +103,9 @@ class Reader(Protocol):
 def make_stereo_message(
     images: ImagePair, device: str, exposure_s: float, dropped_frames: int
 ) -> StereoPair:
-    """Make the message that publishes an image pair.
+    """Make the message for an image pair.
 
-    device: name of the camera.  exposure_s: used if the device does not report its exposure.
+    device: name of the camera.  exposure_s: value if the device does not report its exposure time.
     """
     origins = [(region.column, region.row) for region in images.regions or ()] or [(0, 0)] * 2
     return StereoPair(
@@ -125,7 +121,7 @@ def make_stereo_message(
 
 
 def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
-    """Convert a published message to an image pair; exposure_ns: mean mid-exposure time."""
+    """Convert a message to an image pair; exposure_ns: mean of both mid-exposure times."""
     origins = (pair.left_origin_px, pair.right_origin_px)
     left, right = (
         Region(*origin, image.shape[1], image.shape[0])
@@ -144,15 +140,15 @@ def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
 def describe_skew(skew_s: float, limit_s: float) -> str:
     """Return a text that explains why a pair was rejected for its skew."""
     return (
-        f"skew {1e3 * skew_s:.1f} ms between right and left exposure, maximum {1e3 * limit_s:g} ms:"
-        " restart the cameras, or connect a common trigger"
+        f"{1e3 * skew_s:.1f} ms between left and right exposure, maximum {1e3 * limit_s:g} ms; "
+        "restart the cameras, or connect a common trigger"
     )
 
 
 def convert_to_gray(image: NDArray[Any]) -> Image:
-    """Convert a decoded image to grey (h, w).
+    """Convert an image to grey (h, w).
 
-    image: grey (h, w) or (h, w, 1); brightness and another channel (h, w, 2); or BGR (h, w, 3).
+    image: grey (h, w) or (h, w, 1), BGR (h, w, 3), or brightness and another channel (h, w, 2).
     """
     if image.ndim == 3:
         image = image[:, :, 0] if image.shape[2] < 3 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -160,21 +156,24 @@ def convert_to_gray(image: NDArray[Any]) -> Image:
 
 
 def split_side_by_side(image: Image, name: object) -> tuple[Image, Image]:
-    """Split a side-by-side image (h, 2w) into left and right view.
+    """Split an image (h, 2w) with both views side by side into left and right view (h, w).
 
-    name: source for the error text.  Raises DeviceError for an odd width.
+    name: name of the source in the error text.  Raises DeviceError if the width is odd.
     """
     if image.shape[1] % 2:
         raise DeviceError(
-            f"{name}: side-by-side image of odd width {image.shape[1]} px cannot be split; set "
-            "`right` if the views are separate"
+            f"{name}: an image with the odd width of {image.shape[1]} px cannot contain both views "
+            "side by side; set `right` if the views are separate"
         )
     middle = image.shape[1] // 2
     return np.ascontiguousarray(image[:, :middle]), np.ascontiguousarray(image[:, middle:])
 
 
 def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
-    """Raise DeviceError unless each image has the size of its region, or of the scene's camera."""
+    """Raise DeviceError unless each image has the size of its region or of the scene's camera.
+
+    name: name of the source in the error text.
+    """
     whole = Region(0, 0, camera.width_px, camera.height_px)
     regions = images.regions or (whole, whole)
     views = (("left", images.left, regions[0]), ("right", images.right, regions[1]))
@@ -186,16 +185,13 @@ def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
                 else f"its region is {region}"
             )
             raise DeviceError(
-                f"{name}: {side} view of {image.shape[1]}x{image.shape[0]} px, but {expected}: "
-                "correct the scene's camera or the camera node's source"
+                f"{name}: the {side} view has {image.shape[1]}x{image.shape[0]} px, but "
+                f"{expected}; correct the scene's camera or the camera node's source"
             )
 
 
 def crop(images: ImagePair, regions: Regions) -> ImagePair:
-    """Crop images that `check_size` has accepted to sensor regions.
-
-    Raises DeviceError if the images do not contain these regions.
-    """
+    """Crop images to sensor regions; raise DeviceError if the images do not contain them."""
     if images.regions == regions:
         return images
     parts = []
@@ -205,8 +201,8 @@ def crop(images: ImagePair, regions: Regions) -> ImagePair:
         if not available.contains(region):
             side = ("left", "right")[index]
             raise DeviceError(
-                f"region.{side}: {region} is outside the image, which has {available}; correct the "
-                "camera node's parameter region"
+                f"region.{side}: {region} is outside the image of {available}; correct the camera "
+                "node's parameter region"
             )
         row, column = region.row - available.row, region.column - available.column
         part = image[row : row + region.height, column : column + region.width]

@@ -32,21 +32,22 @@ from flexsheet.nodes.camera.sources import OpenCvSource
 from flexsheet.nodes.camera.stamps import Pairing, StampCheck
 
 MAX_WAITING_FRAMES = 4
-"""Maximum number of frames that wait for the other camera's frame; new ones replace the oldest."""
+"""The maximum number of frames that wait for a frame of the other camera.  A new frame replaces the
+oldest frame."""
 FIRST_FRAME_S = 5.0
-"""Minimum timeout for the first frame, because the sensors need time to start."""
+"""The minimum timeout for the first frame, because the sensors need time to start."""
 RELEASE_S = 0.5
 
 RATE_FRAMES = 61
-"""Number of image pairs over which the actual frame rate is measured."""
+"""The number of image pairs over which the actual frame rate is measured."""
 
 
 @dataclass(frozen=True, slots=True)
 class CapturedFrame:
-    """Image of one camera with two estimates of its mid-exposure time, ns.
+    """An image of one camera with two estimates of its mid-exposure time, ns.
 
-    by_arrival_ns: computed from the arrival. by_stamp_ns: computed from the driver's timestamp;
-    None if there is none.
+    by_arrival_ns: computed from the time of arrival. by_stamp_ns: computed from the driver's
+    timestamp; None without a timestamp.
     """
 
     image: Image
@@ -55,28 +56,32 @@ class CapturedFrame:
 
 
 def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
-    """Open a device, file or stream with OpenCV; raises DeviceError if it cannot be opened."""
+    """Open a device, file or stream with OpenCV; raise DeviceError if this fails."""
     capture = cv2.VideoCapture(device, api)
     if not capture.isOpened():
         capture.release()
         raise DeviceError(
-            f"{device!r}: cannot be opened: it does not exist, is in use, or is no camera or video"
+            f"{device!r} cannot be opened: it does not exist, is in use, or is no camera or video; "
+            "correct the device or close the other program"
         )
     return capture
 
 
 def open_device(device: int | str, api: str | None, backend: Backend | None) -> Any:
-    """Open a camera with the interface of cv2.VideoCapture; raises DeviceError."""
+    """Open a camera with the interface of cv2.VideoCapture; raise DeviceError if this fails."""
     if api in CAPTURES:
         return CAPTURES[api](str(device))
     return open_capture(device, backend.api if backend else cv2.CAP_ANY)
 
 
 class Stream(threading.Thread):
-    """Thread that reads one camera's frames, and notifies `changed` of each frame and of a failure.
+    """A thread that reads the frames of one camera.
 
-    The thread also releases the device. OpenCV would crash if another thread released it during a
-    grab, and a grab can hang.
+    views: 2 if each image contains both views side by side, else 1.
+    requested: region of the sensor to read; None: the full sensor.
+    changed: condition that is notified after each frame and after a failure.
+    The thread also releases the device, because OpenCV crashes if another thread releases the
+    device during a grab.  Raises DeviceError if the device cannot be opened or configured.
     """
 
     def __init__(
@@ -90,11 +95,7 @@ class Stream(threading.Thread):
         now: Now,
         changed: threading.Condition,
     ) -> None:
-        """Open and configure the device.  Raises DeviceError.
 
-        views: 2 if each image contains both views side by side, else 1.
-        requested: region of the sensor to read; None: the full sensor.
-        """
         super().__init__(name=f"camera {device}", daemon=True)
         self.device = device
         self.frames: deque[CapturedFrame] = deque(maxlen=MAX_WAITING_FRAMES)
@@ -148,7 +149,10 @@ class Stream(threading.Thread):
             self._capture.release()
 
     def _next(self) -> CapturedFrame | None:
-        """Read the next frame; return None if its timestamp is implausible.  Raises DeviceError."""
+        """Read the next frame; return None if its timestamp is implausible.
+
+        Raises DeviceError if the camera delivers no image.
+        """
         grabbed = self._capture.grab()
         arrival_ns = self._now()
         stamp_ns = None
@@ -161,17 +165,19 @@ class Stream(threading.Thread):
         image = self._capture.retrieve()[1] if grabbed else None
         if image is None:
             raise DeviceError(
-                f"{self.device!r}: delivers no more images: it was unplugged, or the stream ended"
+                f"camera {self.device!r} does not deliver images any more: it was unplugged, or "
+                "the stream ended; check its cable"
             )
         by_stamp_ns = None if stamp_ns is None else stamp_ns - self._to_stamp_ns
         return CapturedFrame(convert_to_gray(image), arrival_ns - self._to_grab_ns, by_stamp_ns)
 
 
 class CameraReader:
-    """Reader of two free-running cameras, or of one with both views side by side.
+    """A reader of two free-running cameras, or of one camera with both views side by side.
 
     If the timestamps of all drivers are plausible, the mid-exposure time of a frame is its
-    timestamp minus `exposure_to_stamp_s`.  Otherwise it is the arrival minus `exposure_to_grab_s`.
+    timestamp minus `exposure_to_stamp_s`.  Otherwise it is the time of arrival minus
+    `exposure_to_grab_s`.
     """
 
     paced = False
@@ -218,7 +224,7 @@ class CameraReader:
             stream.start()
 
     def read(self) -> ImagePair | None:
-        """Wait for the next image pair and return it.  Raises DeviceError."""
+        """Wait for the next image pair and return it; raise DeviceError if none arrives."""
         with self._changed:
             counts = [stream.count for stream in self._streams]
             limit_ns = self._now() + round(1e9 * self._wait_s)
@@ -239,10 +245,7 @@ class CameraReader:
         return self._make_pair(frames)
 
     def _by_stamp(self) -> bool:
-        """Return whether images are paired by the drivers' timestamps instead of their arrival.
-
-        All cameras use the same kind of time.
-        """
+        """Return whether images are paired by the drivers' timestamps instead of their arrival."""
         return all(stream.trusts_stamps for stream in self._streams)
 
     def _exposure_ns(self, frame: CapturedFrame) -> int:
@@ -253,7 +256,7 @@ class CameraReader:
     def _pop_frames(self) -> tuple[CapturedFrame, ...] | None:
         """Remove and return the next two frames of a pair, or the next frame with both views.
 
-        Return None if it has not arrived yet.
+        Return None if the frames have not arrived yet.
         """
         if len(self._streams) == 1:
             frames = self._streams[0].frames
@@ -295,22 +298,22 @@ class CameraReader:
         ]
         if silent:
             return (
-                f"{' and '.join(silent)}: no image for {self._wait_s:g} s: check the device, "
-                "its cable and its hub"
+                f"camera {' and '.join(silent)}: no image for {self._wait_s:g} s; check the "
+                "device, its cable and its hub"
             )
         return (
-            f"{self._source.left!r} and {self._source.right!r}: no two images within half a period "
-            "of each other; set both cameras to the same rate"
+            f"cameras {self._source.left!r} and {self._source.right!r}: no two images were taken "
+            "within half a period; set both cameras to the same rate"
         )
 
     def interrupt(self) -> None:
-        """Make `read` return None soon, now and later.  Thread-safe."""
+        """Make the current `read` and all later calls return None soon.  Thread-safe."""
         with self._changed:
             self._interrupted = True
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Close the cameras.  If a grab hangs, the camera's thread releases it after the grab."""
+        """Close the cameras.  A camera whose grab does not return is released after the grab."""
         for stream in self._streams:
             stream.stop()
         for stream in self._streams:

@@ -31,30 +31,33 @@ JOIN_S = 3.0
 
 
 class CameraParameters(NodeParameters):
-    """Parameters of the camera node: source of images, and which images to publish."""
+    """The parameters of the camera node."""
 
     source: AnySource = TwinSource()
     retry_s: Positive = Field(
-        default=1.0, description="first delay before a failed source is opened again, s"
+        default=1.0,
+        description="time after a first failure until the source is opened again, s; the time "
+        "doubles with each further failure",
     )
     max_skew_s: Positive | None = Field(
         default=None,
-        description="maximum time between the left and right exposure, s; null: no limit",
+        description="maximum time between the left and right exposure of a published pair, s; "
+        "null: no limit",
     )
     stamp_offset_s: Annotated[float, Field(ge=-0.1, le=0.1)] = Field(
         default=0.0,
-        description="measured time, s, by which exposures are later than their timestamps; it is "
-        "added to all timestamps",
+        description="time by which exposures are later than their timestamps, s. It is added to "
+        "all timestamps",
     )
     region: Literal["full", "finger"] | ExplicitRegions = Field(
         default="full",
-        description="part of each view to publish: full, finger (where the finger can appear), or "
-        "regions",
+        description="part of each view to publish: full, finger (the part in which the finger can "
+        "appear), or explicit regions",
     )
 
 
 class Camera(Node):
-    """Node that publishes stereo image pairs with the time of their exposure."""
+    """A node that publishes stereo image pairs with the time of their exposure."""
 
     role: ClassVar[NodeRole | None] = NodeRole.CAMERA
     opens_devices: ClassVar[bool] = True
@@ -152,10 +155,10 @@ class Camera(Node):
         self._publish(images, pair.device, pair.exposure_s, pair.dropped_frames)
 
     def _publish(self, images: ImagePair, device: str, exposure_s: float, lost: int) -> None:
-        """Publish an image pair, unless its skew exceeds the limit.
+        """Publish an image pair, unless the time between its exposures exceeds the limit.
 
-        exposure_s: used if the device does not report its exposure.
-        lost: number of lost frames, not including rejected ones.
+        exposure_s: value if the device does not report its exposure time.
+        lost: total number of lost frames, without rejected pairs.
         """
         limit_s = self.parameters.max_skew_s
         if limit_s is not None and abs(images.skew_s) > limit_s:
@@ -181,5 +184,8 @@ class Camera(Node):
         reader.stop()
         await asyncio.to_thread(reader.join, JOIN_S)
         if reader.is_alive():
-            self.log.error("device does not respond; its thread continues", reader=reader.name)
+            self.log.error(
+                "the camera does not respond, so its thread continues; restart the node",
+                reader=reader.name,
+            )
         self.newest = None

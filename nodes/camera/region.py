@@ -1,8 +1,4 @@
-"""Compute the region of each sensor in which the finger can appear.
-
-The box that the finger can reach, finger.volume_min_m to volume_max_m, is projected into both
-images.
-"""
+"""Compute the region of each sensor in which the finger can appear."""
 
 from __future__ import annotations
 
@@ -18,17 +14,17 @@ from flexsheet.nodes.models import camera, rigid
 Floats = NDArray[np.float64]
 
 GRID = 17
-"""Number of points along each edge of the reachable box.  They are close enough to neglect lens
-distortion between them."""
+"""The number of points along each edge of the box that the finger can reach.  The lens distortion
+between two points is negligible."""
 MARGIN_PX = 16.0
-"""Margin of the region, for the marker's blur and for differences between calibration and scene."""
+"""The margin for the marker's blur and for differences between calibration and scene."""
 ALIGN_PX = (16, 2)
-"""A region can start only at multiples of these numbers of columns and rows."""
+"""The numbers of columns and rows of whose multiples a region can start."""
 NEAREST_M = 1e-3
 
 
 class ExplicitRegions(LimitedModel):
-    """Sensor regions as given in a launch file: [column, row, width, height] of each view, px."""
+    """The sensor regions in a launch file: [column, row, width, height] of each view, px."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -48,8 +44,8 @@ def find_visible_region(
     """Return the sensor region that shows all visible points (n, 3) m in the camera's frame.
 
     Return None if no point is visible, and the full sensor if some points are behind the camera.
-    The distortion polynomial is invalid beyond the image's corners.  Points there are moved to the
-    circle through the farthest corner, which does not change the visible points.
+    The distortion polynomial is invalid beyond the image's corners.  Points beyond the corners are
+    therefore moved to the circle through the farthest corner.
     """
     in_front = points_camera[points_camera[:, 2] > NEAREST_M]
     if len(in_front) == 0:
@@ -76,7 +72,7 @@ def find_visible_region(
 
 
 def find_finger_regions(scene: Scene) -> Regions:
-    """Return, for each of the two views, the sensor region in which a fingertip can appear.
+    """Return the sensor region of each view in which a fingertip can appear.
 
     The fingertip can appear in the box from finger.volume_min_m to finger.volume_max_m, extended
     by the radius of the finger and a margin.  Raises DeviceError if a view does not show the box.
@@ -92,8 +88,9 @@ def find_finger_regions(scene: Scene) -> Regions:
         region = find_visible_region(points, lens, rig.width_px, rig.height_px)
         if region is None:
             raise DeviceError(
-                f"the {side} view does not show finger.volume_min_m to volume_max_m: correct "
-                f"these or camera.world_from_left in scene {scene.name}, or set region: full"
+                f"the {side} view does not show the box from finger.volume_min_m to volume_max_m; "
+                f"correct the box or camera.world_from_left in scene {scene.name}, or set region: "
+                "full"
             )
         found.append(region)
     return found[0], found[1]
@@ -113,7 +110,7 @@ def resolve_regions(setting: str | ExplicitRegions, scene: Scene) -> Regions | N
     for side, region in (("left", setting.left), ("right", setting.right)):
         if not whole.contains(region):
             raise DeviceError(
-                f"region.{side}: {region} is outside the sensor, which has "
-                f"{whole.width}x{whole.height} px; correct the camera node's parameter region"
+                f"region.{side}: {region} is outside the sensor of {whole.width}x{whole.height} "
+                "px; correct the camera node's parameter region"
             )
     return setting.left, setting.right

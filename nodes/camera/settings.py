@@ -1,7 +1,7 @@
 """Set a camera's exposure, gain, white balance, focus and region to fixed values.
 
-Each setting is read back.  If the device does not accept a setting, a warning gives its name, the
-requested value and the actual one.  Units differ between OpenCV's backends (see its source files
+Each setting is read back.  If the device does not accept a setting, a warning states the requested
+value and the actual value.  Units differ between OpenCV's backends (see its source files
 modules/videoio/src/cap_v4l.cpp, cap_ximea.cpp and cap_aravis.cpp).
 """
 
@@ -21,7 +21,7 @@ MAX_RATE_HZ = 10_000.0
 
 
 class Device(Protocol):
-    """Part of the interface of cv2.VideoCapture that this module uses."""
+    """The part of the interface of cv2.VideoCapture that this module uses."""
 
     def get(self, property_id: int, /) -> float: ...
 
@@ -30,12 +30,12 @@ class Device(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """Properties and units of a camera's controls in one of OpenCV's backends.
+    """The properties and units of a camera's controls in one of OpenCV's backends.
 
     exposure_unit_s, whole_units: unit of CAP_PROP_EXPOSURE, and whether its values are integers.
     auto_exposure: OpenCV property, and the value that selects manual exposure.
-    autos: names and properties of further automatic functions, which the value 0 switches off.
-    offsets: properties for first column and row of the sensor region; None if OpenCV has none.
+    autos: names and properties of further automatic functions; the value 0 switches them off.
+    offsets: properties for first column and row of the sensor region; None if not supported.
     buffers: number of frame buffers to request from the driver.
     stamp_fraction: time from the middle of the exposure to the driver's timestamp, in exposures.
     clock: whether CAP_PROP_POS_MSEC after a grab is the driver's timestamp of that frame.
@@ -103,10 +103,10 @@ BACKENDS = {
 
 @dataclass(frozen=True, slots=True)
 class DeviceSettings:
-    """Actual settings of a device.
+    """The actual settings of a device.
 
-    exposure_s: exposure time; None if unknown.  got: text with format and settings, for log and
-        status of the node.
+    exposure_s: exposure time; None if unknown.
+    got: text with format and settings, for the log and the status of the node.
     warnings: texts about settings that the device did not accept.
     """
 
@@ -119,8 +119,8 @@ class DeviceSettings:
 def choose_backend(device: int | str, api: str | None) -> Backend | None:
     """Return the OpenCV backend with which to open a device.
 
-    api: name of a backend, or None to choose it by the device.  Return None if OpenCV shall choose;
-    the camera's controls are then unknown.
+    api: name of a backend, or None to choose the backend by the device.
+    Return None if OpenCV must choose the backend; the camera's controls are then unknown.
     """
     if api is None:
         api = "v4l2" if isinstance(device, int) or device.startswith("/dev/") else "any"
@@ -130,7 +130,7 @@ def choose_backend(device: int | str, api: str | None) -> Backend | None:
 def set_format(
     capture: Device, backend: Backend | None, camera: StereoCamera, views: int, pixel_format: str
 ) -> None:
-    """Request the image size and frame rate of the scene; the device may deliver others.
+    """Request the image size and frame rate of the scene, which the device may ignore.
 
     views: 2 if each image contains both views side by side, else 1.
     pixel_format: four characters such as MJPG; "" for OpenCV's choice.
@@ -155,7 +155,7 @@ def fix_settings(
     warnings: list[str] = []
 
     def warn(what: str, requested: str, actual: str) -> None:
-        warnings.append(f"{device}: {what}: requested {requested}, the device has {actual}")
+        warnings.append(f"camera {device}: {what}: requested {requested}, actual: {actual}")
 
     rate_hz = capture.get(cv2.CAP_PROP_FPS)
     if not 0.0 < rate_hz <= MAX_RATE_HZ:
@@ -163,7 +163,7 @@ def fix_settings(
     elif abs(rate_hz - camera.rate_hz) > RATE_TOLERANCE * camera.rate_hz:
         warn("rate", f"{camera.rate_hz:g} Hz", f"{rate_hz:g} Hz")
     if backend is None:
-        warn("exposure", f"{1e3 * camera.exposure_s:g} ms", "no control that OpenCV supports")
+        warn("exposure", f"{1e3 * camera.exposure_s:g} ms", "OpenCV cannot set the exposure")
         text = _describe(capture, device, rate_hz, None)
         return DeviceSettings(None, rate_hz, tuple(warnings), text)
 
@@ -227,7 +227,7 @@ def set_region(
     """Set the region of the sensor that the device reads.
 
     Return the actual region, or None for the full sensor.  If the actual region does not contain
-    the requested one, the device is reset to the full sensor.
+    the requested region, the full sensor is used.
     """
     if backend is None or backend.offsets is None:
         return None

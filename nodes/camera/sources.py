@@ -13,26 +13,26 @@ from flexsheet.nodes.parameter_marks import DeviceFile
 
 
 class CameraSource(LimitedModel):
-    """Base class for the values of the camera node's parameter `source`."""
+    """The base class for values of the camera node's parameter `source`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class TwinSource(CameraSource):
-    """Simulated images, which the simulator publishes on the topic twin/stereo."""
+    """A source of simulated images from the topic twin/stereo."""
 
     kind: Literal["twin"] = "twin"
 
 
 class OpenCvSource(CameraSource):
-    """Source of live images; a camera is given by number, path, stream address or pipeline.
+    """A source of live images: one camera with both views, or two cameras.
 
     Two cameras without a common trigger expose at different times (`docs/camera.md`).
     """
 
     kind: Literal["live", "opencv"] = Field(description="opencv is the former name of live")
     left: int | DeviceFile = Field(
-        description="left camera, or one with both views side by side: number, path or address; "
+        description="left camera, or camera with both views side by side: number, path or address; "
         "aravis: name of the camera; realsense: serial number, or empty; gstreamer: pipeline"
     )
     right: int | DeviceFile | None = Field(
@@ -49,8 +49,8 @@ class OpenCvSource(CameraSource):
     )
     exposure_to_stamp_s: Finite | None = Field(
         default=None,
-        description="time from mid-exposure to the driver's timestamp, s; negative if that is the "
-        "start of the exposure; null: half the exposure time",
+        description="time from mid-exposure to the driver's timestamp, s; negative if the "
+        "timestamp is the start of the exposure; null: half the exposure time",
     )
     exposure_to_grab_s: NonNegative | None = Field(
         default=None,
@@ -58,12 +58,13 @@ class OpenCvSource(CameraSource):
         "timestamps; null: half the exposure time",
     )
     silence_s: Positive = Field(
-        default=1.0, description="maximum time without an image pair before reopening a device, s"
+        default=1.0,
+        description="time without an image pair after which the cameras are opened again, s",
     )
 
 
 class VideoSource(CameraSource):
-    """One video file with both views side by side, or two files."""
+    """A source of recorded images: one video file with both views side by side, or two files."""
 
     kind: Literal["video"]
     left: Path
@@ -77,7 +78,7 @@ class VideoSource(CameraSource):
 
 
 class ImagesSource(CameraSource):
-    """Image files, which are read in the order of their names."""
+    """A source of image files, which are read in the order of their names."""
 
     kind: Literal["images"]
     left: Path = Field(description="glob pattern of the left images, such as images/left*.png")

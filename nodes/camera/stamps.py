@@ -9,24 +9,23 @@ from typing import TypeVar
 T = TypeVar("T")
 
 MAX_FUTURE_NS = 1_000_000
-"""Maximum time by which a timestamp may be later than the frame's arrival, due to rounding."""
+"""The maximum time by which rounding may make a timestamp later than the frame's arrival."""
 MAX_AGE_NS = 1_000_000_000
-"""Maximum age of a timestamp when the frame arrives.  It allows for a driver with a few frame
+"""The maximum age of a timestamp when the frame arrives.  It permits a driver with a few frame
 buffers at 10 Hz or more."""
 MAX_IMPLAUSIBLE = 3
 SLACK = 0.05
-"""Tolerance of the pairing, as a fraction of the period.  It is needed for cameras that expose half
-a period apart.  Without it, jitter would change the pairs repeatedly, and drop a frame each time.
-"""
+"""The tolerance of the pairing, as a fraction of the period.  Without a tolerance, jitter would
+drop frames of cameras that expose half a period apart."""
 
 
 class StampCheck:
-    """Check whether a driver's timestamps are readings of this host's monotonic clock.
+    """A check whether a driver's timestamps are times of this computer's monotonic clock.
 
-    A timestamp is plausible if it is later than the previous one, and at most MAX_AGE_NS before the
-    frame's arrival.  Timestamps of another clock differ by hours or years.  The caller drops a
-    frame with an implausible timestamp.  After MAX_IMPLAUSIBLE such frames in a row, `trusted` is
-    false, and timestamps are ignored until the device is reopened.
+    A timestamp is plausible if it is later than the previous timestamp, and at most MAX_AGE_NS
+    before the frame's arrival.  Timestamps of another clock differ by hours or years.
+    trusted: whether the timestamps may be used; False after MAX_IMPLAUSIBLE consecutive implausible
+        timestamps.
     """
 
     def __init__(self) -> None:
@@ -48,10 +47,11 @@ class StampCheck:
 
 
 class Pairing:
-    """Pairing of the frames of two cameras with equal rates by their exposure times.
+    """A pairing of the frames of two cameras with equal rates by their exposure times.
 
-    The cameras have no common trigger.  Two frames are a pair if their exposures are at most half a
-    period (plus `SLACK`) apart.  Otherwise the older one is dropped and counted in `unpaired`.
+    The cameras have no common trigger.  Two frames are a pair if the time between their exposures
+    is at most half a period (plus `SLACK`).  Otherwise the older frame is dropped.
+    unpaired: number of dropped frames.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -63,7 +63,8 @@ class Pairing:
     ) -> tuple[T, T] | None:
         """Remove the next pair from both queues and return it; None if there is none.
 
-        left, right: frames, oldest first.  exposure_ns: returns the exposure time of a frame.
+        left, right: frames in the order of their exposures.
+        exposure_ns: function that returns the exposure time of a frame.
         """
         while left and right:
             skew_ns = exposure_ns(right[0]) - exposure_ns(left[0])
