@@ -141,7 +141,7 @@ async def test_images_of_another_size_are_an_error(scene: Scene, tmp_path: Path)
     source = {"kind": "video", "left": wide, "right": wide}
     async with running(scene, source=source, retry_s=0.01) as bench:
         await bench.until(lambda: bench.node.errors >= 1)
-        assert "left view of 320x120 px" in bench.node.last_error
+        assert "left view has 320x120 px" in bench.node.last_error
         assert "160x120" in bench.node.last_error
         assert bench.sent == []
 
@@ -166,7 +166,7 @@ async def test_the_twins_images_pass_with_their_time(scene: Scene) -> None:
         assert passed_header.source_ns == 123_456
         wrong = pair.model_copy(update={"right": picture(1, 1, 80)})
         await bench.node.step("twin__stereo", wrong, header)
-        assert "right view of 80x120 px" in bench.node.last_error
+        assert "right view has 80x120 px" in bench.node.last_error
         assert len(bench.sent) == 1
         assert bench.node.reader is None
 

@@ -180,7 +180,7 @@ def test_images_must_have_their_regions_size() -> None:
     reads = Region(0, 0, 64, 40), Region(10, 0, 64, 40)
     check_size(ImagePair(RAMP[:40, :64], RAMP[:40, :64], 0, regions=reads), camera, "camera")
     wrong = ImagePair(RAMP[:40, :64], RAMP, 0, regions=reads)
-    with pytest.raises(DeviceError, match=r"right view of 160x120 px, but its region is 64x40 px"):
+    with pytest.raises(DeviceError, match=r"right view has 160x120 px, but its region is 64x40 px"):
         check_size(wrong, camera, "camera")
 
 

@@ -143,7 +143,7 @@ def test_a_soft_object_lets_the_sheet_follow_the_finger_and_a_stiff_one_brings_i
 
 def test_a_stiffer_object_is_reported_with_the_ratio() -> None:
     shown = compliance(soft_curve(4.0))
-    assert "stiffer than the sheet can present" in shown.note
+    assert "stiffer than the sheet can render" in shown.note
     assert "15 to 22 %" in shown.note
     at = int(np.argmin(shown.centre.force_n - shown.centre.object_force_n))
     error = -100 * shown.centre.error_ratio[at]

@@ -256,7 +256,9 @@ async def test_a_failed_camera_is_reported_and_opened_again(
         harness.capture = FakeCapture()
         broken.deliver()
         await until(lambda: harness.node.errors, "the report")
-        assert ("no more images" if broken.fails else "320x240 px") in harness.node.note
+        assert (
+            "does not deliver images any more" if broken.fails else "320x240 px"
+        ) in harness.node.note
         await until(broken.released.is_set, "the release")
         assert (await harness.next_eye()).valid
 

@@ -435,7 +435,7 @@ async def test_an_old_fingertip_is_held_and_one_out_of_order_left_out() -> None:
     count = len(desk.sent)
     await desk.see(in_world(on_cylinder(30.0, 0.02)), after_ns=-FRAME_NS)
     assert len(desk.sent) == count
-    assert "1 fingertips dropped: out of order" in desk.planner.note
+    assert "1 late fingertips dropped" in desk.planner.note
 
 
 @settings(max_examples=25, deadline=None)

@@ -1,21 +1,20 @@
-"""Choose the sheet's stretch and normal offset, so that it renders the object's force.
+"""Choose the stretch and the normal offset of the sheet that render the force of an object.
 
-Two arms hold a stretched sheet where the surface of a virtual object is.  A finger at depth `d` in
-the object would indent a sheet that stays in the object's tangent plane by `d`.  Such a sheet would
-have the object's force at one depth only.  So the sheet also moves along its normal: by an offset
-r(d) behind the tangent plane (in front of it where r is negative).  The sheet's force then equals
-the object's, at the indentation d - r:
+Two arms hold a stretched sheet at the surface of a virtual object.  If the sheet stayed in the
+object's tangent plane, a finger at depth d in the object would indent the sheet by d.  The force of
+the sheet would then equal the force of the object at one depth only.  The sheet is therefore moved
+along its normal by an offset r(d) behind the tangent plane; a negative offset is in front of it:
 
     F_sheet(stretch, d - r(d)) = F_object(d).
 
-A retreat is an offset that grows with the depth: the sheet moves away from the finger.  Since the
-sheet lags behind, a retreat removes energy from slow pushes and so damps them.  An advance (r falls
-with d) adds energy.  `nodes.models.hand_loop` gives the largest slopes dr/dd at which every hand
-is stable with the measured delay.  The chosen stretch is the lowest one that renders the curve
-without an advance, or else the one with the smallest advance.
+A retreat is an offset that increases with the depth.  Since the sheet follows with a delay, a
+retreat removes energy from slow pushes and damps them.  An advance is an offset that decreases with
+the depth, and adds energy.  `nodes.models.hand_loop` computes the largest slopes dr/dd at which the
+loop with any hand is stable.  The lowest stretch that renders the curve without an advance is
+chosen, or else the stretch with the smallest advance.
 
-Below the threshold of touch the sheet does not advance.  Otherwise it would respond to the noise of
-the camera while a finger only strokes.
+The sheet does not advance if the forces are too small to be felt.  Otherwise the sheet would
+respond to the noise of the camera while a finger only strokes the object.
 """
 
 from __future__ import annotations
@@ -47,57 +46,56 @@ from flexsheet.nodes.models.sheet.force_models import (
 )
 
 USABLE_FRACTION = 0.85
-"""Fraction of the maximum edge force and strain that the planner uses.
+"""The fraction of the maximum edge force and strain that the planner uses.
 
-The bridges stop the arms where commanded or measured poses reach the limits.  Two moving arms are
-never exactly as far apart as planned, since each receives the other's state a cycle or two late.
+The bridges stop the arms if commanded or measured poses exceed the limits.  A margin is necessary
+because each arm receives the state of the other arm one or two cycles late.
 """
 
 FORCE_JND_FLOOR_N = 0.05
-"""Minimum force by which a force error is divided to make it relative.  Smaller forces, as in the
-first 2 mm of an object of 4 kPa, have relative errors of at least a tenth."""
+"""The minimum force by which a force error is divided to obtain a relative error.  Smaller forces
+have relative errors of at least a tenth, for example in the first 2 mm of an object of 4 kPa."""
 
 DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
-"""Contact forces up to which the sheet does not advance, and from which it advances fully.  The
-contact force is the larger one of object and sheet."""
+"""The contact force up to which the sheet does not advance, and from which it advances fully.  The
+contact force is the maximum of the object's force and the sheet's force."""
 
 DEADBAND_START_M, DEADBAND_END_M = 0.3e-3, 1.2e-3
-"""Depths up to which the sheet does not advance, and from which it advances fully.  A smaller depth
-may be a fingertip that only rests on the object."""
+"""The depth up to which the sheet does not advance, and from which it advances fully.  A fingertip
+at a smaller depth may only rest on the object."""
 
 TARGET_ERROR_RATIO = 0.10
-"""Relative error of the rendered force above which a note reports it."""
+"""The relative error of the rendered force above which the planner reports the error."""
 
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
-"""Minimum relative difference of stiffness that users notice.  0.15: if the deformation of the skin
-is a cue (Bergmann Tiest & Kappers 2009).  0.22: if neither work nor terminal force is a cue (Tan et
-al. 1995)."""
+"""The minimum relative difference of stiffness that users notice.  0.15: if the deformation of the
+skin is a cue (Bergmann Tiest & Kappers 2009).  0.22: if neither work nor terminal force is a cue
+(Tan et al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
-"""Maximum advance of the sheet per depth of the push; 0.5 feels 1.5 times as stiff as the sheet.
-
-The bounds for a stable loop with the hand are usually lower.
-"""
+"""The maximum advance of the sheet per depth of the push.  With 0.5, the sheet feels 1.5 times as
+stiff.  The bounds for a stable loop with the hand are usually lower."""
 
 SLOPE_TOLERANCE = 0.03
-"""Amount by which a slope may exceed its bound, since the bounds contain larger margins."""
+"""The amount by which a slope may exceed its bound, since the bounds contain larger margins."""
 
 STRETCH_CANDIDATES = 17
-"""Number of stretch ratios that are tried from minimum to maximum."""
+"""The number of stretch ratios that are tried between minimum and maximum."""
 
 
 class UnfitCurveError(FlexsheetError, ValueError):
-    """A force curve that is not finite, not ascending, or too short."""
+    """An error for a force curve that is not finite, not ascending, or too short."""
 
     code = "force-curve"
-    remedy = "Give force over depth from zero, rising, without repeated depths."
+    remedy = "Give forces at ascending depths, starting with force 0 N at depth 0 m."
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectCurve:
-    """Force of the object against depth: n ascending points from (0, 0).
+    """The force of an object as a function of depth, given by n ascending points from (0, 0).
 
-    Between the points the curve is a monotone cubic, beyond the last a line with the last slope.
+    The curve between the points is a monotone cubic.  Beyond the last point it is a line with the
+    last slope.  Raises UnfitCurveError if the points are not finite or not ascending.
     """
 
     depths_m: Floats
@@ -105,35 +103,36 @@ class ObjectCurve:
     _curve: scipy.interpolate.PchipInterpolator = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Raise UnfitCurveError unless there are two or more finite, ascending points."""
+
         depths, forces = self.depths_m, self.forces_n
         if depths.ndim != 1 or len(depths) < 2 or depths.shape != forces.shape:
             raise UnfitCurveError(
-                f"force curve: {depths.shape} depths and {forces.shape} forces; give as many "
-                "forces as depths, two or more"
+                f"force curve: the depths have the shape {depths.shape} and the forces "
+                f"{forces.shape}; give two or more depths and as many forces"
             )
         if not (np.isfinite(depths).all() and np.isfinite(forces).all()):
-            raise UnfitCurveError("force curve: a depth or force is not finite")
+            raise UnfitCurveError("force curve: a depth or a force is not finite")
         if depths[0] != 0.0 or forces[0] != 0.0:
             raise UnfitCurveError(
-                f"force curve: the first row is {depths[0]:g} m, {forces[0]:g} N; it must be 0, 0"
+                f"force curve: the first point is {depths[0]:g} m, {forces[0]:g} N; it must be "
+                "0 m, 0 N"
             )
         if (np.diff(depths) <= 0.0).any() or (np.diff(forces) < 0.0).any():
-            raise UnfitCurveError("force curve: depths must ascend and forces must not fall")
+            raise UnfitCurveError("force curve: the depths must ascend, the forces must not fall")
         object.__setattr__(self, "_curve", scipy.interpolate.PchipInterpolator(depths, forces))
 
     @classmethod
     def from_rows(cls, rows: Floats) -> ObjectCurve:
-        """Make the curve from `SoftBody.force_curve`: rows (n, 2) of depth, m, and force, N."""
+        """Make the curve from rows (n, 2) of depth, m, and force, N."""
         return cls(np.ascontiguousarray(rows[:, 0]), np.ascontiguousarray(rows[:, 1]))
 
     @classmethod
     def linear(cls, stiffness_n_per_m: float, max_depth_m: float) -> ObjectCurve:
-        """Make the force curve of a linear spring up to `max_depth_m`."""
+        """Make the force curve of a linear spring."""
         return cls(np.array([0.0, max_depth_m]), np.array([0.0, stiffness_n_per_m * max_depth_m]))
 
     def force_n(self, depths_m: Floats) -> Floats:
-        """Return forces (n,), N, at depths (n,), m; 0 for negative depths."""
+        """Return the forces (n,), N, at depths (n,), m; 0 for negative depths."""
         last = self.depths_m[-1]
         inside = self._curve(np.clip(depths_m, 0.0, last))
         beyond = np.maximum(np.asarray(depths_m) - last, 0.0)
@@ -143,10 +142,11 @@ class ObjectCurve:
 
 @dataclass(frozen=True, slots=True)
 class StretchLimits:
-    """Limits of the sheet, of the arms that stretch it, and of the control loop with the hand.
+    """The limits of the sheet, of the arms that stretch it, and of the control loop with the hand.
 
     edge_force_n: maximum force on each clamp.
-    bounds: bounds on the offset's slope; None for an analysis that has no hand.
+    max_advance_per_depth: maximum advance of the sheet per depth of the push.
+    bounds: bounds on the offset's slope; None for an analysis without a hand.
     """
 
     min_stretch_ratio: float
@@ -156,7 +156,7 @@ class StretchLimits:
     bounds: OffsetBounds | None = None
 
     def max_advance(self, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum advance per depth (n,) where the sheet has stiffnesses (n,)."""
+        """Return the maximum advance per depth (n,) for stiffnesses (n,) N/m of the sheet."""
         result = np.full(len(stiffnesses_n_per_m), self.max_advance_per_depth)
         if self.bounds is None:
             return result
@@ -168,11 +168,11 @@ class StretchLimits:
 def make_stretch_limits(
     sheet: SheetSpec, model: SheetForceModel, bounds: OffsetBounds | None = None
 ) -> StretchLimits:
-    """Return the stretch limits within the usable fraction of the scene's limits.
+    """Return the limits of the stretch within the usable fraction of the scene's limits.
 
-    They apply to the sheet if nothing pushes it.  A push adds edge force, which `render_force`
-    limits.
     bounds: bounds on the offset's slope for a stable loop with the hand.
+    The edge force is limited for a sheet that nothing pushes.  `render_force` limits the additional
+    force of a push.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -188,14 +188,14 @@ def make_stretch_limits(
 
 
 def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
-    """Return the force (N) on each clamp of the sheet if nothing pushes it."""
+    """Return the force (N) on each clamp of a sheet that nothing pushes."""
     push = SheetPush(stretch_ratio, finger_radius_m=0.03 * model.rubber.width_m)
     return float(model.evaluate(push, np.zeros(1)).edge_force_n[0])
 
 
 @dataclass(frozen=True, slots=True)
 class RenderedForce:
-    """Forces that the sheet renders at one position with one stretch, at n depths.
+    """The forces that the sheet renders at n depths at one position with one stretch.
 
     indentation_m: deflection of the sheet from its plane under the finger.
     edge_force_n: force on each clamp.
@@ -219,7 +219,7 @@ class RenderedForce:
 
     @property
     def error_ratio(self) -> Floats:
-        """Return the relative error (n,) of the rendered force; 0 if neither force can be felt."""
+        """Return the relative error (n,) of the rendered force; 0 if the forces cannot be felt."""
         felt = np.maximum(self.object_force_n, self.force_n) >= FORCE_JND_FLOOR_N
         difference = (self.force_n - self.object_force_n) / np.maximum(
             self.object_force_n, FORCE_JND_FLOOR_N
@@ -230,15 +230,15 @@ class RenderedForce:
 
 _KNOTS = np.concatenate([np.zeros(3), np.geomspace(4e-3, 1.0, 56), np.ones(2)])
 DEPTH_FRACTIONS = 0.5 * (_KNOTS[1:-2] + _KNOTS[2:-1])
-"""Depths at which the offset is computed, as fractions of the maximum; denser near the surface.
+"""The depths at which the offset is computed, as fractions of the maximum depth.
 
-They are the Greville abscissae of a quadratic B-spline on `_KNOTS`, where its control points lie.
-The spline has a continuous slope, which is bounded by the slopes between its control points.  So
-bounds that hold at these depths hold everywhere; an interpolating spline would not ensure that.
+They are the Greville abscissae of a quadratic B-spline on `_KNOTS`, at which its control points
+lie. The slope of the spline is continuous and bounded by the slopes between its control points.
+Bounds that hold at these depths therefore hold at all depths.
 """
 
 SATURATION_FRACTION = 0.1
-"""Last fraction of the maximum indentation, in which the indentation saturates smoothly."""
+"""The fraction of the maximum indentation over which the indentation saturates smoothly."""
 
 
 def render_force(
@@ -251,8 +251,10 @@ def render_force(
 ) -> RenderedForce:
     """Compute the best approximation of the object's force with one stretch at one position.
 
-    The indentation never makes the edge force exceed its limit; beyond that the sheet moves with
-    the finger.  The indentation grows by at most 1 + `limits.max_advance` per depth.
+    push: stretch ratio, finger radius and position.
+    max_depth_m: maximum depth of the finger in the object.
+    The indentation is limited so that the edge force stays within its limit.  Its increase per
+    depth is at most 1 + `limits.max_advance`.
     """
     depths = max_depth_m * DEPTH_FRACTIONS
     desired = curve.force_n(depths)
@@ -287,7 +289,7 @@ def _indentation_for_edge_force(
 ) -> float:
     """Return the indentation (m) at which the force on each clamp is `edge_force_n`.
 
-    The result is 0 if the force is already larger without indentation.
+    The result is 0 if the force is larger even without indentation.
     """
     grid = 2.0 * max_depth_m * DEPTH_FRACTIONS[1:]
     flat = _flat_edge_force_n(model, push.stretch_ratio)
@@ -301,7 +303,10 @@ def _indentation_for_edge_force(
 
 
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
-    """Remove the advance smoothly (C1) from indentations (n,) that are too small to be felt."""
+    """Remove the advance smoothly from indentations (n,) m that are too small to be felt.
+
+    depths: (n,) m.  forces_n: (n,) contact forces.
+    """
     force_weight = _fade(forces_n, DEADBAND_START_N, DEADBAND_END_N)
     depth_weight = _fade(depths, DEADBAND_START_M, DEADBAND_END_M)
     advance = np.maximum(indentation - depths, 0.0)
@@ -313,7 +318,7 @@ def _fade(values: Floats, start: float, end: float) -> Floats:
 
 
 def _saturate(indentation: Floats, maximum: float) -> Floats:
-    """Limit indentations (n,) to a maximum, which they approach smoothly (C1)."""
+    """Limit indentations (n,) m to a maximum that they approach smoothly."""
     if maximum <= 0.0:
         return np.zeros_like(indentation)
     knee, span = (1.0 - SATURATION_FRACTION) * maximum, SATURATION_FRACTION * maximum
@@ -324,9 +329,9 @@ def _saturate(indentation: Floats, maximum: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Compliance:
-    """Offset of the sheet for each depth in one object, at a constant stretch.
+    """The offset of the sheet as a function of the depth in one object, at a constant stretch.
 
-    note: which forces the sheet cannot render, and the error; empty if none.
+    note: text about forces that the sheet cannot render; empty if it can render all forces.
     centre: rendered forces of a push at the sheet's centre.
     _nodes: |x| and |y| of the positions on the sheet at which the offset was computed, m.
     _indentation, _growth: indentation at these positions over the depth, and its derivative.
@@ -344,11 +349,14 @@ class Compliance:
 
     @property
     def max_depth_m(self) -> float:
-        """Return the largest fitted depth (m), beyond which the sheet moves with the finger."""
+        """Return the depth (m) beyond which the sheet moves with the finger."""
         return float(self.centre.depths_m[-1])
 
     def indentation_m(self, depths_m: Floats | float, position_m: SheetPosition = CENTRE) -> Floats:
-        """Return the sheet's indentation (n,), m, with the finger at depths (n,) in the object."""
+        """Return the sheet's indentation (n,), m, for depths (n,), m, of the finger in the object.
+
+        position_m: (x, y) of the contact on the sheet.
+        """
         depths = np.clip(np.asarray(depths_m, dtype=np.float64), 0.0, self.max_depth_m)
         result: Floats = self._indentation(depths) @ self._weights(position_m)
         return result
@@ -356,16 +364,17 @@ class Compliance:
     def normal_offset_m(
         self, depths_m: Floats | float, position_m: SheetPosition = CENTRE
     ) -> Floats:
-        """Return the sheet's distance (n,), m, behind the object's tangent plane; < 0 in front.
+        """Return the sheet's distance (n,), m, behind the object's tangent plane.
 
-        It is 0 if there is no contact, smooth (C1) over the depth and continuous over the position.
+        depths_m: (n,) depths of the finger in the object; without contact the result is 0.
+        position_m: (x, y) of the contact on the sheet.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
         result: Floats = depths - self.indentation_m(depths, position_m)
         return result
 
     def offset_per_depth(self, depth_m: float, position_m: SheetPosition = CENTRE) -> float:
-        """Return the change of the offset per depth: -`limits.max_advance_per_depth` to 1."""
+        """Return the derivative of the offset with respect to the depth, at most 1."""
         if depth_m <= 0.0:
             return 0.0
         if depth_m >= self.max_depth_m:
@@ -373,10 +382,10 @@ class Compliance:
         return 1.0 - float(self._growth(depth_m) @ self._weights(position_m))
 
     def choose_bandwidth_rad_per_s(self) -> tuple[float, bool]:
-        """Choose the bandwidth (rad/s) of the depth's filter so that hands are stable.
+        """Choose the bandwidth (rad/s) of the depth's filter, and return whether hands are stable.
 
-        It is the largest that permits the offset's slopes for a push at the centre.  If none does,
-        it is the smallest, and the second result is False.  Without bounds it is infinite.
+        The result is the largest bandwidth for which the offset's slopes for a push at the centre
+        are within their bounds, or else the smallest bandwidth.  Without bounds it is infinite.
         """
         bounds, push = self.limits.bounds, self.centre
         if bounds is None:
@@ -398,8 +407,8 @@ class Compliance:
     def _weights(self, position_m: SheetPosition) -> Floats:
         """Return weights (9,) for interpolation between the positions of `_nodes`.
 
-        They are linear in x^2 and y^2, since the sheet is symmetric.  No weight is negative, so the
-        bounds at these positions (force, advance, monotonicity) also hold between them.
+        The weights are linear in x^2 and y^2, since the sheet is symmetric.  They are not negative.
+        Bounds that hold at these positions therefore hold between them.
         """
         weights = [
             _interpolate_squares(nodes, abs(at))
@@ -409,7 +418,7 @@ class Compliance:
 
 
 def _interpolate_squares(nodes: Floats, at: float) -> Floats:
-    """Return weights (n,) for interpolation, linear in the squared coordinate, between `nodes`."""
+    """Return weights (n,) for interpolation between nodes (n,) that is linear in the square."""
     squares, square = nodes**2, min(at, float(nodes[-1])) ** 2
     upper = int(np.clip(np.searchsorted(squares, square), 1, len(nodes) - 1))
     t = (square - squares[upper - 1]) / (squares[upper] - squares[upper - 1])
@@ -427,11 +436,10 @@ def fit_compliance(
     stretch_ratio: float | None = None,
     max_depth_m: float | None = None,
 ) -> Compliance:
-    """Find the stretch ratio and the sheet offset that best render a force curve in a scene.
+    """Find the stretch ratio and the sheet offset that render a force curve best.
 
-    stretch_ratio: fixed stretch ratio; None: choose the best one. max_depth_m: maximum depth of a
-    push; None: that of the scene. The note reports an object that is so soft that the scene's
-    tolerance of the sheet's position changes its force noticeably.
+    stretch_ratio: fixed stretch ratio; None: choose the best stretch ratio.
+    max_depth_m: maximum depth of a push; None: use that of the scene.
     """
     depth_m = scene.working_range.push_depth_m if max_depth_m is None else max_depth_m
     radius_m, rubber = scene.finger.radius_m, model.rubber
@@ -496,7 +504,11 @@ def _find_best_stretch(
 
 
 def _note(rendered: RenderedForce, position_error_m: float) -> str:
-    """Describe which forces of a push the sheet cannot render, and the error; empty if none."""
+    """Return a text about forces that the sheet cannot render; empty if it can render all forces.
+
+    position_error_m: error of the sheet's position. The text also reports an object that is so soft
+        that this error changes its force noticeably.
+    """
     error = rendered.error_ratio
     off = np.abs(error) > TARGET_ERROR_RATIO
     if off.any():
@@ -509,31 +521,34 @@ def _note(rendered: RenderedForce, position_error_m: float) -> str:
         )
         kind, than = ("stiffer", "too soft") if error[at] < 0.0 else ("softer", "too stiff")
         return (
-            f"object is {kind} than the sheet can present: {100 * abs(error[at]):.0f} % {than} at "
+            f"object is {kind} than the sheet can render: {100 * abs(error[at]):.0f} % {than} at "
             f"{1e3 * rendered.depths_m[at]:.0f} mm ({rendered.force_n[at]:.2f} of "
-            f"{rendered.object_force_n[at]:.2f} N), {100 * np.abs(error).max():.0f} % at most; "
+            f"{rendered.object_force_n[at]:.2f} N), maximum {100 * np.abs(error).max():.0f} %; "
             f"{cause}; users notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
         )
     uncertainty = compute_force_uncertainty_ratio(rendered, position_error_m)
     if uncertainty > WEBER_RATIO:
         return (
             f"object is too soft for the position tolerance: {1e3 * position_error_m:g} mm of the "
-            f"sheet's position is {100 * uncertainty:.0f} % of the force at "
-            f"{1e3 * rendered.depths_m[-1]:.0f} mm; users notice {100 * WEBER_RATIO:.0f} to "
+            f"sheet's position changes the force at {1e3 * rendered.depths_m[-1]:.0f} mm by "
+            f"{100 * uncertainty:.0f} %; users notice {100 * WEBER_RATIO:.0f} to "
             f"{100 * WEBER_RATIO_BARE:.0f} %"
         )
     return ""
 
 
 def compute_force_uncertainty_ratio(rendered: RenderedForce, position_error_m: float) -> float:
-    """Return the relative change of force at maximum depth that a position error causes."""
+    """Return the relative change of the force at maximum depth that a position error (m) causes."""
     change = float(rendered.stiffness_n_per_m[-1]) * position_error_m
     return change / max(float(rendered.object_force_n[-1]), 1e-9)
 
 
 @dataclass(frozen=True, slots=True)
 class StretchChoice:
-    """Stretch that renders an object's stiffness; `note` reports a stiffness out of range."""
+    """A stretch that renders an object's stiffness.
+
+    note: text about a stiffness out of range; empty if the sheet can render the stiffness.
+    """
 
     stretch_ratio: float
     note: str
@@ -547,7 +562,7 @@ def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
 
 
 def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
-    """Return the stretch that renders an object's stiffness (N/m, small pushes) without an offset.
+    """Return the stretch that renders an object's stiffness at small pushes without an offset.
 
     The linear model of the sheet ignores the object's curved force and the size of the fingertip.
     """

@@ -1,4 +1,4 @@
-"""Control the sheet's compliance: fit its stretch and offset to the soft body under the finger."""
+"""Control the stretch and the normal offset of the sheet for the soft body under the finger."""
 
 from __future__ import annotations
 
@@ -22,29 +22,30 @@ from flexsheet.nodes.planner.compliance import (
 from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
 
 EQUAL_RATIO = 0.02
-"""Relative difference below which two force curves count as equal; users notice seven times it."""
+"""The relative difference below which two force curves are considered as equal.  Users notice a
+difference that is seven times as large."""
 
 FIRST_DELAY_S = 0.06
-"""Assumed delay from a measured depth until the sheet has moved, until the delay is measured."""
+"""The initial value of the delay from a measured depth until the sheet has moved."""
 
 DELAY_HYSTERESIS_S = 0.03
-"""Decrease of the measured delay up to which the bounds of the offset's slope are kept."""
+"""The decrease of the measured delay up to which the bounds of the offset's slope do not change."""
 
 COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
-"""Depths at which force curves are compared, as fractions of the maximum depth."""
+"""The depths at which force curves are compared, as fractions of the maximum depth."""
 
 
 class ComplianceController:
-    """Controller of the sheet's stretch and normal offset for the object under the finger.
+    """A controller of the sheet's stretch and normal offset for the object under the finger.
 
+    mode: "force_curve" renders the object's force as a function of depth.  "stiffness" renders the
+        object's stiffness at small pushes by the stretch (Furukawa et al. 2007).
+        "constant_stretch" uses the minimum stretch.
     hysteresis_ratio: fraction of the energy of loading that the rubber loses in a cycle; None: the
         value in the scene.
     bounds: bounds on the offset's slope for a stable loop with the hand; None if there is no hand.
-    delay_s: time from a measured depth until the sheet has moved accordingly.
-    bandwidth_rad_per_s: bandwidth of the depth's filter; None if there are no bounds.
-    mode: "force_curve" renders the object's force as a function of depth.  "stiffness" renders its
-    stiffness at small pushes by the stretch (Furukawa et al. 2007).  "constant_stretch" keeps the
-    minimum.
+    delay_s: time from a measured depth until the sheet has moved.
+    bandwidth_rad_per_s: bandwidth of the depth's filter; None without bounds.
     """
 
     def __init__(
@@ -75,9 +76,9 @@ class ComplianceController:
     def update(self, soft_body: SoftBody, *, in_contact: bool) -> None:
         """Fit stretch and offset to the soft body under the finger.
 
-        In contact the stretch stays constant, because moving edges could be felt.
+        In contact the stretch remains constant, because users could feel moving edges.
 
-        Raises UnfitCurveError for an invalid force curve; the last fit is then kept.
+        Raises UnfitCurveError if the force curve is invalid; the last fit is then used.
         """
         if self._mode == "constant_stretch":
             return
@@ -96,7 +97,10 @@ class ComplianceController:
         self._fitted_n = forces_n
 
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
-        """Update the measured delay.  Outside contact, fit again if this changes the bounds."""
+        """Update the measured delay.
+
+        Outside contact, stretch and offset are fitted again if the delay changes the bounds.
+        """
         self.delay_s = delay_s
         if self._bounds is None or in_contact:
             return
@@ -131,27 +135,27 @@ class ComplianceController:
             self.bandwidth_rad_per_s, suffices = fitted.choose_bandwidth_rad_per_s()
             if not suffices:
                 hand_note = (
-                    f"a hand of low damping can oscillate with this object: the sheet follows "
-                    f"after {1e3 * self.delay_s:.0f} ms; reduce the delay or use a stiffer object"
+                    "a hand of low damping can oscillate with this object, because the sheet "
+                    f"follows after {1e3 * self.delay_s:.0f} ms; reduce the delay or use a stiffer "
+                    "object"
                 )
         self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted), hand_note)))
 
     def _range_note(self, fitted: Compliance) -> str:
-        """Return why the force model is invalid for the deepest push at the centre; "" if valid."""
+        """Return why the force model is invalid for the deepest push; empty if it is valid."""
         max_depth_m = self._scene.working_range.push_depth_m
         push = SheetPush(fitted.stretch_ratio, fitted.finger_radius_m)
         reason = self._model.invalid_reason(push, float(fitted.indentation_m(max_depth_m)))
         if not reason:
             return ""
-        return f"outside the range of sheet force model {self._model.name}: {reason}"
+        return f"the sheet force model {self._model.name} is not valid here: {reason}"
 
     def normal_offset(self, depth_m: float, position_m: SheetPosition) -> tuple[float, float]:
         """Return the sheet's offset behind the tangent plane (m), and its slope over the depth.
 
-        With hysteresis, the result depends on the depths in earlier calls.
-
         depth_m: depth of the finger in the object.
         position_m: (x, y) of the contact on the sheet.
+        If the rubber has hysteresis, the result depends on the depths of earlier calls.
         """
         force_ratio = 1.0 if self._hysteresis is None else self._hysteresis.update(depth_m)
         if self._compliance is None or depth_m <= 0.0:

@@ -1,7 +1,7 @@
 """Track the contact between the finger and the virtual object, and place the sheet there.
 
-During the approach the sheet waits in the tangent plane nearest to the finger (Furukawa et al.
-2007, Fig. 7a).  In contact it rolls on the object without slip (Fig. 7b).
+During the approach, the sheet is in the tangent plane at the surface point nearest to the finger
+(Furukawa et al. 2007, Fig. 7a).  In contact it rolls on the object without slip (Fig. 7b).
 """
 
 from __future__ import annotations
@@ -29,29 +29,30 @@ from flexsheet.nodes.planner.rolling import (
 )
 
 SHALLOW_RATIO, DEEP_RATIO = 0.15, 0.5
-"""Ratios of the finger's depth to the radius of curvature.  Up to the first, the contact is the
-surface point nearest to the finger.  From the second, it moves as far as the finger moves along the
-sheet."""
+"""Two ratios of the finger's depth to the radius of curvature.  Up to the first ratio, the contact
+is the surface point nearest to the finger.  From the second ratio on, the contact moves as far as
+the finger moves along the sheet."""
 
 MIN_RADIUS_FRACTION = 0.15
-"""Minimum distance of a finger from a centre of curvature, as a fraction of the radius.  It is not
-clear on which side of the object a nearer finger is."""
+"""The minimum distance of a finger from a centre of curvature, as a fraction of the radius.  At a
+smaller distance, the side of the object on which the finger is would be ambiguous."""
 
 MIN_CURVATURE_PER_M = 1e-3
 MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
-"""Maximum plausible distance of a finger from the object's origin, and its maximum speed."""
+"""The maximum plausible distance of a finger from the object's origin, and its maximum speed."""
 
 MAX_TILT_RAD = 1.4
-"""Maximum tilt of the sheet in any scene.  Two normals within this tilt are never opposite, so that
-the shortest rotation between them is unique."""
+"""The maximum tilt of the sheet in any scene.  Two normals within this tilt are never opposite, so
+that the shortest rotation between them is unique."""
 
 MIN_LIFT_M = 2e-4
-"""Minimum reported height of the object's rim around the contact; the sheet yields to less."""
+"""The minimum height of the object's rim around the contact above which the contact is reported as
+concave."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContactLimits:
-    """Limits of the sheet's motion, and thresholds of contact.
+    """The limits of the sheet's motion and the thresholds of contact.
 
     front: unit vector (3,) from the object towards the user.
     max_tilt_rad: maximum angle between `front` and the surface normal at a contact.
@@ -73,7 +74,7 @@ class ContactLimits:
 
 @dataclass(frozen=True, slots=True)
 class ContactCommand:
-    """Contact that the sheet must present, and the sheet's motion there.
+    """The contact that the sheet must render, and the motion of the sheet.
 
     twist: velocity (6,) of the sheet's centre in the object's frame, m/s and rad/s.
     """
@@ -86,21 +87,20 @@ class ContactCommand:
 
 
 class UnpresentableError(FlexsheetError, ValueError):
-    """An object whose surface the sheet cannot present; the text states what to change."""
+    """An error for an object whose surface the sheet cannot render."""
 
     code = "unpresentable"
     remedy = "Make the object larger or smoother, or the sheet wider."
 
 
 class ContactStateMachine:
-    """State machine of one finger's contact with the object: approach, contact and hold."""
+    """A state machine of one finger's contact with the object: approach, contact and hold.
+
+    home: axes (3, 3) of the sheet before the first contact; the third axis is the sheet's normal.
+    Raises UnpresentableError if the front of the object is tilted more than the maximum.
+    """
 
     def __init__(self, shape: Shape, home: Floats, limits: ContactLimits) -> None:
-        """Start at the front of the object.
-
-        home: axes (3, 3) of the waiting sheet; the third is close to `limits.front`.
-        Raises UnpresentableError if the surface normal there is tilted more than the maximum.
-        """
         max_tilt_rad = min(limits.max_tilt_rad, MAX_TILT_RAD)
         self._shape, self._home = shape, home
         self._limits = replace(limits, max_tilt_rad=max_tilt_rad)
@@ -108,9 +108,9 @@ class ContactStateMachine:
         if first.normal @ limits.front < np.cos(max_tilt_rad):
             lean_deg = np.degrees(np.arccos(first.normal @ limits.front))
             raise UnpresentableError(
-                f"the object's front is tilted by {lean_deg:.0f} degrees from the user, the sheet "
-                f"can tilt by {np.degrees(max_tilt_rad):.0f} degrees; rotate the object by "
-                "object.world_from_object in the scene"
+                f"the object's front is tilted by {lean_deg:.0f} degrees from the user, but the "
+                f"sheet can tilt by {np.degrees(max_tilt_rad):.0f} degrees only; rotate the object "
+                "by object.world_from_object in the scene"
             )
         self.contact = make_tangent_contact(home, first, limits.half_width_m)
         self._in_contact = False
@@ -158,10 +158,7 @@ class ContactStateMachine:
         return ContactCommand("approach", reason, self.contact, twist, 0.0)
 
     def _begin_contact(self, contact: SheetContact, object_from_sheet: Floats) -> SheetContact:
-        """Return the contact at which the finger touches the sheet in its current pose.
-
-        From there the sheet rolls without slip and spin.
-        """
+        """Return the contact at which the finger touches the sheet in its current pose (4, 4)."""
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
         point_sheet = inverse(object_from_sheet) @ np.append(contact.point, 1.0)
         axes = transport_axes(object_from_sheet[:3, :3], contact.normal)
@@ -197,10 +194,12 @@ class ContactStateMachine:
     ) -> tuple[Nearest, Floats]:
         """Return the surface point to which the finger moves the contact, and its rate (3,) m/s.
 
-        At small depths, that is the surface point nearest to the finger.  Deep inside the object,
-        the nearest point is arbitrary (on an axis all sides are equally near).  There the contact
-        moves as far as the finger moves along the sheet.  In between, both are blended, so that the
-        contact moves continuously when the finger strokes and pushes.
+        found: surface point nearest to the finger.  moved: motion (3,) m of the finger since the
+            last step.
+
+        At small depths, the contact is the surface point nearest to the finger.  Deep inside the
+        object this point is arbitrary, so the contact moves as far as the finger moves along the
+        sheet.  At depths in between, both motions are blended.
         """
         normal = self.contact.normal
         tangential = np.eye(3) - np.outer(normal, normal)
@@ -219,10 +218,10 @@ class ContactStateMachine:
     def _roll_within_sheet(
         self, contact: SheetContact, found: Nearest
     ) -> tuple[SheetContact, SheetReason | None]:
-        """Roll the sheet on the object until the contact is at the surface point.
+        """Roll the sheet on the object until the contact is at the surface point `found`.
 
-        The motion ends earlier where the contact reaches the limit of the sheet's usable area.
-        Also returns that limit, or None.
+        If the contact reaches the limit of the sheet's usable area, the motion ends there.  The
+        second result is then the reason, otherwise None.
         """
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
@@ -255,8 +254,8 @@ def _is_too_deep(found: Nearest) -> bool:
 def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
     """Return the rate (3,) m/s of the surface point that is nearest to a moving finger.
 
-    Near a centre of curvature the rate is not bounded.  It is therefore limited to its value at
-    `MIN_RADIUS_FRACTION`, and is 0 at the centre itself.
+    The rate is limited to its value at `MIN_RADIUS_FRACTION`, because it is infinite at a centre of
+    curvature.
     """
     try:
         rate = projection_jacobian(found) @ velocity
@@ -267,5 +266,5 @@ def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
 
 
 def _norm(vector: Floats) -> float:
-    """Return the length of a vector (3,); NaN or infinity remain visible in the result."""
+    """Return the length of a vector (3,), which is not finite if an element is not finite."""
     return hypot(*vector.tolist())

@@ -1,4 +1,4 @@
-"""Cache the force table of a scene's sheet, whose computation needs one to two minutes."""
+"""Compute and cache the force table of a scene's sheet.  The computation takes 1 to 2 minutes."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner.sheet_force import compute_membrane_table, make_rubber
 
 VERSION = 1
-"""Version of the computation; tables of another version are computed again."""
+"""The version of the computation.  Cached tables of another version are computed again."""
 
 FIELDS = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
-"""Fields of `TabulatedSheetModel` that the cache file contains."""
+"""The fields of `TabulatedSheetModel` that the cache file contains."""
 
 XS, YS = np.array([0.0, 0.13, 0.25]), np.array([0.0, 0.19, 0.36])
-"""Positions x and y in the table, as fractions of the sheet's width and height."""
+"""The positions x and y in the table, as fractions of the sheet's width and height."""
 
 
 def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
-    """Define key and format of the cache file for a scene's force table."""
+    """Define the key and the format of the cache file for a scene's force table."""
     rubber = make_rubber(scene.sheet)
     depends_on = {
         "version": VERSION,
@@ -57,7 +57,7 @@ def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> TabulatedSheetModel:
-    """Return the cached force table of a scene, or compute it by finite elements and store it."""
+    """Return the force table of a scene from the cache, or compute and store the table."""
     sheet = scene.sheet
     ends = sorted({sheet.min_stretch_ratio, sheet.max_stretch_ratio})
     return cached(
@@ -77,15 +77,15 @@ def load_or_compute(
 def load_force_model(
     scene: Scene, method: SheetForceMethod, cache_dir: Path | None
 ) -> tuple[SheetForceModel, str]:
-    """Return the force model of the scene's sheet without calibration, and a note for the operator.
+    """Return the force model of a sheet without calibration, and a note for the operator.
 
-    If the method is "table" and the table is not cached, the scaled model is used instead.
+    If the method is "table" but the table is not in the cache, the scaled model is returned.
     """
     rubber = make_rubber(scene.sheet)
     if method != "table":
         return ScaledSheetModel(rubber), method
     table = load_cached(make_table_cache(scene), cache_dir)
     if table is None:
-        note = "scaled; the table of the sheet's force is not computed: run flexsheet precompute"
+        note = "scaled; the table of the sheet's force is missing: run flexsheet precompute"
         return ScaledSheetModel(rubber), note
     return table, method

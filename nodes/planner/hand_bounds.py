@@ -1,4 +1,4 @@
-"""Cache the bounds of `nodes.models.hand_loop` for a camera's rate; computing them is slow."""
+"""Compute and cache the bounds on the offset's slope for a stable loop with the hand."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from flexsheet.nodes.models.hand_loop import OffsetBoundsTable, compute_offset_b
 from flexsheet.nodes.planner.compliance import MAX_ADVANCE_PER_DEPTH
 
 VERSION = 2
-"""Version of the computation; tables of another version are computed again."""
+"""The version of the computation.  Cached tables of another version are computed again."""
 
 
 def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
-    """Return the cache entry of the bounds for a camera's rate."""
+    """Define the key and the format of the cache file of the bounds for a camera's rate."""
     depends_on = {
         "version": VERSION,
         "rate_hz": rate_hz,
@@ -33,7 +33,7 @@ def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
 
 
 def load_or_compute_bounds(rate_hz: float, cache_dir: Path | None) -> OffsetBoundsTable:
-    """Return the cached bounds for a camera's rate, or compute and store them."""
+    """Return the bounds for a camera's rate from the cache, or compute and store the bounds."""
     return cached(
         bounds_cache(rate_hz),
         cache_dir,

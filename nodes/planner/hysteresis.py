@@ -1,21 +1,22 @@
-"""Correct the sheet's indentation for the hysteresis of its rubber.
+"""Model the hysteresis of the sheet's rubber.
 
-While the finger moves inwards (loading), the force is 1 + h times the elastic force, and 1 - h
-times while it moves outwards. Here h = r / (2 - r), and r is the fraction of the energy of loading
-that the rubber loses. After the finger reverses, the factor changes linearly with its travel.
+The force is 1 + h times the elastic force while the finger moves inwards (loading), and 1 - h times
+while it moves outwards. Here h = r / (2 - r), and r is the fraction of the energy of loading that
+the rubber loses. When the finger reverses, the factor changes linearly with the finger's travel.
 """
 
 from __future__ import annotations
 
 REVERSAL_RATIO = 0.2
-"""Travel over which the factor changes completely, as a fraction of the depth."""
+"""The travel over which the factor changes completely, as a fraction of the depth."""
 
 MIN_REVERSAL_M = 4e-4
-"""Minimum of this travel, so that tremor at small depths does not reverse the factor."""
+"""The minimum travel over which the factor changes completely.  It prevents that tremor at small
+depths reverses the factor."""
 
 
 class HysteresisCorrection:
-    """Ratio of the sheet's force to its elastic force, which follows from the finger's depths.
+    """A model of the ratio of the sheet's force to its elastic force.
 
     ratio: fraction of the energy of loading that is lost in a cycle.
     """
@@ -25,9 +26,9 @@ class HysteresisCorrection:
         self._depth_m, self._direction = 0.0, 1.0
 
     def update(self, depth_m: float) -> float:
-        """Add a depth of the finger, and return the ratio of force to elastic force there.
+        """Add a depth of the finger, m, and return the ratio of force to elastic force.
 
-        A contact begins with loading. A repeated depth changes nothing.
+        Each contact begins with loading. A repeated depth does not change the ratio.
         """
         if depth_m <= 0.0:
             self._depth_m, self._direction = 0.0, 1.0

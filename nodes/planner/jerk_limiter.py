@@ -1,9 +1,9 @@
 """Move the sheet towards a target with limited speed, acceleration and jerk.
 
-Position, orientation and stretch are each limited in three stages per step.  The first determines
-the desired velocity towards the target, slow enough to stop there.  The second determines the
-acceleration that reaches this velocity without overshoot.  The third changes the present
-acceleration towards that one as far as the jerk allows.
+Position, orientation and stretch are limited separately, in three stages per step.  The first stage
+determines the desired velocity towards the target, from which the sheet can stop there.  The second
+stage determines the acceleration that reaches this velocity without overshoot.  The third stage
+changes the present acceleration towards this acceleration as far as the jerk limit permits.
 """
 
 from __future__ import annotations
@@ -24,14 +24,15 @@ from flexsheet.nodes.models.motion import (
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform, vector_from_rotation
 
 TAPER_FRACTION = 0.5
-"""Fraction of the maximum jerk with which the acceleration falls to 0 at the desired velocity."""
+"""The fraction of the maximum jerk with which the acceleration decreases to 0 near the desired
+velocity."""
 
 LINEAR, ANGULAR, STRETCH = slice(0, 3), slice(3, 6), slice(6, 7)
 
 
 @dataclass(frozen=True, slots=True)
 class JerkBounds:
-    """Maximum jerk of the sheet's centre, rotation and stretch ratio."""
+    """The maximum jerk of the sheet's centre, rotation and stretch ratio."""
 
     jerk_m_per_s3: float
     turn_jerk_rad_per_s3: float
@@ -40,9 +41,10 @@ class JerkBounds:
 
 @dataclass(frozen=True, slots=True)
 class JerkLimitedState:
-    """Motion of the sheet, with the values from which the next step continues.
+    """The motion of the sheet with the state of the jerk limiter.
 
-    mean_velocity, acceleration: means (7,) over the last step: linear, angular, stretch ratio.
+    mean_velocity, acceleration: means (7,) over the last step of linear motion, rotation and
+        stretch ratio.
     """
 
     sheet: SheetMotion
@@ -66,7 +68,7 @@ def limit_jerk(
 ) -> tuple[Floats, Floats]:
     """Return mean velocity and acceleration (n,) of the next step towards a goal velocity (n,).
 
-    The acceleration never exceeds its limit, and never changes by more than max_jerk * step_s.
+    The acceleration stays within its limit, and changes by at most max_jerk * step_s.
     """
     change = goal_velocity - mean_velocity
     size = measure_length(change)
@@ -93,9 +95,9 @@ def step_sheet(
     edges: EdgeBound,
     step_s: float,
 ) -> JerkLimitedState:
-    """Return the sheet `step_s` (> 0) later, moved towards its target at that time.
+    """Return the state of the sheet after one step of `step_s` towards its target.
 
-    target: None brings the sheet to rest.
+    target: motion of the target at the end of the step; None: decelerate to rest.
     """
     goals = (
         np.zeros(7)
@@ -136,7 +138,10 @@ def step_sheet(
 def _desired_velocities(
     now: SheetMotion, target: SheetMotion, bounds: SheetBounds, edges: EdgeBound, step_s: float
 ) -> Floats:
-    """Return the desired mean velocities (7,) of the next step, within the edges' speed limit."""
+    """Return the desired mean velocities (7,) of the next step: linear, angular and stretch.
+
+    The velocities respect the speed limit of the sheet's edges.
+    """
     displacement = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(
         target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T
@@ -162,7 +167,7 @@ def _desired_velocities(
         max_acceleration=bounds.stretch_acceleration_per_s2,
         step_s=step_s,
     )
-    scales = share_edge_speed(
+    scales = divide_edge_speed(
         edges,
         (measure_length(linear), measure_length(angular)),
         (measure_length(displacement), measure_length(rotation)),
@@ -170,16 +175,15 @@ def _desired_velocities(
     return np.concatenate([scales[0] * linear, scales[1] * angular, stretch_rate])
 
 
-def share_edge_speed(
+def divide_edge_speed(
     edges: EdgeBound, speeds: tuple[float, float], distances: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the factors (0..1) on linear and angular speed that keep the edges' speed limit.
+    """Return the factors (0..1) on linear and angular speed that respect the edges' speed limit.
 
     speeds, distances: linear and angular speed (m/s, rad/s), and remaining distances (m, rad).
 
-    The limit is divided in proportion to the remaining distances, so that translation and rotation
-    end together.  A part that one does not need goes to the other.  A common factor would let a
-    short translation take half of the speed from a long rotation.
+    The speed limit is divided between translation and rotation in proportion to their remaining
+    distances, so that both end together.  If one of them needs less, the other gets more.
     """
     limit, reach = edges.speed_m_per_s, edges.reach_m
     linear, angular = speeds[0], reach * speeds[1]

@@ -1,4 +1,4 @@
-"""Define the planner node, which computes sheet targets from fingertips and the soft body."""
+"""Compute sheet targets from fingertips and the soft body under the finger."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from flexsheet.nodes.planner.trajectory import PlannedStep, SheetTrajectoryPlann
 
 FIRST_HORIZON_S = 0.05
 MAX_FUTURE_S = 0.005
-"""Maximum time by which the timestamp of a usable fingertip may lie in the future."""
+"""The maximum time by which the timestamp of a usable fingertip may lie in the future."""
 
 
 def _is_finite(fingertip: Fingertip) -> bool:
@@ -53,7 +53,10 @@ def _is_finite(fingertip: Fingertip) -> bool:
 
 
 class Planner(Node):
-    """Publish one sheet target per fingertip; equal inputs give identical messages."""
+    """A node that publishes one sheet target per fingertip.
+
+    Equal inputs result in identical messages.
+    """
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"soft_body", "arm_latency", "force"})
 
@@ -140,7 +143,7 @@ class Planner(Node):
             self._force_check.add_force(force, header.source_ns)
 
     def _update_note(self) -> None:
-        late = f"{self._late_count} fingertips dropped: out of order" if self._late_count else ""
+        late = f"{self._late_count} late fingertips dropped" if self._late_count else ""
         compliance = self._compliance.note if self._compliance is not None else ""
         stopped = (
             f"{self._stopped_oscillations} oscillations of finger and sheet stopped"
@@ -188,7 +191,7 @@ class Planner(Node):
         self._publish(planned, source_ns)
 
     def _adapt_horizon(self, fingertip: Fingertip, age_s: float) -> float:
-        """Update the prediction horizon and return its change (s)."""
+        """Update the prediction horizon, and return the change of the horizon (s)."""
         self._actuation.on_fingertip(age_s)
         if self.parameters.prediction_horizon_s is not None:
             return 0.0

@@ -1,4 +1,4 @@
-"""Detect oscillations of finger and sheet that the sheet drives, and fade out its motion."""
+"""Detect oscillations of finger and sheet that the sheet drives, and stop the sheet's motion."""
 
 from __future__ import annotations
 
@@ -7,34 +7,37 @@ from collections import deque
 import numpy as np
 
 WINDOW_S = 1.4
-"""Time over which amplitudes are compared; each half contains a period of 1.4 Hz."""
+"""The duration of the window in which amplitudes are compared.  Each half of the window contains a
+period of 1.4 Hz."""
 
 MIN_AMPLITUDE_M = 2e-4
-"""Amplitude of the depth (root mean square) below which an oscillation cannot be felt."""
+"""The amplitude of the depth (root mean square) below which an oscillation cannot be felt."""
 
 GROWTH_RATIO = 1.15
-"""Ratio of amplitudes in the second and first half of the window that triggers the watchdog."""
+"""The ratio of the amplitude in the second half of the window to that in the first half above which
+the watchdog is triggered."""
 
 STEADY_RATIO = 0.95
 SUSTAINED_S = 1.5
-"""An oscillation that the sheet drives also triggers the watchdog if its amplitude stays above this
-ratio for this time."""
+"""A ratio and a time that define a sustained oscillation.  The watchdog is triggered if the ratio
+of the amplitudes in both halves of the window stays above STEADY_RATIO for SUSTAINED_S."""
 
 FADE_S = 0.3
-"""Time in which the motion of the sheet's offset fades out."""
+"""The time in which the motion of the sheet's offset is reduced to zero."""
 
 SLOW_S = 0.35
-"""Time constant of the slow part of depth and offset, which does not count as oscillation."""
+"""The time constant of the slow part of depth and offset, which does not count as oscillation."""
 
 
 class OscillationWatchdog:
-    """Watchdog that stops the motion of the sheet's offset if it drives an oscillation.
+    """A watchdog that stops the motion of the sheet's offset if this motion drives an oscillation.
 
     The sheet delivers energy to the finger if the integral of the offset over the depth is positive
-    in a cycle.  A person who moves back and forth against the sheet loses energy to it, so that
-    only an unstable loop triggers the watchdog.
+    in a cycle.  Voluntary motion against the sheet loses energy to the sheet.  The watchdog is
+    therefore triggered only by an unstable loop.
 
     weight: factor on the offset's motion, from 1 (follows the finger) to 0 (at rest).
+    triggers: number of oscillations that were stopped.
     """
 
     def __init__(self) -> None:
@@ -42,7 +45,7 @@ class OscillationWatchdog:
         self.reset()
 
     def reset(self) -> None:
-        """Start again with the weight 1; called when there is no contact."""
+        """Discard all measurements and set the weight to 1."""
         self.weight = 1.0
         self._slow: tuple[float, float] | None = None
         self._last = (0.0, 0.0)
@@ -51,9 +54,10 @@ class OscillationWatchdog:
         self._fading = False
 
     def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
-        """Return the weight after a measurement.
+        """Return the weight (0 to 1) of the offset's motion after a measurement.
 
         depth_m: measured depth.  offset_m: offset of the sheet at the time of the measurement.
+        step_s: time since the last measurement.
         """
         if self._slow is None:
             self._slow = (depth_m, offset_m)
@@ -94,9 +98,9 @@ class OscillationWatchdog:
 
 
 def _oscillates(depths: np.ndarray) -> bool:
-    """Return whether the depths (n,) change their sign at least twice, beyond the noise.
+    """Return whether depths (n,) m change their sign at least twice.
 
-    A push or a withdrawal by the user changes it once.
+    Smaller values than MIN_AMPLITUDE_M are ignored.  A single push changes the sign only once.
     """
     large = depths[np.abs(depths) > MIN_AMPLITUDE_M]
     return int(np.count_nonzero(np.diff(np.sign(large)))) >= 2

@@ -17,20 +17,20 @@ from flexsheet.nodes.planner.trajectory import TrajectorySettings
 
 
 class PlannerParameters(NodeParameters):
-    """Parameters of `planner`."""
+    """The parameters of the planner node."""
 
     prediction_horizon_s: NonNegative | None = Field(
         default=None,
         description="time from the camera exposure to the time for which the sheet is planned, s; "
-        "null: mean age of fingertips plus actuation delay",
+        "null: the mean age of fingertips plus the actuation delay",
     )
     actuation_delay_s: NonNegative = Field(
         default=0.036,
-        description="time from a fingertip's publication until the sheet has moved, s; with "
-        "measure_actuation_delay, the value until it is measured",
+        description="time from a fingertip's publication until the sheet has moved, s. With "
+        "measure_actuation_delay, it is the initial value",
     )
     measure_actuation_delay: bool = Field(
-        default=True, description="use the actuation delay that the arms measure"
+        default=True, description="whether to use the actuation delay that the arms measure"
     )
     max_actuation_delay_s: Positive = Field(
         default=0.15, description="maximum actuation delay that is measured and used, s"
@@ -38,25 +38,25 @@ class PlannerParameters(NodeParameters):
     compliance_mode: ComplianceMode | Literal["auto"] = Field(
         default="auto",
         description="force_curve: render the object's force over depth, by stretch and offset of "
-        "the sheet; stiffness: render its stiffness by the stretch alone (Furukawa et al. 2007); "
-        "constant_stretch: render no force; auto: the mode in the scene's methods, otherwise "
-        "force_curve; for a rigid object always constant_stretch",
+        "the sheet; stiffness: render the object's stiffness by the stretch alone (Furukawa et al. "
+        "2007); constant_stretch: render no force; auto: the mode in the scene's methods, else "
+        "force_curve. For a rigid object, constant_stretch is always used",
     )
 
     def choose_compliance(self, scene: Scene) -> ComplianceMode:
-        """Return the compliance mode for a scene; for a rigid object it is constant_stretch."""
+        """Return the compliance mode for a scene: constant_stretch if the object is rigid."""
         if scene.object.material is None:
             return "constant_stretch"
         return resolve_method(self.compliance_mode, scene.methods.compliance, "force_curve")
 
     sheet_calibration: SheetCalibrationFile | None = Field(
         default=None,
-        description="file from `flexsheet calibrate sheet`; null: ideal rubber with the modulus in "
-        "the scene",
+        description="calibration file from `flexsheet calibrate sheet`; null: ideal rubber with "
+        "the modulus in the scene",
     )
     sheet_force: SheetForceMethod | Literal["auto"] = Field(
         default="auto",
-        description="force model of the sheet without a calibration; auto: the model in the "
+        description="force model of the sheet if no calibration is given; auto: the model in the "
         "scene's methods, otherwise scaled",
     )
     cache_dir: Path | None = Field(
@@ -71,31 +71,38 @@ class PlannerParameters(NodeParameters):
     )
     max_age_s: Positive = Field(default=0.1, description="maximum age of a usable fingertip, s")
     tilt_margin_rad: NonNegative = Field(
-        default=0.14, description="angle by which the sheet may exceed the scene's tilt, rad"
+        default=0.14,
+        description="angle by which the sheet may exceed working_range.tilt_rad of the scene, rad",
     )
     max_spin_rad: Positive = Field(
         default=0.35, description="maximum rotation of the sheet about its normal by rolling, rad"
     )
-    speed_m_per_s: Positive = Field(default=0.18, description="maximum speed of the sheet's centre")
-    acceleration_m_per_s2: Positive = Field(
-        default=2.0, description="maximum acceleration of the sheet's centre"
+    speed_m_per_s: Positive = Field(
+        default=0.18, description="maximum speed of the sheet's centre, m/s"
     )
-    turn_rad_per_s: Positive = Field(default=2.0, description="maximum angular speed of the sheet")
+    acceleration_m_per_s2: Positive = Field(
+        default=2.0, description="maximum acceleration of the sheet's centre, m/s^2"
+    )
+    turn_rad_per_s: Positive = Field(
+        default=2.0, description="maximum angular speed of the sheet, rad/s"
+    )
     turn_acceleration_rad_per_s2: Positive = Field(
-        default=12.0, description="maximum angular acceleration of the sheet"
+        default=12.0, description="maximum angular acceleration of the sheet, rad/s^2"
     )
     stretch_rate_per_s: Positive = Field(
-        default=0.03, description="maximum rate of the stretch ratio"
+        default=0.03, description="maximum rate of change of the stretch ratio, 1/s"
     )
     stretch_acceleration_per_s2: Positive = Field(
-        default=0.3, description="maximum acceleration of the stretch ratio"
+        default=0.3, description="maximum second derivative of the stretch ratio, 1/s^2"
     )
-    jerk_m_per_s3: Positive = Field(default=60.0, description="maximum jerk of the sheet's centre")
+    jerk_m_per_s3: Positive = Field(
+        default=60.0, description="maximum jerk of the sheet's centre, m/s^3"
+    )
     turn_jerk_rad_per_s3: Positive = Field(
-        default=1000.0, description="maximum angular jerk of the sheet"
+        default=1000.0, description="maximum angular jerk of the sheet, rad/s^3"
     )
     stretch_jerk_per_s3: Positive = Field(
-        default=9.0, description="maximum jerk of the stretch ratio"
+        default=9.0, description="maximum third derivative of the stretch ratio, 1/s^3"
     )
 
     def trajectory_settings(self) -> TrajectorySettings:

@@ -1,10 +1,10 @@
-"""Compute the contact of a flat sheet with a smooth object: tangent, or rolling on it.
+"""Compute the contact of a flat sheet that touches a smooth object, or rolls on the object.
 
-All vectors are in the object's frame.  The sheet's frame has x from the left edge to the right, y
-along the edges and z out of the object; a point on the sheet is (x, y) in it.  Rolling without slip
-or spin moves the sheet's axes along the contact's path by parallel transport.  The contact's path
-on the sheet has the same length as its path on the object (Furukawa et al. 2007, Fig. 7b, for any
-smooth shape).  Source: do Carmo, Differential Geometry of Curves and Surfaces, section 4-4.
+All vectors are in the object's frame.  The sheet's frame has x from the left edge to the right
+edge, y along the edges and z out of the object.  Rolling without slip or spin moves the sheet's
+axes along the contact's path by parallel transport.  The contact's path on the sheet has the same
+length as its path on the object (Furukawa et al. 2007, Fig. 7b, for any smooth shape).  Source: do
+Carmo, Differential Geometry of Curves and Surfaces, section 4-4.
 """
 
 from __future__ import annotations
@@ -19,25 +19,26 @@ from flexsheet.nodes.models.rigid import angle_between, transform
 from flexsheet.nodes.models.shapes import Nearest, Shape
 
 MIN_STEP_RATIO = 1.0 / 512.0
-"""Resolution of the search for the last point within the tilt, relative to the search distance."""
+"""The resolution of the search for the last point within the maximum tilt, as a fraction of the
+search distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
-"""Finer resolution for a search that passes deep inside the object, where a step changes the normal
-by many degrees.  It applies until the tilt is within this angle of the limit."""
+"""A finer resolution of the search for tilts that are more than NEAR_LIMIT_RAD below the limit.  It
+is needed deep inside the object, where a small step changes the normal by many degrees."""
 
 RIM_RADIUS_M = 0.03
-"""Radius around the contact within which the object may rise above the tangent plane."""
+"""The radius around the contact in which the object may rise above the tangent plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetContact:
-    """Contact of the sheet with the object.
+    """A contact of the sheet with the object.
 
-    point, normal: surface point (3,) and unit normal (3,).
-    shape_operator: derivative (3, 3) of the normal along the surface (its curvature), 1/m.
-    axes: (3, 3), whose columns are the axes of the sheet; the third is the normal.
+    point, normal: surface point (3,) m and unit normal (3,).
+    shape_operator: derivative (3, 3) of the normal along the surface, 1/m.
+    axes: (3, 3); its columns are the axes of the sheet, the third column is the normal.
     position_sheet_m: (x, y) of the contact on the sheet.
-    lift_m: distance of the sheet's plane from the point where the object is concave, otherwise 0.
+    lift_m: distance between the sheet's plane and the point; 0 unless the object is concave there.
     """
 
     point: Floats
@@ -55,20 +56,20 @@ class SheetContact:
 
     @property
     def object_from_sheet(self) -> Floats:
-        """Return the sheet's pose (4, 4), with its frame at its centre."""
+        """Return the pose (4, 4) of the sheet's centre in the object's frame."""
         contact_sheet = np.append(self.position_sheet_m, -self.lift_m)
         return transform(self.axes, self.point - self.axes @ contact_sheet)
 
     def height_m(self, finger: Floats) -> float:
-        """Return the height of a point (3,) above the sheet's plane, negative below it."""
+        """Return the height of a point (3,) m above the sheet's plane; negative below the plane."""
         return float((finger - self.point) @ self.normal) - self.lift_m
 
 
 def transport_axes(axes: Floats, normal: Floats) -> Floats:
-    """Rotate axes (3, 3) by the smallest rotation that maps the third one to `normal`.
+    """Rotate axes (3, 3) by the smallest rotation that maps the third axis to `normal` (3,).
 
-    This is parallel transport along the shorter arc between both normals.  It is undefined for
-    opposite normals.  The result is orthogonal without rounding drift.
+    This is parallel transport along the shorter arc between both normals.  The result is undefined
+    for opposite normals, and orthogonal without rounding drift.
     """
     both = axes[:, 2] + normal
     # The rotation is the product of two Householder reflections.  The first one negates the third
@@ -79,11 +80,11 @@ def transport_axes(axes: Floats, normal: Floats) -> Floats:
 
 
 def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
-    """Return the contact after the sheet has rolled to another surface point, a short step away.
+    """Return the contact after the sheet has rolled to the surface point `found`.
 
-    The chord between both points is projected onto the plane halfway between the tangent planes,
-    and scaled to the length of the arc.  This gives the displacement of the contact on the sheet.
-    It is exact on circles; elsewhere its error is of third order in the angle.
+    To compute the displacement of the contact on the sheet, the chord between both points is
+    projected onto the plane halfway between the tangent planes, and scaled to the length of the
+    arc.  The displacement is exact on circles; elsewhere its error is of third order in the angle.
     """
     axes = transport_axes(contact.axes, found.normal)
     middle = transport_axes(contact.axes, _normalize(contact.normal + found.normal))
@@ -104,9 +105,10 @@ def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
 def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> SheetContact:
     """Return the contact of a sheet that waits at a surface point for an approaching finger.
 
-    The sheet's axes are `home` (3, 3), rotated to the normal.  The contact is on the sheet's
-    horizontal centre line, and at most `half_width_m` from its centre.  Within this limit, the
-    sheet's centre stays in front of the object's origin along x.
+    home: axes (3, 3) of the sheet before they are rotated to the normal.
+    half_width_m: maximum distance of the contact from the sheet's centre.  The contact is on the
+        sheet's horizontal centre line.  Within this limit, the sheet's centre has the position of
+        the object's origin along the sheet's x axis.
     """
     axes = transport_axes(home, found.normal)
     x = float(np.clip(axes[:, 0] @ found.point, -half_width_m, half_width_m))
@@ -116,8 +118,8 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
 def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     """Return the twist (6,) of the rolling sheet's centre while the contact moves at `rate` (3,).
 
-    Without spin, the angular velocity is n x dn/dt, with the normal n.  Without slip, the sheet's
-    point in contact is at rest.
+    The twist is linear velocity, m/s, and angular velocity, rad/s.  Without spin, the angular
+    velocity is n x dn/dt with the normal n.  Without slip, the sheet's point in contact is at rest.
     """
     tangential = rate - contact.normal * (rate @ contact.normal)
     angular = cross(contact.normal, contact.shape_operator @ tangential)
@@ -129,10 +131,11 @@ def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
 def compute_tangent_twist(
     contact: SheetContact, rate: Floats, home: Floats, half_width_m: float
 ) -> Floats:
-    """Return the twist (6,) of a sheet that waits while the nearest point moves at `rate` (3,).
+    """Return the twist (6,) of a waiting sheet while its surface point moves at `rate` (3,) m/s.
 
-    Its axes follow from `home` by the smallest rotation.  Their angular velocity is n x dn/dt, and
-    about the normal n it is -(h x n) . dn/dt / (1 + h . n).  Here h is the third axis of `home`.
+    home, half_width_m: see `make_tangent_contact`.
+    With the normal n and the third axis h of `home`, the angular velocity of the sheet is n x dn/dt
+    plus -(h x n) . dn/dt / (1 + h . n) about the normal.
     """
     point, normal, axes = contact.point, contact.normal, contact.axes
     tangential = rate - normal * (rate @ normal)
@@ -149,15 +152,15 @@ def compute_tangent_twist(
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross product (3,) of two vectors, several times as fast as np.cross."""
+    """Return the cross product (3,) of two vectors (3,), several times as fast as np.cross."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def measure_spin_rad(axes: Floats, home: Floats) -> float:
-    """Return the angle of `axes` about its normal.
+    """Return the rotation angle of `axes` (3, 3) about its normal relative to `home` (3, 3).
 
-    The angle is counted from `home`, rotated so that its normal agrees with that of `axes`.
+    `home` is first rotated by the smallest rotation that makes both normals equal.
     """
     ready = transport_axes(home, axes[:, 2])
     return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
@@ -168,12 +171,11 @@ def limit_tilt(
 ) -> tuple[Nearest, bool]:
     """Return the last surface point towards `found` whose normal is within the maximum tilt.
 
-    Also return whether it differs from `found`.
-
+    The second result is whether this point differs from `found`.
     front: unit vector (3,) from which the tilt is measured.
     start: surface point within the tilt, from which the search starts.  The search follows the
-        straight line to `found` in growing steps and projects each onto the surface, so that it
-        stays on the sheet's side.  It begins with a small step, which suffices at the limit.
+        straight line to `found` in increasing steps.  Each step is projected onto the surface, so
+        that the search stays on the sheet's side of the object.
     """
     limit, near = np.cos(max_tilt_rad), np.cos(max(max_tilt_rad - NEAR_LIMIT_RAD, 0.0))
     if found.normal @ front >= limit:
@@ -191,10 +193,10 @@ def limit_tilt(
 
 
 def compute_rim_lift_m(shape: Shape, contact: SheetContact) -> float:
-    """Return how far (m) to lift the tangent plane so that the object does not penetrate it.
+    """Return how far (m) the tangent plane must be lifted so that the object does not penetrate it.
 
-    It is 0 where the object is not concave.  Only the surface within `RIM_RADIUS_M` of the contact
-    counts, the region in which a finger deforms the sheet.
+    The result is 0 if the object is not concave.  Only the surface within `RIM_RADIUS_M` of the
+    contact is considered, because a finger deforms the sheet only there.
     """
     return shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
 

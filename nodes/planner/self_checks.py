@@ -14,16 +14,16 @@ from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.models.sheet.force_models import SheetForceModel, SheetPush
 
 MAX_STIFFNESS_RATIO = 0.05
-"""Accepted relative difference of the stiffness: three standard deviations of a calibration."""
+"""The maximum relative difference of the stiffness: three standard deviations of a calibration."""
 
 
 def check_stiffness(
     sheet: SheetSpec, calibration: SheetCalibration | None
 ) -> tuple[SelfCheck, ...]:
-    """Return the check of Young's modulus times thickness, or () if there is no calibration.
+    """Compare Young's modulus times thickness in the scene with the calibrated product.
 
-    A difference matters because rendered forces follow from the calibration, but the limits of the
-    edge force and the sag from the scene.
+    Return () without a calibration.  A difference is an error because rendered forces are computed
+    from the calibration, but the sag and the limits of the edge force from the scene.
     """
     if calibration is None:
         return ()
@@ -43,20 +43,25 @@ def check_stiffness(
 
 
 MAX_FORCE_RATIO = 0.12
-"""Accepted relative error of the predicted force: hysteresis of the rubber 5 %, sheet model 3 %,
-0.3 mm of the depth 3 to 6 %, gauge 1 %."""
+"""The maximum relative error of the predicted force.  The contributions are 5 % by hysteresis of
+the rubber, 3 % by the sheet model, 3 to 6 % by 0.3 mm of the depth, and 1 % by the gauge."""
 
 MIN_INDENTATION_M = 0.005
 MIN_FORCE_N = 0.2
-"""Minimum push depth and force that are compared; below, measurement errors dominate."""
+"""The minimum push depth and force that are compared.  The relative errors of smaller values are
+too large."""
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""Time before and after a measured force, and maximum change of the indentation in this time."""
+"""The criterion for a push at rest: from QUIET_S before to QUIET_S after the measured force, the
+indentation changes by at most QUIET_M."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedPush:
-    """State of the sheet that the planner commands for a time: stretch, indentation, contact."""
+    """The state of the sheet that the planner commands for the time `valid_at_ns`.
+
+    position_m: (x, y) of the contact on the sheet.
+    """
 
     valid_at_ns: int
     stretch_ratio: float
@@ -65,10 +70,9 @@ class PlannedPush:
 
 
 class MeasuredForceCheck:
-    """Comparison of the measured force of the finger with the force that the sheet's model
-    predicts.
+    """A comparison of measured forces of the finger with forces that the sheet's model predicts.
 
-    Their ratio is the true product of modulus and thickness, divided by the assumed one.
+    The ratio of both is the true product of modulus and thickness divided by the assumed product.
     """
 
     def __init__(self, scene: Scene, model: SheetForceModel) -> None:
@@ -79,16 +83,16 @@ class MeasuredForceCheck:
         self._monitor = ResidualMonitor(1, threshold=MAX_FORCE_RATIO)
 
     def add_push(self, push: PlannedPush) -> None:
-        """Add a planned push, and check the forces measured at least QUIET_S before it."""
+        """Add a planned push, and check the forces that were measured at least QUIET_S earlier."""
         self._pushes.append(push)
         limit_ns = push.valid_at_ns - round(1e9 * QUIET_S)
         while self._waiting and self._waiting[0][0] <= limit_ns:
             self._compare(*self._waiting.popleft())
 
     def add_force(self, force: Force, at_ns: int) -> None:
-        """Add a force and the time of its measurement.
+        """Add a measured force; ignore it unless it is valid and along the sheet's normal.
 
-        Only valid forces along the sheet's normal are used.
+        at_ns: time of the measurement.
         """
         if force.valid and force.axis == "sheet_normal":
             self._waiting.append((at_ns, force.force_n))

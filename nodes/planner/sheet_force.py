@@ -1,4 +1,4 @@
-"""Make the force model of a scene's sheet, and define the sheet-force method family."""
+"""Make the force model of a scene's sheet, and benchmark the force models."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
 
 ReferenceForce = Callable[[SheetSpec, float, float, SheetPosition, float], float]
-"""Reference force (N) at a stretch ratio, a depth, a position and a fingertip radius (m)."""
+"""A function that returns the reference force (N) for a sheet, a stretch ratio, a depth (m), a
+position and a fingertip radius (m)."""
 
 
 def make_rubber(sheet: SheetSpec) -> Rubber:
@@ -37,7 +38,7 @@ def make_rubber(sheet: SheetSpec) -> Rubber:
 def make_force_model(
     sheet: SheetSpec, calibration: SheetCalibration | None = None
 ) -> SheetForceModel:
-    """Return the calibrated force model; if there is none, a `ScaledSheetModel` of the sheet.
+    """Return the calibrated force model of the sheet, or an ideal model without a calibration.
 
     Raises CalibrationMismatchError if the calibrated sheet has another size.
     """
@@ -73,7 +74,11 @@ def compute_membrane_table(
     finger_radius_m: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TabulatedSheetModel:
-    """Compute the table by finite elements of the membrane: one push per stretch and position."""
+    """Compute a table of the sheet's force by finite elements of the membrane.
+
+    stretches: (n,) stretch ratios.  xs_m, ys_m: coordinates of the pushes on the sheet.
+    progress: function that is called with the number of finished pushes and their total number.
+    """
 
     def measure(stretch_ratio: float, depths: Floats, position_m: SheetPosition) -> Floats:
         return push_path(
@@ -98,22 +103,23 @@ def compute_membrane_table(
 
 BENCHMARK_DEPTHS_M = (0.002, 0.005, 0.010, 0.020, 0.040)
 SLOW_DEPTHS_M = (0.005, 0.020)
-"""Depths at which slow models are measured, with the mean stretch at the sheet's centre."""
+"""The depths at which slow models are benchmarked, with the mean stretch at the sheet's centre."""
 BENCHMARK_POSITIONS: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
     ("off-centre", 0.13, 0.19),
     ("near the clamp", 0.25, 0.0),
     ("near the free edge", 0.0, 0.36),
 )
-"""Benchmarked positions: name, x as a fraction of the width, and y as a fraction of the height."""
+"""The benchmarked positions: name, x as a fraction of the width, y as a fraction of the height."""
 
 
 MakeTable = Callable[[Scene], TabulatedSheetModel]
 
 
 def sheet_force_family(reference: ReferenceForce, make_table: MakeTable | None) -> Family:
-    """Make the family of force models, with trials over stretch, depth and position.
+    """Define the benchmark of the force models over stretch, depth and position.
 
+    reference: function that returns the reference force.
     make_table: function that loads or computes the table; None: omit models that need minutes.
     """
     return Family(

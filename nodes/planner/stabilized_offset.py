@@ -12,12 +12,12 @@ OffsetAtDepth = Callable[[float], float]
 
 
 class StabilizedOffset:
-    """Offset of the sheet behind the object's tangent plane, computed separately for each contact.
+    """A filter that computes the sheet's offset behind the object's tangent plane.
 
-    It follows from the measured depth through the filter of `hand_loop`.  A depth that is
-    predicted over the whole delay would shift the least stable frequency of the loop into the range
-    of hand oscillation.  The offset never exceeds the depth, so that the sheet stays in contact
-    with a finger that moves away.
+    The measured depth is filtered by the filter of `hand_loop`.  It is not predicted over the whole
+    delay, because this would shift the least stable frequency of the loop into the range of hand
+    oscillation.  The offset never exceeds the depth, so that the sheet stays in contact with a
+    finger that moves away.
     """
 
     def __init__(self) -> None:
@@ -35,10 +35,11 @@ class StabilizedOffset:
         bandwidth_rad_per_s: float,
         delay_s: float,
     ) -> tuple[float, float]:
-        """Return the offset (m) and its rate (m/s) after a measurement.
+        """Return the offset (m) and its rate (m/s) after a measurement of the depth.
 
-        offset_at_depth: function from the depth to the offset, m.  step_s: time since the last
-        measurement.  bandwidth_rad_per_s: bandwidth of the depth's filter; infinite for none.
+        offset_at_depth: function from the depth to the offset, m.
+        step_s: time since the last measurement.
+        bandwidth_rad_per_s: bandwidth of the depth's filter; infinite for no filter.
         delay_s: time from a measurement until the sheet has moved.
         """
         if measured_depth_m <= 0.0:
@@ -63,7 +64,7 @@ class StabilizedOffset:
         return offset_m, rate_m_per_s
 
     def _offset_at(self, delay_s: float) -> float:
-        """Return the present offset of the sheet, which was commanded `delay_s` ago; at first 0."""
+        """Return the offset that was commanded `delay_s` ago, or 0 before the first command."""
         while len(self._commanded) > 1 and self._commanded[1][0] <= self._time_s - delay_s:
             self._commanded.popleft()
         if not self._commanded or self._commanded[0][0] > self._time_s - delay_s:

@@ -1,28 +1,30 @@
-"""Order measured fingertips by the times of their exposures, and adapt the prediction horizon."""
+"""Drop late fingertips, and adapt the prediction horizon to the measured delays."""
 
 from __future__ import annotations
 
 from flexsheet.messages.types import Side
 
 RESTART_COUNT = 3
-"""Number of late fingertips in a row, with rising timestamps, that indicate a step of the clock."""
+"""The number of consecutive late fingertips with ascending timestamps that indicate a clock that
+was set back."""
 
 MIN_STEP_NS = 1_000_000
-"""Minimum plausible interval between two exposures; no camera is faster."""
+"""The minimum plausible interval between two exposures; no camera is faster."""
 
 AGE_WEIGHT = 0.05
-"""Weight of the newest age in the running mean; at 60 Hz the mean spans a third of a second."""
+"""The weight of the newest age in its exponential mean.  At 60 Hz the time constant is 0.33 s."""
 
 DELAY_WEIGHT = 0.11
-"""Weight of an arm's newest report in the running mean; at 5 Hz the mean spans 1.8 s."""
+"""The weight of an arm's newest report in its exponential mean.  At 5 Hz the time constant is 1.8
+s.
+"""
 
 
 class MonotonicTimestampFilter:
-    """Filter that passes measured fingertips only in the order of their exposures.
+    """A filter that drops late fingertips, which were exposed before the last passed fingertip.
 
-    A late fingertip is dropped, because the sheet is already planned for a later time.
-    `RESTART_COUNT` late ones in a row mean that the clock has stepped back; the filter then
-    restarts with the last one.
+    The sheet is already planned for a later time than that of a late fingertip.  `RESTART_COUNT`
+    consecutive late fingertips indicate that the clock was set back.  The filter then restarts.
     """
 
     def __init__(self) -> None:
@@ -30,9 +32,10 @@ class MonotonicTimestampFilter:
         self._late_ns: list[int] = []
 
     def update(self, source_ns: int, first_step_s: float) -> float | None:
-        """Return the time (s) since the last passed fingertip; None if this one is dropped.
+        """Return the time (s) since the last passed fingertip; None if the new one is dropped.
 
-        first_step_s: returned for the first fingertip and after a restart.
+        source_ns: time of the exposure.
+        first_step_s: result for the first fingertip and after a restart.
         """
         last_ns = self._last_ns
         if last_ns is not None and source_ns < last_ns + MIN_STEP_NS:
@@ -46,10 +49,10 @@ class MonotonicTimestampFilter:
 
 
 class ActuationDelayEstimator:
-    """Estimator of the delay from a fingertip's publication until the arms have moved accordingly.
+    """An estimator of the delay from a fingertip's publication until the arms have moved.
 
-    It is the latency that the arms report, less the mean age of published fingertips.
-    delay_s: mean over both arms, from 0 to the maximum; before any report, the initial value.
+    The delay is the latency that the arms report, less the mean age of published fingertips.
+    delay_s: mean over both arms; before any report, the initial value.
     """
 
     def __init__(self, initial_s: float, max_s: float) -> None:
@@ -59,12 +62,12 @@ class ActuationDelayEstimator:
         self._delays_s: dict[Side, float] = {}
 
     def on_fingertip(self, age_s: float) -> None:
-        """Add a fingertip that leads to a target; age_s: its age when it was published."""
+        """Add the age of a usable fingertip at the time of its publication, s."""
         before_s = age_s if self._age_s is None else self._age_s
         self._age_s = before_s + AGE_WEIGHT * (age_s - before_s)
 
     def on_latency(self, side: Side, latency_s: float) -> None:
-        """Add a reported latency from exposure until the arm has moved; ignore implausible ones."""
+        """Add the latency (s) from the exposure until an arm has moved; ignore implausible values."""
         if self._age_s is None or not 0.0 <= latency_s - self._age_s <= self._max_s:
             return
         before_s = self._delays_s.get(side, self._initial_s)
@@ -75,7 +78,7 @@ class ActuationDelayEstimator:
 def update_horizon_s(horizon_s: float, needed_s: float, max_s: float) -> float:
     """Return the prediction horizon (s) of the next target.
 
-    The horizon changes slowly, so that the sheet does not jump after one late fingertip.
+    The horizon changes slowly, so that the sheet does not jump after a late fingertip.
 
     horizon_s: prediction horizon of the last target.
     needed_s: time from the exposure until the sheet reaches the target.

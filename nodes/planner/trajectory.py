@@ -1,7 +1,4 @@
-"""Plan the sheet's trajectory: the next motion of the sheet for each measured fingertip.
-
-`SheetTrajectoryPlanner` is deterministic: it uses timestamps and measurements, but no clock.
-"""
+"""Plan the motion of the sheet after each measured fingertip."""
 
 from __future__ import annotations
 
@@ -28,31 +25,36 @@ from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
 
 EDGE_SPEED_FRACTION = 0.7
-"""Fraction of the maximum tool speed that the plan uses; the rest lets a late arm catch up."""
+"""The fraction of the maximum tool speed that the planner uses.  A late arm can catch up with the
+remaining speed."""
 
 EDGE_MARGIN_M = 0.03
-"""Minimum distance of a contact from a clamped edge, so that the finger does not push the clamp."""
+"""The minimum distance of a contact from a clamped edge, so that the finger does not touch the
+clamp."""
 
 MAX_DEPTH_FRACTION = 1.4
-"""Ratio of depth to the scene's push depth above which a finger has passed through the object."""
+"""The ratio of the finger's depth to the scene's push depth above which the finger has passed
+through the object."""
 
 MAX_STEP_S = 0.1
-"""Gap between fingertips after which the sheet restarts from rest, since the arms have stopped."""
+"""The time without fingertips after which the sheet restarts from rest, since the arms have
+stopped.
+"""
 
 
 KEEP_S = 0.15
-"""Time for which a trajectory keeps the velocity, so that arms continue until a lost packet is
-repeated (0.1 to 0.15 s)."""
+"""The time for which a trajectory continues with constant velocity.  It is sufficient to repeat a
+lost packet, which takes 0.1 to 0.15 s."""
 
 MIN_BRAKE_S, MAX_BRAKE_S = 0.1, 0.2
-"""Minimum and maximum duration of the deceleration at the end of a trajectory."""
+"""The minimum and maximum duration of the deceleration at the end of a trajectory."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedStep:
-    """Result of one planning step, in the world frame.
+    """The result of one planning step, in the world frame.
 
-    trajectory: motion after the step, if no newer target arrives.
+    trajectory: motion after the step if no newer target arrives.
     contact_sheet_m: (x, y) of the contact on the sheet.
     normal_offset_m: distance of the sheet's surface behind the object's tangent plane.
     """
@@ -68,7 +70,7 @@ class PlannedStep:
 
 @dataclass(frozen=True, slots=True)
 class TrajectorySettings:
-    """Limits of the trajectory.
+    """The limits of the sheet's trajectory.
 
     contact_on_m, contact_off_m: distances from the sheet at which contact begins and ends.
     tilt_margin_rad: angle by which the sheet may exceed the scene's tilt.
@@ -84,13 +86,13 @@ class TrajectorySettings:
 
 
 class SheetTrajectoryPlanner:
-    """Planner of the sheet's motion on one virtual object."""
+    """A planner of the sheet's motion on one virtual object.
+
+    Equal measurements and timestamps result in equal motions, because no clock is used.  Raises
+    UnpresentableError if the front of the object is tilted more than the maximum.
+    """
 
     def __init__(self, scene: Scene, settings: TrajectorySettings) -> None:
-        """Start at the front of the object.
-
-        Raises UnpresentableError if the surface normal there exceeds the maximum tilt.
-        """
         pose, sheet = scene.object.world_from_object, scene.sheet
         self._world_from_object = pose_matrix(pose)
         self._object_from_world = inverse(self._world_from_object)
@@ -131,10 +133,10 @@ class SheetTrajectoryPlanner:
         step_s: float,
         measured_world: Floats | None = None,
     ) -> PlannedStep:
-        """Return the sheet `step_s` later, moved towards the contact with a finger.
+        """Move the sheet for `step_s` towards the contact with a finger.
 
         position_world, velocity_world: predicted motion (3,) of the finger, m and m/s.
-        measured_world: measured position (3,) from which it is predicted; None: position_world.
+        measured_world: measured position (3,) m of the finger; None: equal to position_world.
         """
         finger = apply(self._object_from_world, position_world)
         velocity = self._object_from_world[:3, :3] @ velocity_world
@@ -168,7 +170,7 @@ class SheetTrajectoryPlanner:
         moved_m: float,
         speed_m_per_s: float,
     ) -> float:
-        """Update the offset behind the tangent plane and return its rate, m/s.
+        """Update the offset behind the tangent plane, and return the rate of the offset, m/s.
 
         moved_m, speed_m_per_s: predicted motion of the finger along the object's normal.
         """
@@ -189,14 +191,11 @@ class SheetTrajectoryPlanner:
 
     @property
     def watchdog_triggers(self) -> int:
-        """Return how often an oscillation of finger and sheet was stopped."""
+        """Return the number of oscillations of finger and sheet that were stopped."""
         return self._offset.watchdog.triggers
 
     def _sag_m(self, sheet: SheetMotion, x_m: float, y_m: float) -> float:
-        """Return the sag (m) of the sheet by its weight at (x_m, y_m), along its normal.
-
-        The edges are placed this far behind the tangent plane, so that the surface is in the plane.
-        """
+        """Return the sag (m) of the sheet by its weight at (x_m, y_m), along the sheet's normal."""
         distance_m = self._rubber.width_m * sheet.stretch_ratio
         return float(
             compute_sag_m(
@@ -215,7 +214,10 @@ class SheetTrajectoryPlanner:
         return self._command.phase in ("contact", "hold")
 
     def hold(self, reason: SheetReason, step_s: float) -> PlannedStep:
-        """Return the sheet `step_s` later, decelerated because the finger's position is unknown."""
+        """Decelerate the sheet for `step_s` because the finger's position is unknown.
+
+        reason: reason that is published.
+        """
         self._advance(None, step_s)
         phase: Phase = "wait" if self._command.phase == "wait" else "hold"
         return self._make_step(
@@ -254,7 +256,7 @@ class SheetTrajectoryPlanner:
 
 
 def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajectory | None:
-    """Return how the sheet moves after a target until it stops; None if it cannot stop in time."""
+    """Return the motion of the sheet after a target until rest; None if it cannot stop in time."""
     brake_s = max(
         MIN_BRAKE_S,
         measure_length(motion.twist_world[:3]) / bounds.acceleration_m_per_s2,
@@ -264,7 +266,7 @@ def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajecto
 
 
 def offset_along_normal(sheet: SheetMotion, offset_m: float, rate_m_per_s: float) -> SheetMotion:
-    """Return the sheet moved back along its normal by an offset that changes at the given rate."""
+    """Move a sheet back along its normal by an offset that changes at the given rate."""
     normal = sheet.world_from_sheet[:3, 2]
     pose, twist = sheet.world_from_sheet.copy(), sheet.twist_world.copy()
     pose[:3, 3] -= offset_m * normal
