@@ -67,7 +67,7 @@ class ActuationDelayEstimator:
         self._age_s = before_s + AGE_WEIGHT * (age_s - before_s)
 
     def on_latency(self, side: Side, latency_s: float) -> None:
-        """Add the latency (s) from the exposure until an arm has moved; ignore implausible values."""
+        """Add the time (s) from the exposure until an arm has moved, if it is plausible."""
         if self._age_s is None or not 0.0 <= latency_s - self._age_s <= self._max_s:
             return
         before_s = self._delays_s.get(side, self._initial_s)
