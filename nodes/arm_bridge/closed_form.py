@@ -21,24 +21,26 @@ from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
 Floats = NDArray[np.float64]
 
 WRIST_SINGULAR = 1e-7
-"""Value of |sin J5| below which the axes of J4 and J6 count as coincident; J4 is then kept."""
+"""The value of |sin J5| below which the axes of J4 and J6 are considered as coincident.  J4 then
+stays constant."""
 
 SHOULDER_SINGULAR_M = 1e-7
-"""Distance of the wrist centre from the axis of J1 below which J1 stays constant."""
+"""The distance of the wrist centre from the axis of J1 below which J1 stays constant."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
-"""Values of |J5| up to which `solve_next_joints` keeps J4 constant, and from which J4 is exact."""
+"""The value of |J5| up to which J4 may stay constant, and the value from which J4 is exact."""
 
 SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
-"""Distance of the wrist centre from J1's axis up to which `solve_next_joints` keeps J1 constant,
-and from which it solves J1 exactly."""
+"""The distance of the wrist centre from J1's axis up to which J1 may stay constant, and the
+distance from which J1 is exact."""
 
 MAX_FIXED_ERROR_RATIO = 1.4
-"""Maximum pose error between both bounds, as a multiple of the first: 1.05 degrees or 1 mm."""
+"""The maximum pose error near a singularity, as a multiple of WRIST_FIXED_RAD or SHOULDER_FIXED_M:
+1.05 degrees or 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
-"""Maximum rotation of J4 or J1 in one step to reduce the error near a singularity.  At 140 steps
-per second it is half the maximum speed of these joints."""
+"""The maximum rotation of J4 or J1 in one step to reduce the error near a singularity.  At 140
+steps per second, this is half the maximum speed of these joints."""
 
 Shoulder = Literal["front", "back"]
 Elbow = Literal["up", "down"]
@@ -48,8 +50,7 @@ Wrist = Literal["plain", "flipped"]
 class Branch(NamedTuple):
     """One of the eight joint solutions for a flange pose.
 
-    shoulder: whether the wrist centre is in front of the plane through the axes of J1 and J2, or
-        behind it.
+    shoulder: "front" if the wrist centre is in front of the plane through the axes of J1 and J2.
     elbow: "up" if J3 is above the angle at which shoulder, elbow and wrist centre are in line.
     wrist: "flipped" if J5 is negative.
     """
@@ -65,7 +66,7 @@ BRANCHES = tuple(
     for elbow in get_args(Elbow)
     for wrist in get_args(Wrist)
 )
-"""All branches, in the order in which `branches` returns their joints."""
+"""All branches, in the order of the results of `ClosedFormKinematics.branches`."""
 
 
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
@@ -77,12 +78,12 @@ def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
 def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
     """Return the angle (rad) by which to rotate an axis towards a vector or its opposite.
 
-    The nearer one of these two directions is used.  Near a singularity the vector is short and the
+    The nearer one of these two directions is used.  Near a singularity the vector is short, and the
     rotation is limited.
-    along, across: components of the vector parallel to the axis, and at +90 degrees from it.
+    along, across: components of the vector parallel to the axis, and perpendicular to the axis.
     fixed, near: lengths of the vector.  Up to `fixed`, the axis may deviate by 90 degrees from the
-        vector.  From `near` on, the rotation is complete.  In between, the permitted deviation
-        decreases.  A permitted deviation is reduced by at most MAX_FREE_ROTATION_RAD per step.
+        vector.  Between `fixed` and `near`, the permitted deviation decreases to zero.  It is
+        reduced by at most MAX_FREE_ROTATION_RAD per step.
     """
     length = hypot(along, across)
     if length == 0.0:
@@ -97,7 +98,7 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
 
 
 def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
-    """Return J6 (rad) such that the rotation by J4, J5 and J6 is nearest to `wrist` (3, 3)."""
+    """Return the J6 (rad) for which the rotation by J4, J5 and J6 is nearest to `wrist` (3, 3)."""
     s4, c4, s5, c5 = sin(q4), cos(q4), sin(q5), cos(q5)
     first = (c4 * c5, s4 * c5, -s5)
     second = (-s4, c4, 0.0)
@@ -112,9 +113,9 @@ def _wrap(angle: float) -> float:
 
 
 def _nearest_revolution(angle: float, near: float, low: float, high: float) -> float:
-    """Add revolutions to an angle so that it is in [low, high] and nearest to `near`, rad.
+    """Return the equivalent angle (rad) in [low, high] that is nearest to `near`.
 
-    Returns infinity if no such angle exists.
+    The result is infinite if no equivalent angle is in this range.
     """
     best = inf
     for rotated in (angle, angle - 2.0 * pi, angle + 2.0 * pi):
@@ -124,7 +125,7 @@ def _nearest_revolution(angle: float, near: float, low: float, high: float) -> f
 
 
 class ClosedFormKinematics:
-    """Kinematics of one arm in closed form."""
+    """The kinematics of one arm in closed form."""
 
     def __init__(self, model: ClosedFormArm) -> None:
         self.model = model
@@ -135,15 +136,15 @@ class ClosedFormKinematics:
         self._lowest, self._highest = model.min_rad, model.max_rad
         self._elbow_to_wrist_m = hypot(self._shift_m, self._forearm_m)
         self.elbow_rad = atan2(self._shift_m, self._forearm_m)
-        """J3 with shoulder, elbow and wrist centre in line."""
+        """The angle of J3 at which shoulder, elbow and wrist centre are in line, rad."""
         bend = min(max(self.elbow_rad, self._lowest[2]), self._highest[2]) - self.elbow_rad
         self.max_wrist_m = hypot(
             self._upper_m + self._elbow_to_wrist_m * cos(bend), self._elbow_to_wrist_m * sin(bend)
         )
-        """Maximum distance of the wrist centre from the shoulder within the range of J3."""
+        """The maximum distance of the wrist centre from the shoulder within the range of J3, m."""
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the flange's velocity per joint speed (n, 6, 6), as `SerialChain.jacobian`."""
+        """Return the Jacobian (n, 6, 6): linear, then angular flange velocity per joint speed."""
         return self._chain.jacobian(joints_rad)
 
     def forward(self, joints_rad: ArrayLike) -> Floats:
@@ -175,11 +176,11 @@ class ClosedFormKinematics:
         return np.array(rows).T
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return the joints (6,) rad of a pose on all branches, even beyond the joint ranges."""
+        """Return the joints (6,) rad of a pose on all branches; they may exceed their ranges."""
         return [np.array(one) for one in self.branches(base_from_flange, self.model.start_rad)]
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[Branch]:
-        """Return all eight branches, independently of the poses."""
+        """Return all eight branches."""
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
@@ -192,11 +193,11 @@ class ClosedFormKinematics:
         return np.asarray(self.max_wrist_m - away)
 
     def branches(self, base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
-        """Return all joint solutions of a flange pose, at most 8, even beyond the joint ranges.
+        """Return all joint solutions of a flange pose, rad, in the order of `BRANCHES`.
 
-        The order is that of `BRANCHES`.  A joint that is undefined at a singularity keeps its value
-        in `present_rad` (6,).  Other angles are less than a revolution from zero.  The list is
-        empty if the wrist centre is too far from the shoulder or too near to it.
+        present_rad: present joints (6,), which determine joints that are undefined at a
+            singularity.
+        Joints may exceed their ranges.  The list is empty if the wrist centre is out of reach.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         rotation = base_from_flange[:3, :3]
@@ -230,11 +231,11 @@ class ClosedFormKinematics:
         return found
 
     def inverse_kinematics(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Return joints (6,) within the ranges for a flange pose, nearest to the present joints.
+        """Return the joints (6,) rad for a flange pose that are nearest to the present joints.
 
         The nearest solution has the smallest maximum joint change.  Joint ranges may exceed 360
         degrees, so angles that differ by one revolution are also tried.  Raises UnreachableError if
-        no branch is within the ranges.
+        no solution is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         nearest, least = None, inf
@@ -254,21 +255,17 @@ class ClosedFormKinematics:
         return np.array(nearest)
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Return joints (6,) rad for the next step of a motion, without a jump between branches.
+        """Return the joints (6,) rad for the next step of a motion.
 
         The result is exact except near two singularities.  Near J5 = 0, the exact J4 is the
-        direction of a vector of length sin(J5).  This direction changes arbitrarily fast when the
-        vector passes close to zero, so J4 may lag there.  J5 then follows the component of the
-        vector along J4, which may be negative.  The other component is ignored.  The resulting
-        orientation error of the flange is at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.
+        direction of a vector of length sin(J5).  This direction changes arbitrarily fast if the
+        vector is short, so J4 may lag there.  J5 then follows the component of the vector along J4,
+        and the other component is ignored.  The orientation error of the flange is at most
+        MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.  J1 is treated in the same way when the wrist
+        centre is near its axis.
 
-        J1 is treated in the same way when the wrist centre is near its axis.  Therefore J4 or J1
-        hardly move on a path that passes within WRIST_FIXED_RAD or SHOULDER_FIXED_M of a
-        singularity.  Farther away they follow the exact solution, and the caller limits their
-        speeds.
-
-        If the solution is out of a joint's range, `inverse_kinematics` selects another branch.  It
-        raises UnreachableError if there is none.
+        If the solution is not within the joint ranges, another branch is selected.  Raises
+        UnreachableError if no branch is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         rotation = base_from_flange[:3, :3]
@@ -321,7 +318,7 @@ class ClosedFormKinematics:
         return acos(min(1.0, max(-1.0, cosine)))
 
     def _solve_shoulder(self, out: float, height: float, q3: float) -> float:
-        """Return J2 (rad) for a wrist centre in the plane of the arm at given J3; see `_bend`."""
+        """Return J2 (rad) for the position of the wrist centre (see `_bend`) and J3 (rad)."""
         along = self._forearm_m * sin(q3) - self._shift_m * cos(q3)
         up = self._upper_m + self._shift_m * sin(q3) + self._forearm_m * cos(q3)
         return _wrap(atan2(out, height) - atan2(along, up))
@@ -337,20 +334,20 @@ class ClosedFormKinematics:
             wrist = base_from_flange[:3, 3] - self._flange_m * base_from_flange[:3, 2]
             away = float(np.linalg.norm(wrist - [0.0, 0.0, self._shoulder_m]))
             return UnreachableError(
-                f"{where}: out of the arm's reach, the wrist would be {1e3 * away:.0f} mm from the "
-                f"shoulder, at most {1e3 * self.max_wrist_m:.1f} mm",
+                f"{where}: out of the arm's reach; the wrist would be {1e3 * away:.0f} mm from the "
+                f"shoulder, maximum {1e3 * self.max_wrist_m:.1f} mm",
                 "reach",
             )
         _, joint, angle = min(max(self._beyond(solution)) for solution in solutions)
         return UnreachableError(
-            f"{where}: no branch is within the joint ranges; the nearest has J{joint + 1} at "
-            f"{degrees(angle):.1f} degrees, its range is {degrees(self._lowest[joint]):.0f} to "
-            f"{degrees(self._highest[joint]):.0f}",
+            f"{where}: no solution is within the joint ranges; the nearest solution has "
+            f"J{joint + 1} at {degrees(angle):.1f} degrees, but its range is "
+            f"{degrees(self._lowest[joint]):.0f} to {degrees(self._highest[joint]):.0f}",
             f"J{joint + 1}",
         )
 
     def _beyond(self, solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
-        """Return for each joint its excess beyond its range (rad), its index and angle (rad)."""
+        """Return the excess beyond the range (rad), the index and the angle (rad) of each joint."""
         found = []
         for joint, (angle, low, high) in enumerate(
             zip(solution, self._lowest, self._highest, strict=True)
@@ -374,9 +371,8 @@ class ClosedFormKinematics:
     ) -> Floats:
         """Return joints (n, 6) rad for flange poses (n, 4, 4) on one branch.
 
-        Joints may be beyond their ranges.  They are NaN where the wrist centre is out of reach.  Of
-        the equivalent angles of J1, J4 and J6, those within the range are preferred, and of these
-        the nearest to `near_rad` (6,).  At a singularity the undefined joint is 0.
+        Joints may exceed their ranges.  They are NaN for poses out of reach.  Among the equivalent
+        angles of a joint, an angle within its range and near `near_rad` (6,) is selected.
         """
         poses = np.asarray(base_from_flange, dtype=np.float64)
         wrist = poses[:, :3, 3] - self._flange_m * poses[:, :3, 2]
@@ -417,7 +413,7 @@ class ClosedFormKinematics:
         return joints
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return by how much joints (n, 6) exceed the minimum distance from each singularity, (n,).
+        """Return the margins (n,) of joints (n, 6) to the minimum distance from each singularity.
 
         A margin is negative if the joints are nearer to the singularity than permitted.
         """
@@ -431,7 +427,7 @@ class ClosedFormKinematics:
         }
 
     def _out(self, joints: Floats) -> Floats:
-        """Return how far (m) the wrist centre is from the axis of J1 in the arm's plane.
+        """Return the distance (m) of the wrist centre from the axis of J1 in the arm's plane.
 
         The distance is negative if the wrist centre is behind the axis.
         """

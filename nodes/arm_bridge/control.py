@@ -1,10 +1,10 @@
-"""Decide one arm's command in each cycle: follow the sheet's target, pause, stop or relax.
+"""Compute the command of one arm in each cycle: follow the sheet's target, pause, stop or relax.
 
-Two arms hold an elastic sheet between them; each is controlled by its own node, the bridge.  To
-relax means to slacken the sheet.  This module uses no sockets and no clock.  The node passes in the
-inputs and the duration of the cycle, and sends the returned command.  `state_machine` defines the
-states and their transitions.  Both bridges apply the same speed bounds to the sheet, which
-synchronizes the two arms on long paths.  The limiter then bounds each arm's joint speeds.
+Two arms hold an elastic sheet between them.  Each arm is controlled by its own node, the bridge.
+To relax means to slacken the sheet.  This module uses no sockets and no clock: the node provides
+the inputs and the duration of the cycle, and sends the returned command.  `state_machine` defines
+the states and their transitions.  Both bridges apply the same speed bounds to the sheet, which
+synchronizes the two arms on long paths.
 """
 
 from __future__ import annotations
@@ -72,56 +72,59 @@ from flexsheet.nodes.models.rigid import is_rigid
 Floats = NDArray[np.float64]
 
 MAX_REST_RAD_PER_S = 1e-6
-"""Joint speed below which an arm is at rest."""
+"""The maximum joint speed of an arm at rest."""
 
 # At this stretch rate the sheet becomes slack in about a second.
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
-"""Distance to the target below which the sheet moves with FOLLOW_BOUNDS instead of START_BOUNDS,
-until the next stop."""
+"""The distances (position, rotation, stretch) from the target below which the sheet moves with
+FOLLOW_BOUNDS instead of START_BOUNDS."""
 
 MEASURED_SLACK_M = 0.002
-"""Distance by which a measured flange may exceed a limit of commands, because servos ripple."""
+"""The distance by which a measured flange may exceed a limit of commands, because servos ripple."""
 
 SLACK_STRETCH = 1.0005
-"""Stretch ratio at which the sheet counts as slack; its tension is then 0.1 N."""
+"""The maximum stretch ratio of a slack sheet.  The tension at this ratio is 0.1 N."""
 
 NO_MOTION = np.zeros(6)
 
 IMPLAUSIBLE_LENGTH_RATIO = 1.1
-"""A measured sheet longer than this multiple of its limit is a measurement error."""
+"""The ratio of a measured sheet length to its limit above which the measurement is wrong."""
 
 MAX_JOINT_JUMP_RAD = 0.35
-"""Change of the goal in one cycle above which it is on another branch of joint solutions."""
+"""The maximum change of the joint goal in one cycle.  A larger change would lead to another branch
+of joint solutions."""
 
 RELAX_DELAY_S = 0.5
-"""Time without a target or permission to move after which an arm slackens the sheet."""
+"""The time without a target or permission to move after which an arm slackens the sheet."""
 
 STALE_REASONS = {
-    Freshness.STALLED: "the counters of its status stand still, its joints are not used",
-    Freshness.REVERSED: "the counters of its status run backwards, its joints are not used",
+    Freshness.STALLED: "the counters of its status stand still, so its joints are not used",
+    Freshness.REVERSED: "the counters of its status run backwards, so its joints are not used",
 }
 
 MAX_WAIT_FOR_OTHER_S = 1.0
-"""An armed arm is disarmed if the other arm is not armed within this time."""
+"""The time after which an armed arm is disarmed if the other arm is not armed."""
 
 MAX_ARMING_AGE_S = 1.0
-"""Maximum age of an arming command.  The operator may no longer intend an older one."""
+"""The maximum age of an arming command.  An older command may not be the operator's intention."""
 
 ALIGNED_RAD = 1e-4
-"""Distance from the end of an alignment (see `path_check`) at which joints have reached it."""
+"""The maximum distance of the joints from the goal of an alignment (see `path_check`) at which the
+alignment is complete."""
 
 MAX_BEYOND_RANGE_RAD = 0.02
-"""Distance outside the joint ranges above which measured joints are a measurement error."""
+"""The maximum distance of measured joints outside their ranges.  A larger distance is a measurement
+error."""
 
 RECHECK_PERIOD_S = 0.5
-"""Time after which a blocked path is checked again, since the target may have moved."""
+"""The time after which a blocked path is checked again, since the target may have moved."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """Delays (s) of an input after which the arm decelerates, and after which it is disarmed."""
+    """The delays of an input, s, after which the arm decelerates and after which it is disarmed."""
 
     hold_after_s: float
     stop_after_s: float
@@ -129,22 +132,20 @@ class Timeouts:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Command for the arm's controller: a mode of `ArmLink`, and joints (6,) rad."""
+    """A command for the arm's controller: a mode of `ArmLink`, and joints (6,) rad."""
 
     mode: str
     joints_rad: Floats
 
 
 class ArmControl:
-    """Controller of one arm, called once per cycle.
+    """A controller of one arm, which computes one command per cycle.
 
-    state: changes only by `handle`, through the table of `state_machine`.
-    mode, faults, reason: published for the operator and the other arm.  faults are latched until
-        `reset`.  reason: why the arm does not follow the target.
-    ready: whether the arm is armed, which means that it may move.  The operator arms it.  Every
-        interlock disarms it, and it stays disarmed when the cause has ended.  With `auto_arming`
-        the arm is armed whenever there is no interlock.
-    pending_check: path whose check is under way; `on_path_result` receives the result.
+    faults: texts of the faults, which are latched until `reset`.
+    reason: why the arm does not follow the target; shown to the operator.
+    auto_arming: whether the arm is armed whenever no interlock forbids motion.  Otherwise the
+        operator arms the arm.  Every interlock disarms the arm until it is armed again.
+    pending_check: path that must be checked; `on_path_result` receives the result.
     """
 
     def __init__(
@@ -200,14 +201,14 @@ class ArmControl:
 
     @property
     def all_faults(self) -> tuple[str, ...]:
-        """Return all faults to report to the other arm, with an e-stop or a lost connection."""
+        """Return the faults, the e-stop and the lost connection as texts for the other arm."""
         estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
         lost = (self.reason,) if self._state is State.DISCONNECTED else ()
         return (*self.faults, *estop, *lost)
 
     @property
     def path_blocked(self) -> bool:
-        """Return whether the arm rests because every path to the target violates a limit."""
+        """Return whether the arm rests because the path to the target violates a limit."""
         return self._blocked is not None and self._state in CHECKING_STATES
 
     @property
@@ -217,11 +218,11 @@ class ArmControl:
 
     @property
     def is_idle(self) -> bool:
-        """Return whether the arm rests until an operator's command; it may be polled less often."""
+        """Return whether the arm rests until an operator's command and may be polled less often."""
         return self._state is State.IDLE and self.at_rest
 
     def handle(self, event: Event) -> None:
-        """Change the state by the transition table, unless the present state ignores the event."""
+        """Change the state by the transition table `TRANSITIONS`."""
         target = TRANSITIONS[self._state, event]
         if target is None:
             return
@@ -231,11 +232,11 @@ class ArmControl:
         self._state = target
 
     def on_answer_missed(self, text: str) -> bool:
-        """Tolerate one exchange without an answer; return False for a second one in a row.
+        """Tolerate one exchange without an answer; return False for a second consecutive one.
 
-        The arm's own watchdog stops the arm if it receives no command for too long. The next
-        command continues from the one that was not answered.
-        text: reason, which is shown to the operator.
+        The next command continues from the command that was not answered. The arm's own watchdog
+        stops the arm if it receives no command for too long.
+        text: reason for the operator.
         """
         if self._missed or self.measured_rad is None:
             return False
@@ -248,12 +249,12 @@ class ArmControl:
         return True
 
     def on_exchange_failed(self, text: str, *, silent: bool) -> bool:
-        """Handle a failed exchange; return True when the arm counts as lost from now on.
+        """Handle a failed exchange; return True if the arm has just been lost.
 
-        silent: no answer came at all.
+        text: reason for the operator.  silent: whether no answer arrived.
         """
         if silent and self.last_measured_rad is None:
-            # It has never answered, so it may still be starting, which is no fault.
+            # The arm has never answered, so it may still be starting, which is no fault.
             self.reason = f"{NodeNote.WAITING_FOR_ARM.phrase}: {text}"
             return False
         if silent and self.on_answer_missed(text):
@@ -276,7 +277,10 @@ class ArmControl:
         arm_faults: tuple[ArmFault, ...],
         freshness: Freshness = Freshness.FRESH,
     ) -> None:
-        """Store the arm's answer: faults, and measured joints (6,) rad if they are fresh."""
+        """Store the faults and the measured joints (6,) rad of an arm's answer.
+
+        Joints that are not fresh are ignored.
+        """
         self._missed = False
         self._standstill.on_measurement(joints_rad, freshness)
         if self.last_measured_rad is None or freshness in (Freshness.FIRST, Freshness.FRESH):
@@ -287,7 +291,7 @@ class ArmControl:
         if not self._has_commanded and not self._standstill.has_jumped:
             self.commanded_rad = self.measured_rad
         if arm_faults == (ArmFault.WATCHDOG,):
-            # A command was late, so the arm has stopped itself: restart from its position.
+            # A command was late, so the arm has stopped: restart from its position.
             self._restart_idle()
             self.reason = NodeNote.ARM_WATCHDOG.phrase
             self._inhibit(self.reason, Event.WATCHDOG_TRIPPED)
@@ -295,7 +299,7 @@ class ArmControl:
             self.faults = tuple(f"arm: {FAULT_TEXTS[fault]}" for fault in arm_faults)
 
     def _restart_idle(self) -> None:
-        """Discard the motion, and send the mode `idle` next to restart the arm's controller."""
+        """Discard the motion, and restart the arm's controller by the mode `idle`."""
         self._discard_motion()
         self._standstill.restart()
         self._must_idle = True
@@ -314,11 +318,10 @@ class ArmControl:
     ) -> str | None:
         """Engage or reset the e-stop; return why a reset is refused, or None.
 
-        stamp_ns: timestamp of the message.  clock_problem: why the timestamp is uncertain, or "".
-
-        Several nodes write e-stops, and a late reader receives the last message of each in any
-        order.  A reset is therefore refused if it is older than the last stop, or if its timestamp
-        is in the future.
+        stamp_ns: timestamp of the message.
+        clock_problem: why the timestamp is uncertain; empty if it is certain.
+        Several nodes publish e-stops, which may arrive in any order.  A reset is therefore refused
+        if it is older than the last stop, or if its timestamp is in the future.
         """
         if estop.engaged:
             # With a timestamp in the future, the stop would block every reset until that time.
@@ -336,7 +339,7 @@ class ArmControl:
         return None
 
     def reset(self) -> bool:
-        """Clear e-stop and faults; return False while the arm still moves."""
+        """Clear the e-stop and all faults; return False if this is refused while the arm moves."""
         if not self.at_rest:
             return False
         self.estop_reason, self.faults = None, ()
@@ -347,7 +350,10 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm the arm by a command of this age; return why arming is refused, or None."""
+        """Arm or disarm the arm by an operator's command; return why it is refused, or None.
+
+        age_s: age of the command.
+        """
         if not arming.ready:
             self._disarm_reason = f"disabled: {arming.reason}" if arming.reason else "disabled"
             return None
@@ -366,7 +372,7 @@ class ArmControl:
         self.handle(Event.ARM)
 
     def _inhibit(self, reason: str, event: Event = Event.INTERLOCK) -> None:
-        """Disarm the arm by an event, and store the reason, which also prevents arming."""
+        """Disarm the arm by an event, and prevent arming for the given reason."""
         self._interlock_reason = reason
         self._disarm(reason, event)
 
@@ -379,7 +385,7 @@ class ArmControl:
     def _check_interlocks(
         self, goal: Goal | None, other: OtherArm | None, clock_problem: str
     ) -> None:
-        """Disarm the arm while anything forbids motion; arm it otherwise if `auto_arming`."""
+        """Disarm the arm if an interlock forbids motion; otherwise arm it if `auto_arming`."""
         silent = other is None or not other.age_s <= self._timeouts.stop_after_s
         stopped = self.estop_reason is not None or (other is not None and other.estopped)
         reason = self._find_interlock(goal, None if silent else other)
@@ -400,7 +406,10 @@ class ArmControl:
         self._settle()
 
     def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
-        """Return the interlock that forbids motion, or None; other: None if that arm is silent."""
+        """Return the text of the interlock that forbids motion, or None.
+
+        other: state of the other arm; None if its messages are too late.
+        """
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if self.faults:
@@ -419,7 +428,7 @@ class ArmControl:
         return None
 
     def _settle(self) -> None:
-        """Change the state after a latched stop, and when the arm has come to rest."""
+        """Change the state if a stop or a fault is latched, or if the arm has come to rest."""
         for _ in range(2):
             if self.estop_reason is not None:
                 self.handle(Event.ESTOP)
@@ -468,7 +477,7 @@ class ArmControl:
         return self._move_to_target(geometry, goal, other, measured, step_s)
 
     def _find_stop(self, other: OtherArm | None, clock_problem: str) -> str | None:
-        """Return why the arm must rest and must not slacken the sheet, or None."""
+        """Return why the arm must stop and must not slacken the sheet, or None."""
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if other is not None and other.estopped:
@@ -476,7 +485,7 @@ class ArmControl:
         return clock_problem if clock_problem and not self.faults else None
 
     def _wait_for_arming(self, geometry: ArmGeometry, other: OtherArm, step_s: float) -> Command:
-        """Stop, slacken the sheet if it may be taut, and rest until both arms are armed."""
+        """Command a stop and then a slack sheet, until both arms are armed."""
         self._waited_s += step_s
         if self.ready:
             return self._wait_for_other(geometry, step_s)
@@ -489,7 +498,10 @@ class ArmControl:
         return self._decelerate(reason, geometry, step_s)
 
     def _wait_for_other(self, geometry: ArmGeometry, step_s: float) -> Command:
-        """Stop because the other arm is not armed; before a motion, wait for it for a moment."""
+        """Command a stop because the other arm is not armed.
+
+        Unless it is about to start, this arm is disarmed too.
+        """
         reason = "the other arm is not ready"
         has_started = self._sheet is not None or not self.at_rest
         if not self.auto_arming and (has_started or self._waited_s > MAX_WAIT_FOR_OTHER_S):
@@ -506,7 +518,7 @@ class ArmControl:
         measured: Floats,
         step_s: float,
     ) -> Command:
-        """Follow the target. An arm at rest first checks the path to the target."""
+        """Return the command that follows the target, or checks the path if the arm is at rest."""
         self._waited_s = 0.0
         if not _is_valid(goal.motion):
             return self._latch_fault("sheet target is not a rigid pose", geometry, step_s)
@@ -525,9 +537,10 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """Move the sheet to its target; decelerate while target or other arm's state is late.
+        """Return the command that moves the sheet to its target.
 
-        If the planner or the bridge of the other arm has ended, decelerate at once.
+        The sheet decelerates if the target or the state of the other arm is late, or if the planner
+        or the bridge of the other arm has ended.
         """
         late_s = max(goal.overdue_s, other.age_s - self._timeouts.hold_after_s)
         is_late = goal.planner_ended or other.ended or late_s > self._timeouts.hold_after_s
@@ -557,7 +570,7 @@ class ArmControl:
     def _check_measurement(
         self, geometry: ArmGeometry, other: OtherArm | None, measured: Floats
     ) -> None:
-        """Latch a fault if the measured joints trail the command or violate a limit."""
+        """Latch a fault if the measured joints (6,) lag behind the command or violate a limit."""
         if self.faults or self._state not in TRACKING:
             return
         violation = check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
@@ -584,7 +597,7 @@ class ArmControl:
         measured: Floats,
         step_s: float,
     ) -> Command:
-        """Start the motion if its path has been checked; otherwise rest and request a check.
+        """Start the motion if its path has been checked; otherwise request a check.
 
         The other arm's bridge checks the same path.  No arm moves before both checks have passed.
         """
@@ -612,10 +625,10 @@ class ArmControl:
         return self._decelerate(reason, geometry, step_s)
 
     def on_path_result(self, request: PathCheckRequest, result: Alignment | str | None) -> None:
-        """Store the result of a path check: an alignment, None, or why the path is blocked.
+        """Store the result of a path check, unless the request is not the pending one.
 
-        An alignment moves the joints to the start of the path first; None: it is not necessary.
-        The result of an older request is ignored.
+        result: alignment that first moves the joints to the start of the path; None if no alignment
+            is necessary; or the text why the path is blocked.
         """
         if request is not self.pending_check:
             return
@@ -633,7 +646,7 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """Start the motion along a checked path; the first command is the measured joints."""
+        """Start the motion along a checked path with the measured joints as first command."""
         self.handle(Event.PATH_CLEAR)
         self._sheet = sheet if alignment is None else alignment.sheet
         self._alignment, self._aligned_s = alignment, 0.0
@@ -652,10 +665,9 @@ class ArmControl:
     def _align(
         self, alignment: Alignment, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Command the next step of this arm's alignment to the path; end the alignment at its goal.
+        """Return the command for the next step of this arm's alignment to the path.
 
-        The alignment's time stands still while an input is late or while this arm waits for the
-        other.
+        The alignment pauses while an input is late, or while this arm waits for the other arm.
         """
         if self._state is State.FOLLOW and self._together:
             self._aligned_s += step_s
@@ -674,9 +686,10 @@ class ArmControl:
         speed_factor: float,
         step_s: float,
     ) -> SheetMotion:
-        """Return the sheet's next motion: slow until it has reached its target, then with it.
+        """Return the sheet's motion after one step towards its target.
 
-        speed_factor: factor on the speed bounds, below 1 for the arm that leads the other.
+        The sheet moves slowly until it has reached the target for the first time after a start.
+        speed_factor: factor on the speed bounds, below 1 for the arm that leads the other arm.
         """
         if not self._settled:
             distance_m, angle_rad = measure_distance(sheet, target)
@@ -690,26 +703,26 @@ class ArmControl:
     def _command_sheet(
         self, sheet: SheetMotion, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Command the joints at which this arm's edge is where the sheet's pose requires it."""
+        """Return the command for the joints that place this arm's edge for a pose of the sheet."""
         try:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError as error:
             return self._latch_fault(str(error), geometry, step_s)
         jump_rad = float(np.abs(goal_rad - self.commanded_rad).max())
         if jump_rad > MAX_JOINT_JUMP_RAD:
-            text = f"joints would jump by {np.degrees(jump_rad):.0f} degrees"
+            text = f"the joints would jump by {np.degrees(jump_rad):.0f} degrees in one cycle"
             return self._latch_fault(text, geometry, step_s)
         self._sheet = sheet
         return self._command_joints(goal_rad, geometry, other, step_s)
 
     def _limits(self, geometry: ArmGeometry) -> SheetLimits:
-        """Return the present limits of the sheet, which are wider during an alignment."""
+        """Return the present limits of the sheet; during an alignment they are wider."""
         return geometry.sheet_limits if self._alignment is None else self._relaxed_limits
 
     def _command_joints(
         self, goal_rad: Floats, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Move towards joints (6,) rad within speed limits; latch a fault for an unsafe sheet."""
+        """Return the command towards joints (6,) rad; latch a fault if it violates a limit."""
         velocity = self._limit_velocity(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
         limits = self._limits(geometry)
@@ -732,7 +745,10 @@ class ArmControl:
     def _slacken(
         self, reason: str, geometry: ArmGeometry, other: OtherArm | None, step_s: float
     ) -> Command:
-        """Stop; once at rest, slacken the sheet by moving this edge towards the other edge."""
+        """Command a stop; at rest, slacken the sheet by moving this edge towards the other edge.
+
+        reason: text for the operator.
+        """
         self._settle()
         measured = self.measured_rad
         starts = self._state is State.TAUT
@@ -747,7 +763,7 @@ class ArmControl:
             self.handle(Event.RELAX_ENDED)
             return self._decelerate(reason, geometry, step_s)
         if between.stretch_ratio > IMPLAUSIBLE_LENGTH_RATIO * limits.max_length_m / limits.width_m:
-            text = f"{reason}; the measured length is not possible"
+            text = f"{reason}; the measured length of the sheet is not possible"
             return self._decelerate(text, geometry, step_s)
         if starts and not self._stands_still(measured, geometry):
             return self._decelerate(reason, geometry, step_s)
@@ -757,7 +773,7 @@ class ArmControl:
             else check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
         )
         if refusal is not None:
-            # The arm does not follow commands.  Further ones would make it jump when it does again.
+            # The arm does not follow commands.  It would jump when it follows commands again.
             self.handle(Event.RELAX_ENDED)
             return self._decelerate(f"{reason}; {refusal}", geometry, step_s)
         if starts or self._sheet is None or self._relax_from is None:
@@ -788,7 +804,10 @@ class ArmControl:
         return self._move(velocity, geometry, step_s)
 
     def _decelerate(self, reason: str, geometry: ArmGeometry, step_s: float) -> Command:
-        """Decelerate along the path; at rest, command no motion.  reason: for the operator."""
+        """Return the command that decelerates along the path, or that commands no motion at rest.
+
+        reason: text for the operator.
+        """
         self.handle(Event.RELAX_BLOCKED)
         self._drop_path()
         self._settle()
@@ -833,10 +852,10 @@ class ArmControl:
         return self._send("move", self.commanded_rad + velocity * step_s, geometry, step_s)
 
     def _send(self, mode: str, joints_rad: Floats, geometry: ArmGeometry, step_s: float) -> Command:
-        """Return the command for these joints; every command is made here.
+        """Return the command for joints (6,) rad after two final checks of every command.
 
-        Two final checks apply to every command, and a violation is a fault.  A state without motion
-        sends no motion.  No command exceeds the joint speeds or the tool speed.
+        A fault is latched if the state permits no motion, or if the step exceeds the joint speeds
+        or the tool speed.
         """
         before = self.commanded_rad
         if mode == "move" and self._state not in MOTION_STATES:
@@ -864,7 +883,7 @@ class ArmControl:
         return Command(mode, bounded)
 
     def _is_at_command(self, measured: Floats, geometry: ArmGeometry) -> bool:
-        """Return whether measured joints are so near the last command that it may restart there."""
+        """Return whether the measured joints are near enough to the last command to restart."""
         shift_m = geometry.bound_edge_shift_m(self.commanded_rad, measured)
         return shift_m <= MAX_RESTART_SHIFT_M
 
@@ -872,16 +891,16 @@ class ArmControl:
         return self._standstill.is_standing(at_command=self._is_at_command(measured, geometry))
 
     def _restart_refusal(self, measured: Floats, geometry: ArmGeometry) -> str | None:
-        """Return why a motion must not restart from the measured joints, or None.
+        """Return why a motion must not start from the measured joints (6,) of an arm at rest, or
+        None.
 
-        The arm must be at rest.  At its last commanded position it may restart.  At any other
-        position, either the arm has not followed, or the measurement is wrong and would make the
-        arm jump.
+        The motion may start at the last commanded position.  At another position, the measurement
+        may be wrong, and the arm would then jump.
         """
         lowest, highest = geometry.range_rad
         beyond = max(float((lowest - measured).max()), float((measured - highest).max()))
         if beyond > MAX_BEYOND_RANGE_RAD:
-            return f"measured joints are {np.degrees(beyond):.1f} degrees beyond their range"
+            return f"the measured joints are {np.degrees(beyond):.1f} degrees beyond their range"
         if self._is_at_command(measured, geometry):
             return None
         monitor = self._standstill
@@ -890,14 +909,14 @@ class ArmControl:
         angle_deg = float(np.degrees(np.abs(self.commanded_rad - measured).max()))
         defect = "jumped before" if monitor.has_jumped else "are frozen"
         return (
-            f"the arm stands {angle_deg:.1f} degrees off its command by measured joints that "
-            f"{defect}: check the arm, then restart its bridge"
+            f"the arm is {angle_deg:.1f} degrees off its command according to measured joints that "
+            f"{defect}; check the arm, then restart its bridge"
         )
 
     def _restart_at(self, measured: Floats, geometry: ArmGeometry) -> None:
-        """Replace the last commanded joints by the measured ones.
+        """Replace the last commanded joints by the measured joints.
 
-        Latch a fault instead if the arm does not stand still.
+        If the arm does not stand still, latch a fault instead.
         """
         if (
             not self._stands_still(measured, geometry)

@@ -23,11 +23,11 @@ Floats = NDArray[np.float64]
 RANGE_MARGIN_RAD = np.radians(2.0)
 
 EDGE_SPEED_FRACTION = 0.95
-"""Fraction of the limiter's tool speed that the sheet's motion may use."""
+"""The fraction of the limiter's tool speed that the sheet's motion may use."""
 
 
 def make_kinematics(model: ClosedFormArm | JointChain) -> ArmKinematics:
-    """Make the kinematics that suit the model of an arm."""
+    """Make the kinematics of an arm from its model."""
     return (
         ClosedFormKinematics(model)
         if isinstance(model, ClosedFormArm)
@@ -36,7 +36,11 @@ def make_kinematics(model: ClosedFormArm | JointChain) -> ArmKinematics:
 
 
 class ArmGeometry:
-    """Geometry of one arm: poses of its base and of the edge that it holds, and its limits."""
+    """The geometry of one arm: poses of its base and of the edge that it holds, and its limits.
+
+    tool_points_flange: (4, 3) m in the flange frame: centre and ends of the clamped edge, and the
+        flange.
+    """
 
     def __init__(self, scene: Scene, side: Side) -> None:
         self.side: Side = side
@@ -58,13 +62,13 @@ class ArmGeometry:
         sheet = scene.sheet
         half = 0.5 * sheet.height_m
         self.edge_bound = EdgeBound(EDGE_SPEED_FRACTION * self.max_tool_speed, half)
-        self.edge_points_flange = apply(
+        edge_points_flange = apply(
             self.flange_from_edge,
             np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]]),
         )
-        self._tool_points = np.vstack([self.edge_points_flange, np.zeros(3)])
+        self.tool_points_flange = np.vstack([edge_points_flange, np.zeros(3)])
         chain = arm.model.chain() if isinstance(arm.model, ClosedFormArm) else arm.model
-        edge_end_m = float(np.linalg.norm(self.edge_points_flange, axis=1).max())
+        edge_end_m = float(np.linalg.norm(edge_points_flange, axis=1).max())
         self._levers_m = SerialChain(chain).levers_m(edge_end_m)
         self.start_rad = np.array(arm.model.start_rad)
         self.range_rad = np.array([arm.model.min_rad, arm.model.max_rad])
@@ -114,32 +118,37 @@ class ArmGeometry:
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
-        """Return centre and ends of the clamped edge, and the flange (4, 3), m, base frame."""
-        return apply(self._base_from_flange(joints_rad), self._tool_points)
+        """Return points (4, 3) m in the base frame at joints (6,) rad.
+
+        The points are the centre and the ends of the clamped edge, and the flange.
+        """
+        return apply(self._base_from_flange(joints_rad), self.tool_points_flange)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
         """Return joints (6,) rad that place this arm's edge for a pose of the sheet.
 
-        They are near the present joints, and compensate the displacement by the sheet's tension.
-        Raises UnreachableError if there are none.
+        present_rad: present joints (6,), which are near the result.
+        The displacement of the edge by the sheet's tension is compensated.  Raises UnreachableError
+        if the arm cannot reach the pose.
         """
         edge = motion.world_from_sheet.copy()
         edge[:3, 3] += self.edge_offset_m(motion.stretch_ratio) * edge[:3, 0]
         return self.solve_joints(flange_pose(edge, self.flange_from_edge), present_rad)
 
     def edge_offset_m(self, stretch_ratio: float) -> float:
-        """Return the commanded position of the edge along the sheet's x axis, from its centre.
+        """Return the commanded distance (m) of the edge from the sheet's centre along its x axis.
 
-        The tension of the sheet moves the flange from this position towards the other flange.
+        The result is negative for the left edge.  The tension of the sheet moves the edge from the
+        commanded position towards the other edge.
         """
         length_m = stretch_ratio * self.sheet_limits.width_m
         moved_m = self._compliance_m_per_n * self.sheet_limits.force_n(length_m)
         return (-1.0 if self.left else 1.0) * (0.5 * length_m + moved_m)
 
     def solve_joints(self, world_from_flange: Floats, near_rad: Floats) -> Floats:
-        """Return encoder angles (6,) that place the flange of a rigid arm at a pose (4, 4).
+        """Return encoder angles (6,) rad near `near_rad` that place a rigid arm's flange at a pose.
 
-        They are near `near_rad`. Raises UnreachableError if there are none.
+        Raises UnreachableError if the arm cannot reach the pose (4, 4).
         """
         offsets_rad = self._joint_offsets_rad
         base_from_flange = self.base_from_world @ world_from_flange
@@ -147,9 +156,9 @@ class ArmGeometry:
         return np.asarray(joints_rad - offsets_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
-        """Return the sheet at rest between this arm's edge and that of the other arm.
+        """Return the sheet at rest between this arm's edge and the other arm's edge.
 
-        own_edge, other_edge: world poses (4, 4) that the edges would have if the arms were rigid.
+        own_edge, other_edge: world poses (4, 4) of the edges of rigid arms.
         """
         limits = self.sheet_limits
         left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)

@@ -1,15 +1,15 @@
-"""Check whether the arms can reach poses of the sheet: many at once, and along a path.
+"""Check whether the arms can reach poses of the sheet: many poses at once, or along a path.
 
 Two arms hold the sheet by its left and right edges.  Poses of the sheet are (n, 4, 4) in the world
-with stretch ratios (n,); joints are (n, 6) rad.  A margin is the distance to a limit, positive
-within it; for speeds it is a fraction of the limit.  A branch is one of the discrete joint
-solutions of a pose.
+with stretch ratios (n,); joints are (n, 6) rad.  A margin is the distance to a limit and is
+positive within the limit.  Margins of speeds are fractions of the limit.  A branch is one of the
+discrete joint solutions of a pose.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import Any
 
@@ -22,7 +22,6 @@ from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import (
-    apply,
     inverse,
     rotation_from_vector,
     transform,
@@ -47,24 +46,26 @@ POSE_LIMITS = (
     "edge force",
 )
 COMMAND_LIMITS = ("reach", *RANGES, "workspace", "flange distance", "edge force")
-"""Limits of a pose that the limiter also enforces for every command."""
+"""The limits of a pose that the limiter also enforces for every command."""
 SPEED_LIMITS = (*SPEEDS, "tool speed")
 LIMITS = (*POSE_LIMITS, *SPEED_LIMITS)
-"""All limits.  The first violated one in this order is reported (`ArmReach.binding`)."""
+"""All limits.  If a pose violates several limits, the first one in this order is reported."""
 
 BRANCH_SAMPLES = 500
-"""Approximate number of poses from which `find_best_reach` selects the branch."""
+"""The approximate number of poses from which `find_best_reach` selects the branch."""
 
 SPEED_DAMPING = 1e-12
-"""Damping term that limits the computed joint speeds at a singularity."""
+"""The damping term that limits the computed joint speeds at a singularity."""
 
 MAX_STEP_RAD = 0.05
-"""Maximum change of a joint between two samples of a path; at a jump, any sampling exceeds it."""
+"""The maximum change of a joint between two samples of a path."""
 
 MIN_FRACTION = 1e-6
+"""The minimum distance between two samples of a path, as a fraction of the path.  If a joint
+changes by more than MAX_STEP_RAD over this distance, it jumps."""
 
 ROUNDING = 1e-9
-"""Amount by which rounding errors may reduce a margin."""
+"""The amount by which rounding errors may reduce a margin."""
 
 DETOURS_M = (
     (0.0, 0.0, 0.05),
@@ -74,15 +75,15 @@ DETOURS_M = (
     (0.0, 0.08, 0.0),
     (0.0, -0.08, 0.0),
 )
-"""Offsets of detours in the world, m, in the order of trial; those towards the user are first."""
+"""The offsets of detours in the world, m, in the order in which they are tried."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPoses:
     """Poses (n, 4, 4), stretch ratios (n,) and twists (n, k, 6) of the sheet in the world.
 
-    twists: k motions (m/s, rad/s) of the sheet's centre that the arms must follow from each pose;
-    k may be 0.
+    twists_world: k motions (m/s, rad/s) of the sheet's centre that the arms must follow from each
+        pose; k may be 0.
     """
 
     world_from_sheet: Floats
@@ -99,17 +100,17 @@ class SheetPoses:
         )
 
     def without_twists(self) -> SheetPoses:
-        """Return the same poses without motions to follow."""
+        """Return the same poses without twists."""
         return SheetPoses(self.world_from_sheet, self.stretch_ratio, np.empty((len(self), 0, 6)))
 
 
 @dataclass(frozen=True, slots=True)
 class ArmReach:
-    """Joints and margins of one arm for n poses of the sheet on one branch.
+    """The joints and margins of one arm for n poses of the sheet on one branch.
 
     joints_rad: (n, 6), NaN for poses out of reach.
-    margins: margins (n,) by limit, for each of `LIMITS`.  Those that depend on joints are NaN for
-        poses out of reach.  Those of singularities that the arm does not have are infinite.
+    margins: margins (n,) by limit, for each of `LIMITS`.  Margins that depend on joints are NaN for
+        poses out of reach.  Margins of singularities that the arm does not have are infinite.
     """
 
     branch: Any
@@ -118,7 +119,7 @@ class ArmReach:
 
     @property
     def binding(self) -> NDArray[np.intp]:
-        """Return for each pose the index in `LIMITS` of the first violated limit, (n,), or -1."""
+        """Return the index (n,) in `LIMITS` of the first violated limit of each pose, or -1."""
         found = np.full(len(self.joints_rad), -1)
         for number in reversed(range(len(LIMITS))):
             found[self.margins[LIMITS[number]] < 0.0] = number
@@ -126,18 +127,18 @@ class ArmReach:
 
     @property
     def reachable(self) -> Bools:
-        """Return for each pose whether the arm can reach it at rest, (n,)."""
+        """Return whether the arm can reach each pose at rest, (n,)."""
         binding = self.binding
         return np.asarray((binding < 0) | (binding >= len(POSE_LIMITS)))
 
     @property
     def trackable(self) -> Bools:
-        """Return for each pose whether the arm can also follow the twists there, (n,)."""
+        """Return whether the arm can reach each pose and follow its twists, (n,)."""
         return np.asarray(self.binding < 0)
 
 
 def compute_flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
-    """Return the flange poses world_from_flange (n, 4, 4) of a rigid arm for poses of the sheet."""
+    """Return the world poses (n, 4, 4) of a rigid arm's flange for n poses of the sheet."""
     edges = places.world_from_sheet.copy()
     offset = np.array([geometry.edge_offset_m(ratio) for ratio in places.stretch_ratio])
     edges[:, :3, 3] += offset[:, None] * edges[:, :3, 0]
@@ -147,7 +148,10 @@ def compute_flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
 def compute_reach(
     geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses, branch: Any
 ) -> ArmReach:
-    """Compute joints and margins of an arm for poses on one branch; other: the other arm."""
+    """Compute the joints and margins of an arm for poses of the sheet on one branch.
+
+    other: the arm that holds the other edge.
+    """
     flanges = compute_flange_poses(geometry, places)
     joints = geometry.kinematics.solve_joints_on_branch(
         geometry.base_from_world @ flanges, branch, geometry.start_rad
@@ -158,9 +162,10 @@ def compute_reach(
 
 
 def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses) -> ArmReach:
-    """Return the reach on the branch that reaches most poses; among equals, with larger margins.
+    """Return the joints and margins on the branch that reaches the most poses.
 
-    One branch is used for all poses, because an arm cannot change it while it holds the sheet.
+    If several branches reach as many poses, the branch with the larger margins is selected.  All
+    poses have the same branch, because an arm cannot change its branch while it holds the sheet.
     """
     still = places.without_twists().some(
         np.arange(0, len(places), max(1, len(places) // BRANCH_SAMPLES))
@@ -242,20 +247,16 @@ def _speeds(
 
 def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
     """Return world points (n, 4, 3), m: centre and ends of the clamped edge, and the flange."""
-    half = 0.5 * geometry.sheet_limits.height_m
-    edge = apply(
-        geometry.flange_from_edge, np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]])
-    )
-    points = np.einsum("nij,pj->npi", flanges[:, :3, :3], np.vstack([edge, np.zeros(3)]))
+    points = np.einsum("nij,pj->npi", flanges[:, :3, :3], geometry.tool_points_flange)
     return np.asarray(points + flanges[:, None, :3, 3])
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPath:
-    """Path of the sheet that both arms can follow: m poses from start to goal.
+    """A path of the sheet that both arms can follow: m poses from start to goal.
 
-    left_rad, right_rad: joints (m, 6) of both arms, on one branch each.
-    times_s: (m,) times from 0, as short as the speed limits of joints and edges allow.
+    left_rad, right_rad: joints (m, 6) of both arms; each arm stays on one branch.
+    times_s: (m,) times of the poses at the speed limits of joints and edges.
     via_m: offset of the detour in the world, m; None if the path is straight.
     """
 
@@ -268,7 +269,7 @@ class SheetPath:
 
 @dataclass(frozen=True, slots=True)
 class PathStep:
-    """Pose of the sheet on a path, with the joints (6,) of both arms."""
+    """A pose of the sheet on a path, with the joints (6,) rad of both arms."""
 
     sheet: SheetMotion
     left_rad: Floats
@@ -276,9 +277,9 @@ class PathStep:
 
 
 class PathError(FlexsheetError, ValueError):
-    """A path that the arms cannot follow; the text names arm, limit and position.
+    """An error for a path that the arms cannot follow.
 
-    limit: one of `LIMITS`, "jump" or "alignment".  fraction: position on the straight path, 0..1.
+    limit: one of `LIMITS`, "jump" or "alignment".  fraction: position on the path, 0 to 1.
     """
 
     code = "path"
@@ -310,10 +311,11 @@ def plan_path(
     """Plan a path for both arms between two poses and stretches of the sheet.
 
     left_rad, right_rad: joints (6,) at the start; None: all branches are tried.
+    detours_m: offsets of the detours to try if the straight path violates a limit.
 
-    The sheet moves straight and rotates about one axis, and its stretch changes linearly.  If a
-    limit blocks this path, the sheet first shifts by an offset of `detours_m`, and shifts back at
-    the end.  Raises PathError with the limit that blocks the straight path.
+    On a straight path, the sheet rotates about one axis and its stretch changes linearly.  On a
+    detour, the sheet is shifted by the offset after the start, and shifted back at the end.  Raises
+    PathError with the limit that the straight path violates.
     """
     starts = list(product(_starts(left, start, left_rad), _starts(right, start, right_rad)))
     first: PathError | None = None
@@ -337,9 +339,10 @@ def plan_path_through(
     left_rad: Floats,
     right_rad: Floats,
 ) -> SheetPath:
-    """Plan a path for both arms through all corners, straight between them.
+    """Plan a path for both arms that is straight between the given corners.
 
-    left_rad, right_rad: joints (6,) at the first corner.  Raises PathError if a limit blocks it.
+    left_rad, right_rad: joints (6,) at the first corner.
+    Raises PathError if the path violates a limit.
     """
     begin = PathStep(
         corners[0],
@@ -352,25 +355,16 @@ def plan_path_through(
 def _shifted(
     places: Sequence[SheetMotion], offset_m: tuple[float, float, float]
 ) -> list[SheetMotion]:
-    return [
-        SheetMotion(
-            transform(
-                place.world_from_sheet[:3, :3], place.world_from_sheet[:3, 3] + np.array(offset_m)
-            ),
-            place.twist_world,
-            place.stretch_ratio,
-            place.stretch_rate_per_s,
-        )
-        for place in places
-    ]
+    shift = transform(np.eye(3), np.array(offset_m))
+    return [replace(one, world_from_sheet=shift @ one.world_from_sheet) for one in places]
 
 
 def _sample_path(
     left: ArmGeometry, right: ArmGeometry, corners: Sequence[SheetMotion], begin: PathStep
 ) -> list[PathStep]:
-    """Sample a path through the given sheet motions so densely that no joint jumps.
+    """Sample a path through the corners so that joints change by at most MAX_STEP_RAD per sample.
 
-    Raises PathError if an arm cannot reach a sample or a joint would jump.
+    Raises PathError if an arm cannot reach a sample, or if a joint would jump.
     """
     track = [begin]
     for number, (near, far) in enumerate(pairwise(corners)):
@@ -409,11 +403,15 @@ def _explain_jump(
     *,
     fraction: float,
 ) -> PathError:
-    """Return the error for joints that would jump from `before_rad` (6,) to reach the next pose."""
+    """Return the error for joints that jump between `before_rad` (6,) and the next pose."""
     reach = compute_reach(arm, other, _make_poses([there]), arm.kinematics.find_branch(before_rad))
     binding = int(reach.binding[0])
     limit = "jump" if binding < 0 else LIMITS[binding]
-    why = "its joints would jump" if binding < 0 else f"its branch ends: {limit}"
+    why = (
+        "its joints would jump"
+        if binding < 0
+        else f"its joint solution violates the limit {limit} beyond this position"
+    )
     return PathError(
         why, side=arm.side, limit=limit, fraction=fraction, world_from_sheet=there.world_from_sheet
     )
@@ -422,8 +420,8 @@ def _explain_jump(
 def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[Floats]:
     """Return the joints (6,) that an arm may have at the start of a path.
 
-    They are those near the given joints, or one solution per branch within the joint ranges.  The
-    branch with the largest distance to the range limits is first.
+    given: joints near the solution; None: return one solution per branch within the joint ranges.
+    Solutions with larger distances from the range limits are first.
     """
     if given is not None:
         return [_solve_joints(arm, start, given, fraction=0.0)]
@@ -461,10 +459,11 @@ def _solve_joints(
 def solve_step(
     left: ArmGeometry, right: ArmGeometry, sheet: SheetMotion, near: PathStep, *, fraction: float
 ) -> PathStep:
-    """Solve both arms' joints for a pose of the sheet, near the joints of a neighbouring step.
+    """Solve the joints of both arms for a pose of the sheet.
 
-    Raises PathError if one of COMMAND_LIMITS is violated.  Distances to singularities are not
-    checked.  fraction: position on the path, which the error states.
+    near: neighbouring step, whose joints are near the solution.
+    fraction: position on the path for the error text.
+    Raises PathError if one of COMMAND_LIMITS is violated.
     """
     step = PathStep(
         sheet,
@@ -484,7 +483,7 @@ def solve_step(
         for limit in COMMAND_LIMITS:
             if not margins[limit][0] >= 0.0:
                 raise PathError(
-                    f"{limit} is violated",
+                    f"the limit {limit} is violated",
                     side=arm.side,
                     limit=limit,
                     fraction=fraction,
@@ -517,9 +516,9 @@ def _check_limits(
     track: Sequence[PathStep],
     via: tuple[float, float, float] | None,
 ) -> SheetPath:
-    """Return the path if all poses are within the limits of both arms; raises PathError otherwise.
+    """Return the path, or raise PathError if a pose violates a limit of one of the arms.
 
-    A limit that is violated at the start may stay violated, but not by more.
+    A limit that is violated at the start may remain violated by the same amount.
     """
     places = _make_poses([step.sheet for step in track])
     joints = (
@@ -540,7 +539,7 @@ def _check_limits(
         if len(broken):
             limit = LIMITS[int(reach.binding[broken[0]])]
             raise PathError(
-                f"{limit} is violated",
+                f"the limit {limit} is violated",
                 side=arm.side,
                 limit=limit,
                 fraction=float(broken[0]) / max(len(track) - 1, 1),
