@@ -891,8 +891,7 @@ class ArmControl:
         return self._standstill.is_standing(at_command=self._is_at_command(measured, geometry))
 
     def _restart_refusal(self, measured: Floats, geometry: ArmGeometry) -> str | None:
-        """Return why a motion must not start from the measured joints (6,) of an arm at rest, or
-        None.
+        """Return why a motion must not start from the measured joints (6,), or None.
 
         The motion may start at the last commanded position.  At another position, the measurement
         may be wrong, and the arm would then jump.

@@ -1,6 +1,6 @@
 """Convert a sheet target to a goal for one arm, and synchronize the two arms.
 
-Plain functions: poses are 4x4 in the world, rotations in rad, lengths in m, times in s or ns.
+Poses are 4x4 in the world, rotations in rad, lengths in m, times in s or ns.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ FOLLOW_BOUNDS = SheetBounds(
 )
 
 SLOW_FROM_RAD = 0.05
-"""Lead of one edge over the other from which the leading arm slows."""
+"""The lead of one edge over the other edge from which the leading arm slows down."""
 
 WAIT_FROM_RAD = 0.12
-"""Lead at which the leading arm waits; the limiter stops both arms at 0.2 rad."""
+"""The lead of one edge at which the leading arm waits.  The limiter stops both arms at 0.2 rad."""
 
 MAX_PREDICTION_S = 0.15
-"""Maximum time by which a target may lie in the future: the prediction horizon and a margin."""
+"""The maximum time by which a target may lie in the future: the prediction horizon and a margin."""
 
 MAX_TRAJECTORY_S = 0.4
-"""Maximum duration of a trajectory, for which an arm moves without a new message."""
+"""The maximum duration of a trajectory, during which an arm moves without a new message."""
 
 SKEW_LENGTH_M = 0.25
-"""Offset between two sheet poses that counts like a rotation of 1 rad between them."""
+"""The offset between two sheet poses that has the same weight as a rotation of 1 rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """Target of the sheet at the time at which a command takes effect.
+    """The target of the sheet at the time at which a command takes effect.
 
-    overdue_s: how late the next target is; negative if it is not yet due.
-    planner_ended: whether the planner's process, or one before it, has ended since the target.
+    overdue_s: time since the next target was due; negative if it is not yet due.
+    planner_ended: whether the planner or a node on which it depends has ended since the target.
     """
 
     motion: SheetMotion
@@ -66,11 +66,10 @@ class Goal:
 def extrapolate_goal(
     motion: SheetMotion, ahead_s: float, overdue_s: float, *, max_extrapolation_s: float
 ) -> Goal:
-    """Extrapolate the target by `ahead_s` (positive or negative), limited to `max_extrapolation_s`.
+    """Extrapolate the target by `ahead_s`, limited to `max_extrapolation_s` in both directions.
 
-    overdue_s: time since the next target was due.  If the target needs a longer extrapolation, it
-    also counts as overdue, by the remaining time.  The same applies to a target that is too far in
-    the future, since its clock must be wrong.
+    overdue_s: time since the next target was due.  It is increased if the target needs a longer
+        extrapolation, or if the target is too far in the future.
     """
     carried_s = min(max(ahead_s, -max_extrapolation_s), max_extrapolation_s)
     late_s = max(overdue_s, ahead_s - max_extrapolation_s, -ahead_s - MAX_PREDICTION_S)
@@ -79,7 +78,7 @@ def extrapolate_goal(
 
 @dataclass(frozen=True, slots=True)
 class GoalTiming:
-    """Times (s) for the conversion of a target to a goal.
+    """The times (s) for the conversion of a target to a goal.
 
     servo_lag_s: time from sending a command until it takes effect.
     target_period_s: time from a target's arrival until the next is due.
@@ -92,9 +91,9 @@ class GoalTiming:
 
 
 def find_trajectory(target: SheetTarget) -> SheetTrajectory | None:
-    """Return the target's trajectory if the arm may follow it; otherwise None.
+    """Return the trajectory of a target, or None if the arm must not follow the trajectory.
 
-    Its speeds and decelerations must be within FOLLOW_BOUNDS, its duration within MAX_TRAJECTORY_S.
+    The speeds and decelerations must be within FOLLOW_BOUNDS, the duration within MAX_TRAJECTORY_S.
     """
     trajectory, bounds = target.trajectory, FOLLOW_BOUNDS
     if trajectory is None or not trajectory.brake_s > 0.0 <= trajectory.keep_s:
@@ -120,11 +119,9 @@ def make_goal(
 ) -> Goal:
     """Convert a target to the goal of a command that is sent now.
 
-    trajectory: result of `find_trajectory`, if the other arm follows it too; the target is then
-        overdue from the trajectory's end.  None: the target is extrapolated by its twist.
-    planner_ended: see `Goal`.
-
-    A target contains no rate of the stretch, so the arms follow a changing stretch with a lag.
+    trajectory: result of `find_trajectory` if the other arm also follows the trajectory; the target
+        is then overdue after the end of the trajectory.  None: the target is extrapolated by its
+        twist.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s
@@ -147,12 +144,13 @@ def compute_sync_factor(
 ) -> float:
     """Return the factor (0..1) on an arm's speed that lets the other arm catch up.
 
-    own_edge, other_edge: world poses of the commanded edges; left: whether this arm's edge is the
-    sheet's left one.  target: target pose world_from_sheet.
+    own_edge, other_edge: world poses (4, 4) of the commanded edges.
+    target: target pose world_from_sheet (4, 4).
+    left: whether this arm holds the left edge.
 
     Each arm's node computes its commands in its own cycles, so a late cycle on one side twists the
-    sheet.  The arm that is ahead on the path to the target slows in proportion to its lead.  Only
-    one of the arms can be ahead, so they never wait for each other.
+    sheet.  The arm that is ahead on the path to the target slows in proportion to its lead.  The
+    arms cannot wait for each other, because only one of them can be ahead.
     """
     across = other_edge[:3, 3] - own_edge[:3, 3]
     half = (0.5 if left else -0.5) * sqrt(float(across @ across))
@@ -168,7 +166,7 @@ def compute_sync_factor(
 
 
 def scale_speeds(bounds: SheetBounds, factor: float) -> SheetBounds:
-    """Return the bounds with scaled speeds and the same accelerations."""
+    """Multiply the speeds of the bounds by a factor; the accelerations do not change."""
     if factor == 1.0:
         return bounds
     return replace(
@@ -180,14 +178,14 @@ def scale_speeds(bounds: SheetBounds, factor: float) -> SheetBounds:
 
 
 def _sheet_centre(edge: Floats, along_m: float) -> Floats:
-    """Return the sheet's pose (4, 4) from that of an edge; its centre is at `along_m` on x."""
+    """Return the sheet's pose (4, 4) from an edge's pose (4, 4).
+
+    along_m: coordinate of the sheet's centre on the x axis of the edge.
+    """
     return transform(edge[:3, :3], edge[:3, 3] + along_m * edge[:3, 0])
 
 
 def _difference(pose: Floats, other: Floats) -> Floats:
-    """Return the difference (6,) of two poses: rotation (rad), then offset over SKEW_LENGTH_M.
-
-    If the poses are exchanged, the result is exactly negated.
-    """
+    """Return the difference (6,) of two poses: rotation (rad), then offset / SKEW_LENGTH_M."""
     rotation = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
     return np.concatenate([rotation, (other[:3, 3] - pose[:3, 3]) / SKEW_LENGTH_M])

@@ -2,7 +2,8 @@
 
 Joint angles are (6,) or (n, 6) in radians, poses are 4x4 `base_from_flange` in metres.  The inverse
 kinematics use a damped Newton method, which starts at known joints and has a bounded number of
-steps.  Distant poses are reached through intermediate poses, so that the arm stays on its branch.
+steps.  The joints for a distant pose are solved through intermediate poses, so that the arm stays
+on its branch.
 """
 
 from __future__ import annotations
@@ -21,41 +22,42 @@ from flexsheet.nodes.models.rigid import pose_matrix
 Floats = NDArray[np.float64]
 
 MAX_STEPS = 12
-"""Maximum number of Newton steps from known joints; a control cycle typically needs 2 or 3."""
+"""The maximum number of Newton steps from known joints.  A control cycle typically needs 2 or 3."""
 
 WAYPOINTS, STEPS_PER_WAYPOINT = 8, 5
-"""Number of intermediate poses on the way to a distant pose, and of Newton steps for each."""
+"""The number of intermediate poses to a distant pose, and the number of Newton steps for each of
+them."""
 
 MAX_STEP_RAD = 0.3
-"""Maximum change of a joint in one Newton step."""
+"""The maximum change of a joint in one Newton step."""
 
 TOLERANCE = 1e-8
-"""Error of a solved pose (m, rad) below which the iteration ends."""
+"""The error of a solved pose (m, rad) below which the iteration ends."""
 
 MAX_ERROR = 1e-6
-"""Maximum error of an accepted solution, m and rad."""
+"""The maximum error of an accepted solution, m and rad."""
 
 DAMPING = 1e-9
-"""Damping term of the normal equations, which limits the steps at a singularity."""
+"""The damping term of the normal equations, which limits the steps at a singularity."""
 
 SINGULAR_LENGTH_M = 0.25
-"""Length that converts velocities to angular velocities in the singular values of the Jacobian."""
+"""The length by which the velocities in the Jacobian are divided to obtain angular velocities."""
 
 MIN_SINGULAR_VALUE, NEAR_SINGULAR_VALUE = 0.01, 0.05
-"""Limits of the smallest singular value of the Jacobian.  A pose is rejected below the first limit.
-Paths must stay above the second one, where 0.25 m/s needs joint speeds of at most 20 rad/s."""
+"""The minimum of the smallest singular value of the Jacobian for single poses and for paths.  At
+the second value, a speed of 0.25 m/s needs joint speeds of at most 20 rad/s."""
 
 SEEDS = 256
-"""Number of random joint vectors from which `solve_all` starts."""
+"""The number of random joint vectors from which `solve_all` starts."""
 
 SEED_STEPS = 40
 
 MIN_DIFFERENCE = 0.02
-"""Value of |sin(difference / 2)| of any joint above which two solutions are distinct."""
+"""The minimum value of |sin(difference / 2)| of a joint in two distinct solutions."""
 
 
 class SerialChain:
-    """Vectorized forward kinematics and Jacobian of a chain of six rotary joints."""
+    """The forward kinematics and the Jacobian of a chain of six rotary joints."""
 
     def __init__(self, model: JointChain) -> None:
         # The transform of a joint at angle q is constant + sin(q) sine + cos(q) cosine.
@@ -76,7 +78,7 @@ class SerialChain:
         self.flange_m = float(np.linalg.norm(model.flange.position_m))
 
     def _frames(self, joints_rad: Floats) -> list[Floats]:
-        """Return the poses base_from_joint of all joints and of the flange, for joints (..., 6)."""
+        """Return the poses (..., 4, 4) of all joints and of the flange in the base frame."""
         angles = joints_rad[..., None, None]
         links = self._constant + np.sin(angles) * self._sine + np.cos(angles) * self._cosine
         frames = [links[..., 0, :, :]]
@@ -111,7 +113,7 @@ class SerialChain:
 
 
 class NumericKinematics:
-    """Kinematics of one arm with Newton's method; implements `kinematics.ArmKinematics`."""
+    """The kinematics of one arm by Newton's method."""
 
     def __init__(self, model: JointChain) -> None:
         self.model = model
@@ -128,7 +130,7 @@ class NumericKinematics:
         return self._chain.jacobian(joints_rad)
 
     def _refine(self, poses: Floats, joints_rad: Floats, steps: int) -> tuple[Floats, Floats]:
-        """Return joints (n, 6) after Newton steps towards poses, and their errors (n,)."""
+        """Return joints (n, 6) after Newton steps towards poses (n, 4, 4), and errors (n,)."""
         joints = joints_rad
         for left in reversed(range(steps + 1)):
             flanges, slopes = self._chain.pose_and_jacobian(joints)
@@ -144,7 +146,7 @@ class NumericKinematics:
         return joints, largest
 
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
-        """Return joints (n, 6) on the branch of `joints_rad` (6,), and their errors (n,)."""
+        """Return joints (n, 6) on the branch of `joints_rad` (6,) for poses, and errors (n,)."""
         start = self.forward(joints_rad)
         rotation = scipy.spatial.transform.Rotation
         turns = rotation.from_matrix(poses[:, :3, :3] @ start[:3, :3].T).as_rotvec()
@@ -158,10 +160,10 @@ class NumericKinematics:
         return self._refine(poses, joints, STEPS_PER_WAYPOINT)
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: Floats) -> Floats:
-        """Return joints (6,) rad near the present ones.
+        """Return joints (6,) rad for a flange pose (4, 4) near the present joints (6,).
 
-        Raises UnreachableError if there is no solution, if a joint would leave its range, or near a
-        singularity.
+        Raises UnreachableError if there is no solution, if a joint is out of its range, or if the
+        pose is too near to a singularity.
         """
         poses, present = base_from_flange[None], np.asarray(present_rad, dtype=np.float64)
         if not (np.isfinite(poses).all() and np.isfinite(present).all()):
@@ -177,13 +179,13 @@ class NumericKinematics:
             if self.reach_margins_m(poses)[0] < 0.0:
                 away_mm = 1e3 * float(np.linalg.norm(base_from_flange[:3, 3]))
                 raise UnreachableError(
-                    f"{where}: out of the arm's reach, {away_mm:.0f} mm away, at most "
+                    f"{where}: out of the arm's reach; its distance is {away_mm:.0f} mm, maximum "
                     f"{1e3 * self._max_distance_m:.0f} mm",
                     "reach",
                 )
             raise UnreachableError(
-                f"{where}: no joints found near the present ones; the nearest pose is "
-                f"{1e3 * errors[0]:.2g} mm or mrad away",
+                f"{where}: no joint solution found near the present joints; the remaining error is "
+                f"{1e3 * errors[0]:.2g} mm or mrad",
                 "reach",
             )
         found = joints[0]
@@ -198,16 +200,17 @@ class NumericKinematics:
         smallest = float(self._singular_values(joints)[0])
         if not smallest >= MIN_SINGULAR_VALUE:
             raise UnreachableError(
-                f"{where}: too near to a singularity, the smallest singular value is "
-                f"{smallest:.2g}, at least {MIN_SINGULAR_VALUE}",
+                f"{where}: too near to a singularity; the smallest singular value is "
+                f"{smallest:.2g}, minimum {MIN_SINGULAR_VALUE}",
                 "singularity",
             )
         return np.asarray(found)
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return distinct solutions (6,) rad within the joint ranges, nearest to the start first.
+        """Return distinct joint solutions (6,) rad of a pose within the joint ranges.
 
-        The search starts from random joints with a fixed seed, so it may miss a solution.
+        They are sorted by their distance from the start joints.  The search starts from random
+        joints with a fixed seed, so it may miss a solution.
         """
         random = np.random.default_rng(1)
         low, high = np.maximum(self._lowest, -pi), np.minimum(self._highest, pi)
@@ -248,7 +251,7 @@ class NumericKinematics:
         return float(self._chain.offsets_m.sum() + self._chain.flange_m)
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return by how much (n,) the sum of all link lengths exceeds the distances of poses, m."""
+        """Return the sum of all link lengths minus the distances (n,) of poses (n, 4, 4), m."""
         away = np.linalg.norm(base_from_flange[:, :3, 3], axis=1)
         return np.asarray(self._max_distance_m - away)
 
@@ -267,7 +270,7 @@ class NumericKinematics:
 def _pose_errors(wanted: Floats, present: Floats) -> Floats:
     """Return translations (m) and rotation vectors (rad), (n, 6), from present to wanted poses.
 
-    The rotation vectors are exact for small angles, and have the correct direction for all.
+    The lengths of the rotation vectors are exact for small angles only, their directions always.
     """
     turn = wanted[:, :3, :3] @ np.swapaxes(present[:, :3, :3], 1, 2)
     spin = 0.5 * np.stack(

@@ -1,8 +1,6 @@
 """Define the interface of the kinematics of an arm.
 
-Joint angles are (6,) in radians, poses are 4x4 `base_from_flange` in metres.  The modules
-`closed_form` and `joint_chain` implement the interface, and `geometry.make_kinematics` selects one
-of them for the model of an arm.
+Joint angles are (6,) in radians, poses are 4x4 `base_from_flange` in metres.
 """
 
 from __future__ import annotations
@@ -20,14 +18,14 @@ Floats = NDArray[np.float64]
 
 
 class UnreachableError(FlexsheetError, ValueError):
-    """Raised for a flange pose that has no permitted joint solution.
+    """An error for a flange pose that has no permitted joint solution.
 
     limit: "reach", "singularity", or the joint ("J1" to "J6") that is out of range in the nearest
         solution.
     """
 
     code = "unreachable"
-    remedy = "`flexsheet doctor scene SCENE` lists what is out of reach and what would help."
+    remedy = "Run `flexsheet doctor scene SCENE`, which lists the limits and possible changes."
 
     def __init__(self, text: str, limit: str) -> None:
         super().__init__(text)
@@ -35,7 +33,10 @@ class UnreachableError(FlexsheetError, ValueError):
 
 
 class ArmKinematics(Protocol):
-    """Kinematics of one arm.  A branch is one of the discrete joint solutions of a pose."""
+    """The interface of the kinematics of one arm.
+
+    A branch is one of the discrete joint solutions of a pose.
+    """
 
     @property
     def model(self) -> ArmModel:
@@ -54,15 +55,15 @@ class ArmKinematics(Protocol):
         ...
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: Floats) -> Floats:
-        """Return joints (6,) rad near the present ones, within their ranges.
+        """Return joints (6,) rad for a flange pose (4, 4) near the present joints (6,).
 
-        The computing time is bounded, because a bridge calls this in each control cycle.  Raises
-        UnreachableError.
+        The computing time is bounded, because a bridge calls this method in each control cycle.
+        Raises UnreachableError if the arm cannot reach the pose.
         """
         ...
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return the joints (6,) rad of a pose on all branches."""
+        """Return the joint solutions (6,) rad of a pose on all branches."""
         ...
 
     def find_branch(self, joints_rad: Floats) -> Any:
@@ -87,7 +88,7 @@ class ArmKinematics(Protocol):
         ...
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return by how much joints (n, 6) exceed the minimum distance from each singularity, (n,).
+        """Return the margins (n,) of joints (n, 6) to the minimum distance from each singularity.
 
         The result has one array for each kind of singularity. A margin is negative if the joints
         are nearer to the singularity than permitted.
@@ -96,6 +97,6 @@ class ArmKinematics(Protocol):
 
 
 class SeedBranch(NamedTuple):
-    """Branch of an arm without closed form: the solutions that are continuous with given joints."""
+    """A branch of an arm without closed form, defined by one of its joint solutions (6,) rad."""
 
     seed_rad: tuple[float, ...]

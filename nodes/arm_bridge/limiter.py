@@ -1,11 +1,9 @@
 """Limit every command to an arm.
 
-Speed, acceleration and tool speed (the speed of the flange and of the edge that it holds) are
-clamped, which delays the arm.  Clamping does not make an overstretched or twisted sheet safe, nor
-flanges too close to each other, nor a position outside the workspace.  For these, the checks return
-a text, and the caller stops the arm.
-
-Plain functions: joints (6,) rad, poses 4x4, metres.
+Joint speed, acceleration and tool speed (the speed of the flange and of the edge that it holds) are
+clamped, which delays the arm.  Limits of the sheet, of the distance between the flanges and of the
+workspace cannot be enforced by clamping.  If one of them is violated, a check returns a text, and
+the caller stops the arm.  Joints are (6,) rad, poses 4x4 in metres.
 """
 
 from __future__ import annotations
@@ -24,35 +22,37 @@ from flexsheet.nodes.models.sheet import edge_force_n
 Floats = NDArray[np.float64]
 
 TOOL_SPEED_FRACTION = 0.82
-"""Fraction of the maximum tool speed that commands may use.  The speed of an arm that receives
-positions ripples about its mean.  The ripple is largest where wrist joints rotate fast against each
-other, because each one ripples with its own speed (benchmarks/limiter.py)."""
+"""The fraction of the maximum tool speed that commands may use.  A margin is necessary because the
+speed of an arm ripples about its mean.  The ripple is largest if wrist joints rotate fast in
+opposite directions (benchmarks/limiter.py)."""
 
 MAX_TRAVEL_STEP_S = 0.01
-"""Maximum duration for which one command may move the arm.  After a longer gap the arm would catch
-up faster than the tool speed allows."""
+"""The maximum duration for which one command may move the arm.  After a longer gap, the arm would
+exceed the tool speed to catch up."""
 
 MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
-"""Minimum and maximum duration of a command; speeds over a shorter one are rounding errors."""
+"""The minimum and the maximum duration of a command.  Over a shorter duration, the computed speeds
+would be dominated by rounding errors."""
 
 LENGTH_TOLERANCE_M = 1e-7
 MIN_BLEND = 0.02
-"""Minimum weight of the desired velocity that is tried in its blend with a decelerating one."""
+"""The minimum weight of the desired velocity that is tried in a blend with a decelerating velocity.
+"""
 
 ROUNDING_FACTOR = 1.0 + 1e-6
-"""Factor by which rounding errors may exceed a limit."""
+"""The factor by which rounding errors may exceed a limit."""
 
 RELAXED_M, RELAXED_RAD = 0.002, 0.01
-"""Margins on limits that are exceeded at the start of a motion, because servos ripple and
-measurements are noisy."""
+"""The margins on limits that are exceeded at the start of a motion.  They are necessary because
+servos ripple and measurements are noisy."""
 
 RANGE_BRAKE_FRACTION = 2.0 / 3.0
-"""Fraction of a joint's acceleration that is reserved for stopping within its range."""
+"""The fraction of a joint's acceleration that is reserved for stopping within its range."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointLimits:
-    """Range, speed and acceleration of each joint, (6,)."""
+    """The limits of range, speed and acceleration of each joint, (6,)."""
 
     min_rad: Floats
     max_rad: Floats
@@ -62,7 +62,7 @@ class JointLimits:
 
 @dataclass(frozen=True, slots=True)
 class SheetLimits:
-    """Limits of the sheet and of the two arms that hold it."""
+    """The limits of the sheet and of the two arms that hold it."""
 
     width_m: float
     height_m: float
@@ -75,10 +75,10 @@ class SheetLimits:
     workspace_min_m: Floats
     workspace_max_m: Floats
     compliance_m_per_n: float = 0.0
-    """Sum of the compliances of both flanges under the tension of the sheet."""
+    """The sum of the compliances of both flanges under the tension of the sheet."""
 
     def sheet_length_m(self, edge_distance_m: float) -> float:
-        """Return the length of the sheet (m), which pulls its edges towards each other.
+        """Return the length of the sheet (m) between two compliant arms.
 
         edge_distance_m: distance between the edges if the arms were rigid.
         """
@@ -103,7 +103,7 @@ class SheetLimits:
             high_m, high_excess_m = length_m, excess_m
 
     def force_n(self, length_m: float) -> float:
-        """Return the force (N) on each edge of the sheet when the edges are this far apart."""
+        """Return the force (N) on each edge of a sheet of this length."""
         return edge_force_n(length_m / self.width_m, self)
 
 
@@ -120,16 +120,18 @@ def limit_velocity(
 ) -> Floats:
     """Return joint velocities (6,) rad/s for the next step towards a moving goal.
 
-    goal_rad: joints at the end of the step; a goal that is not finite decelerates.
     velocity: result of the last call.
-    tool_points: function from joints to points (n, 3) m, none of which may exceed `max_tool_speed`.
+    goal_rad: joints at the end of the step; if they are not finite, the arm decelerates.
+    tool_points: function from joints to points (n, 3) m, whose speed is at most `max_tool_speed`.
 
     For any goal, joints_rad + result * step_s is in range, and joint and tool speeds are within
     their limits.  The acceleration exceeds its limit only if range or tool speed require it.
-    Raises ValueError for a `step_s` outside MIN_STEP_S to MAX_STEP_S.
+    Raises ValueError if `step_s` is not from MIN_STEP_S to MAX_STEP_S.
     """
     if not MIN_STEP_S <= step_s <= MAX_STEP_S:
-        raise ValueError(f"step_s is {step_s} s; a command covers {MIN_STEP_S} to {MAX_STEP_S} s")
+        raise ValueError(
+            f"step_s is {step_s} s, but a command covers {MIN_STEP_S} to {MAX_STEP_S} s"
+        )
     if np.isfinite(goal_rad).all() and np.isfinite(goal_velocity).all():
         desired = find_desired_velocity(
             joints_rad, goal_rad, goal_velocity, limits=limits, step_s=step_s
@@ -155,7 +157,7 @@ def find_desired_velocity(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return the velocities (6,) that reach the goal in this step, or that can still stop there."""
+    """Return velocities (6,) rad/s that reach the goal in this step, or that can stop there."""
     max_speed = limits.speed_rad_per_s
     goal = _clamp(goal_rad, limits.min_rad, limits.max_rad)
     along = _clamp(goal_velocity, -max_speed, max_speed)
@@ -168,7 +170,7 @@ def find_desired_velocity(
 def clamp_to_range(
     joints_rad: Floats, velocity: Floats, desired: Floats, *, limits: JointLimits, step_s: float
 ) -> Floats:
-    """Clamp velocities to the maximum acceleration, and to speeds that can stop within range."""
+    """Clamp velocities (6,) rad/s to the maximum acceleration, and to stop within the range."""
     max_acceleration = limits.acceleration_rad_per_s2
     up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
     down = _find_max_speed(joints_rad - limits.min_rad, max_acceleration, step_s)
@@ -181,17 +183,17 @@ def clamp_to_range(
 
 
 def _clamp(values: Floats, lowest: Floats, highest: Floats) -> Floats:
-    """Clip values like numpy.clip, which is five times as slow for six numbers."""
+    """Clip values; numpy.clip is five times as slow for six numbers."""
     return np.minimum(np.maximum(values, lowest), highest)
 
 
 def _find_max_speed(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
-    """Return the highest speeds from which the joints can stop within these distances."""
+    """Return the highest speeds from which the joints can stop within given distances."""
     return closing_speed(np.maximum(distance, 0.0), RANGE_BRAKE_FRACTION * acceleration, step_s)
 
 
 def decelerate(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
-    """Return velocities (6,) after one step of braking; all joints slow in proportion."""
+    """Return velocities (6,) rad/s after one step of braking; all joints slow in proportion."""
     stopping_s = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
     return velocity * max(0.0, 1.0 - step_s / stopping_s) if stopping_s > 0.0 else velocity
 
@@ -206,10 +208,12 @@ def limit_tool_speed(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return the velocities (6,) nearest to the desired ones at which tool points are not too fast.
+    """Return velocities (6,) rad/s near the desired ones that respect the maximum tool speed.
 
-    They are blends of the desired and the decelerating velocities, which keep acceleration and
-    range.  If even the latter are too fast, they are scaled down and exceed the acceleration.
+    velocity: result of the last call.
+    The result is a blend of the desired and the decelerating velocities, which are within the
+    acceleration limit.  If even the decelerating velocities are too fast, they are scaled down and
+    exceed the acceleration limit.
     """
     here = tool_points(joints_rad)
     max_shift_m = max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
@@ -253,9 +257,9 @@ def bound_step(
 ) -> Floats:
     """Return the joints (6,) towards `desired_rad` that one step can reach.
 
-    Joint speeds and tool speed bound the step.  Within these bounds the result is `desired_rad`
-    itself, beyond them a point on the straight line to it.  If `desired_rad` is not finite, the
-    result is `joints_rad`.
+    Joint speeds and tool speed limit the step.  If they permit it, the result is the object
+    `desired_rad`, otherwise a point on the straight line to it.  If `desired_rad` is not finite,
+    the result is `joints_rad`.
     """
     if desired_rad is joints_rad:
         return desired_rad
@@ -285,9 +289,9 @@ def _longest(shifts: Floats) -> float:
 
 
 def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
-    """Return the largest blend of slow and fast shifts (n, 3) for which no shift is too long.
+    """Return the largest blend (0 to 1) of slow and fast shifts (n, 3) m within `max_shift_m`.
 
-    It is the smallest solution of |slow + blend (fast - slow)| = max_shift_m for any shift.
+    The blend solves |slow + blend (fast - slow)| = max_shift_m for the shift that limits it most.
     """
     change = fast - slow
     square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)
@@ -305,10 +309,9 @@ def relax_limits(
     *,
     left: bool,
 ) -> SheetLimits:
-    """Widen those limits that the arms exceed, or nearly exceed, at the start of a motion.
+    """Widen the limits that the arms exceed, or nearly exceed, at the start of a motion.
 
-    The motion can then return within the limit, but must not exceed it further.  All poses are in
-    the world; for `left` see `check_sheet`.
+    All poses are (4, 4) in the world.  left: whether this arm holds the left edge.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     apart = other_flange[:3, 3] - flange[:3, 3]
@@ -330,36 +333,38 @@ def relax_limits(
 
 
 def _twist(edge: Floats, other_edge: Floats) -> float:
-    """Return the angle (rad) between two edges' orientations."""
+    """Return the angle (rad) between the orientations of two edges."""
     # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2).
     apart = (other_edge[:3, :3] - edge[:3, :3]).ravel()
     return 2.0 * math.asin(min(1.0, math.sqrt(float(apart @ apart) / 8.0)))
 
 
 def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits) -> str | None:
-    """Return which limit the sheet between two edges (world poses) violates, or None.
+    """Return a text about the limit that the sheet between two edges violates, or None.
 
-    edge: edge that this arm holds; left: whether it is the sheet's left one.  Numbers that are not
-    finite violate every limit.
+    edge, other_edge: world poses (4, 4) of this arm's edge and of the other edge.
+    left: whether this arm holds the left edge.  Numbers that are not finite violate every limit.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     distance = limits.sheet_length_m(math.sqrt(float(across @ across)))
     if not distance <= limits.max_length_m:
-        return f"sheet of {distance * 1e3:.1f} mm, at most {limits.max_length_m * 1e3:.1f} mm"
+        return (
+            f"the sheet is {distance * 1e3:.1f} mm long, maximum {limits.max_length_m * 1e3:.1f} mm"
+        )
     force = limits.force_n(distance)
     if not force <= limits.max_edge_force_n:
-        return f"edge force {force:.1f} N, at most {limits.max_edge_force_n:.1f} N"
+        return f"the edge force is {force:.1f} N, maximum {limits.max_edge_force_n:.1f} N"
     twist = _twist(edge, other_edge)
     if not twist <= limits.max_twist_rad:
         return (
-            f"edges rotated by {np.degrees(twist):.1f} degrees to one another, "
-            f"at most {np.degrees(limits.max_twist_rad):.1f}"
+            f"the edges are rotated relative to each other by {np.degrees(twist):.1f} degrees, "
+            f"maximum {np.degrees(limits.max_twist_rad):.1f}"
         )
     skew_rad = angle_between(across if left else -across, edge[:3, 0])
     if not skew_rad <= limits.max_twist_rad:
         return (
-            f"edge skewed by {np.degrees(skew_rad):.1f} degrees to the line between both edges, "
-            f"at most {np.degrees(limits.max_twist_rad):.1f}"
+            f"the edge is skewed by {np.degrees(skew_rad):.1f} degrees relative to the line between "
+            f"both edges, maximum {np.degrees(limits.max_twist_rad):.1f}"
         )
     return None
 
@@ -367,21 +372,22 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Return whether a flange (world pose) violates the workspace or flange distance; None if not.
+    """Return a text if a flange violates the workspace or the flange distance, or None.
 
-    slack_m: tolerance on both limits.  Numbers that are not finite violate both.
+    flange_world, other_flange: world poses (4, 4).  slack_m: tolerance on both limits.
+    Numbers that are not finite violate both limits.
     """
     position = flange_world[:3, 3]
     lowest, highest = limits.workspace_min_m - slack_m, limits.workspace_max_m + slack_m
     if not ((position >= lowest) & (position <= highest)).all():
         x, y, z = position * 1e3
-        return f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm is outside the workspace"
+        return f"the flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm is outside the workspace"
     apart = other_flange[:3, 3] - position
     distance = math.sqrt(float(apart @ apart))
     if not distance >= limits.min_flange_distance_m - slack_m:
         return (
-            f"flanges {distance * 1e3:.0f} mm apart, "
-            f"at least {limits.min_flange_distance_m * 1e3:.0f} mm"
+            f"the flanges are {distance * 1e3:.0f} mm apart, "
+            f"minimum {limits.min_flange_distance_m * 1e3:.0f} mm"
         )
     return None
 
@@ -389,7 +395,7 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Return a violation if commanded joints (6,) are too far from the measured ones, or None."""
+    """Return a text if commanded and measured joints (6,) rad differ too much, or None."""
     lag = float(np.abs(joints_rad - measured_rad).max())
     if not lag <= max_error_rad:
         return f"the arm trails its command by {np.degrees(lag):.1f} degrees"

@@ -1,4 +1,4 @@
-"""Control an arm by lines of text over TCP; this module is an example of a driver.
+"""Control an arm by lines of text over TCP, as an example of a driver.
 
 Most controllers can run a program that reads and writes lines on a socket.  A command is one line,
 and its answer is one line.  Spaces separate the fields:
@@ -35,13 +35,16 @@ MAX_LINE_BYTES = 512
 
 
 def encode_line(sequence: int, mode: str, joints_rad: Floats) -> bytes:
-    """Encode a command; raises ValueError unless there are six finite joints."""
+    """Encode a command; raise ValueError unless there are six finite joints."""
     angles = " ".join(f"{angle:.9g}" for angle in validate_joints(joints_rad))
     return f"{sequence} {mode} {angles}\n".encode("ascii")
 
 
 def decode_line(line: bytes, sequence: int) -> tuple[ArmStatus, tuple[int, ...]]:
-    """Decode the answer to a command; return the status and its counter.  Raises ArmAnswerError."""
+    """Decode the answer to a command into the status and its counter.
+
+    sequence: number of the command.  Raises ArmAnswerError if the answer is invalid.
+    """
     try:
         answered, count, faults, *angles = line.decode("ascii").split()
         joints = np.array([float(angle) for angle in angles])
@@ -52,14 +55,14 @@ def decode_line(line: bytes, sequence: int) -> tuple[ArmStatus, tuple[int, ...]]
     if numbers[0] != sequence:
         raise ArmAnswerError(f"expected the answer to command {sequence}, found {numbers[0]}")
     if len(joints) != JOINTS or not all(math.isfinite(angle) for angle in joints):
-        raise ArmAnswerError(f"the answer {line[:80]!r} must have {JOINTS} finite joint angles")
+        raise ArmAnswerError(f"the answer {line[:80]!r} does not have {JOINTS} finite joint angles")
     if not 0 <= numbers[1] < 2**32:
-        raise ArmAnswerError(f"the count {numbers[1]} must be from 0 to 2**32 - 1")
+        raise ArmAnswerError(f"the answer has the count {numbers[1]}; it must be 0 to 2**32 - 1")
     return ArmStatus(joints, found), (numbers[1],)
 
 
 class LineLink(ConnectedLink):
-    """Driver for one arm whose controller program exchanges lines of text."""
+    """A driver for one arm whose controller program exchanges lines of text."""
 
     period_s = 0.008
 
@@ -98,7 +101,9 @@ class LineLink(ConnectedLink):
                 "check the controller and the network cable"
             ) from error
         except (OSError, ValueError) as error:
-            raise ArmAnswerError(f"answer of {self.host}:{self.port}: {error}") from error
+            raise ArmAnswerError(
+                f"the answer of {self.host}:{self.port} cannot be read: {error}"
+            ) from error
         if not line.endswith(b"\n"):
             raise ArmSilentError(
                 f"{self.host}:{self.port} has closed the connection; check the controller"

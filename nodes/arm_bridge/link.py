@@ -1,4 +1,4 @@
-"""Define the interface of drivers that send commands to an arm, for any protocol."""
+"""Define the interface of the drivers that exchange commands and answers with an arm."""
 
 from __future__ import annotations
 
@@ -19,47 +19,54 @@ Floats = NDArray[np.float64]
 JOINTS = 6
 
 MAX_UNCHANGED_S = 0.05
-"""Maximum time for which a controller's counters may stay unchanged: seven of its cycles of 7.1 ms.
+"""The maximum time for which a controller's counters may stay unchanged: seven cycles of 7.1 ms.
 Two exchanges within one cycle may return the same counters."""
+
+MIN_PAUSE_S, MAX_PAUSE_S = 0.05, 1.0
+"""The minimum and the maximum pause before a driver opens a failed connection again."""
 
 _COUNTER_PERIOD = 2**32
 
 
 class ArmLinkError(FlexsheetError):
-    """A failed exchange with an arm, with the reason in one line."""
+    """An error for a failed exchange with an arm."""
 
     code = "arm-link"
     remedy = "Check the arm's address, power, cable and program."
 
 
 class ArmSilentError(ArmLinkError):
-    """No connection to an arm, or no answer from it in time."""
+    """An error for an arm that cannot be connected or does not answer in time."""
 
     code = "arm-silent"
     remedy = (
-        "First check whether the computer is busy (`flexsheet doctor`, row `load`): the usual "
-        "cause with simulated arms. Then check the arm's address, power, cable and program."
+        "First check whether the computer is overloaded (`flexsheet doctor`, row `load`), which is "
+        "the usual cause with simulated arms. Then check the arm's address, power, cable and "
+        "program."
     )
 
 
 class ArmRefusedError(ArmLinkError):
-    """An arm's answer that rejects the command."""
+    """An error for an arm that refuses a command."""
 
     code = "arm-refused"
-    remedy = "Read the reason on the controller's teach pendant: enabled, no alarm, in remote mode?"
+    remedy = (
+        "Read the reason on the controller's teach pendant. The arm must be enabled, without alarm "
+        "and in remote mode."
+    )
 
 
 class ArmAnswerError(ArmLinkError):
-    """An arm's answer that is damaged, follows another protocol or answers another command."""
+    """An error for an answer that is damaged, of another protocol or to another command."""
 
     code = "arm-answer"
     remedy = (
-        "Check whether another program controls the same arm, and the version of the arm's program."
+        "Check that no other program controls the arm, and check the version of the arm's program."
     )
 
 
 class ArmFault(Enum):
-    """Faults that an arm's controller reports."""
+    """The faults that an arm's controller reports."""
 
     JOINT_RANGE = auto()
     STEP_SIZE = auto()
@@ -75,18 +82,18 @@ FAULT_TEXTS = {
     ArmFault.WATCHDOG: "watchdog: no command",
     ArmFault.SERVO: "servo",
 }
-"""Text of each fault, for logs and for `ArmState.faults`."""
+"""The text of each fault, for logs and for `ArmState.faults`."""
 
 
 class Freshness(StrEnum):
-    """Whether measured joints are new, according to the counters in the controller's answer."""
+    """A classification of measured joints by the counters in the controller's answer."""
 
     FIRST = "first"
     """This is the first answer since the start of the link or of the controller."""
     FRESH = "fresh"
     """The counters have advanced, so the joints are measured again."""
     REPEATED = "repeated"
-    """The counters equal those of the previous answer, but only for a permitted time so far."""
+    """The counters equal those of the previous answer, but not yet for too long."""
     STALLED = "stalled"
     """The counters have not advanced for too long (`max_unchanged_s`)."""
     REVERSED = "reversed"
@@ -99,7 +106,10 @@ class Freshness(StrEnum):
 
 
 class CounterMonitor:
-    """Monitor of a controller's 32-bit counters, which detects measurements that are not new."""
+    """A monitor of a controller's 32-bit counters, which detects measurements that are not new.
+
+    max_unchanged_s: maximum time for which the counters may stay unchanged.
+    """
 
     def __init__(self, max_unchanged_s: float = MAX_UNCHANGED_S) -> None:
         self._max_unchanged_s = max_unchanged_s
@@ -109,9 +119,10 @@ class CounterMonitor:
     def classify(
         self, counters: tuple[int, ...], *, sent_ns: int, received_ns: int, may_restart: bool
     ) -> Freshness:
-        """Return the freshness of an answer with these counters.
+        """Return the freshness of an answer with the given counters.
 
-        counters: all must advance; the first is the number of measurements, or their time.
+        counters: counters of the controller, which must all advance; the first one is the number or
+            the time of its measurements.
         sent_ns, received_ns: times of the command and of its answer, on this computer's clock.
         may_restart: whether a counter that runs backwards means a restarted controller.
         """
@@ -136,9 +147,9 @@ class CounterMonitor:
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """Answer of an arm: measured joints (6,) rad, faults, and whether the joints are new.
+    """An answer of an arm: measured joints (6,) rad, faults, and whether the joints are new.
 
-    currents_percent: motor currents (6,), percent of the rated ones; None if they are not reported.
+    currents_percent: motor currents (6,), percent of the rated currents; None if not reported.
     """
 
     joints_rad: Floats
@@ -149,7 +160,7 @@ class ArmStatus:
 
 @dataclass(frozen=True, slots=True)
 class BlockField:
-    """Field of a register block or packet.
+    """A field of a register block or packet.
 
     kind: code of Python's `struct`: H (u16), I (u32), i (i32), f (float32) or x (padding).
     """
@@ -161,7 +172,7 @@ class BlockField:
 
 
 class ArmLink(Protocol):
-    """Interface for the exchange of commands and answers with one arm, one exchange at a time.
+    """The interface for the exchange of commands and answers with one arm.
 
     Modes: `idle` (no motion; restarts after a fault or a lost connection), `move` (to the given
     joints), `hold` and `stop` (no motion).
@@ -172,7 +183,7 @@ class ArmLink(Protocol):
         ...
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:
-        """Send one command and return the status that answers it; raises ArmLinkError."""
+        """Send a command and return the arm's answer; raise ArmLinkError if this fails."""
         ...
 
     def close(self) -> None:
@@ -181,31 +192,22 @@ class ArmLink(Protocol):
 
 
 class ConnectedLink(ABC):
-    """Base class of drivers that use one connection, on which each command gets one answer.
+    """The base class of drivers that use one connection, on which each command gets one answer.
 
-    A driver implements `connected`, `_connect`, `_request` and `_disconnect`.  This class uses them
-    to implement `ArmLink`.  It opens the connection when it is needed, and closes it after a
-    failure.  After the first failure it reconnects at once, then after pauses that double up to
-    `max_pause_s`.  Counters in the answers show whether the measured joints are new.
+    A driver implements `connected`, `_connect`, `_request` and `_disconnect`.  The base class opens
+    the connection when it is needed, and closes it after a failure.  After the first failure it
+    reconnects at once, then after pauses that double from MIN_PAUSE_S to MAX_PAUSE_S.
+    connections: number of connections that were opened.
     """
 
     period_s: ClassVar[float] = 0.0071
-    """Period with which the controller measures its joints.  Answers may repeat a measurement for
-    seven periods, or for MAX_UNCHANGED_S if that is longer."""
+    """The period with which the controller measures its joints.  Answers may repeat a measurement
+    for seven periods, or for MAX_UNCHANGED_S if that is longer."""
 
-    def __init__(
-        self,
-        host: str,
-        port: int,
-        *,
-        timeout_s: float,
-        min_pause_s: float = 0.05,
-        max_pause_s: float = 1.0,
-    ) -> None:
+    def __init__(self, host: str, port: int, *, timeout_s: float) -> None:
         self.host, self.port = host, port
         self.connections = 0
         self._timeout_s = timeout_s
-        self._min_pause_s, self._max_pause_s = min_pause_s, max_pause_s
         self._pause_s = 0.0
         self._try_again_ns = 0
         self._counters = CounterMonitor(max(MAX_UNCHANGED_S, 7.0 * self.period_s))
@@ -217,7 +219,7 @@ class ConnectedLink(ABC):
 
     @abstractmethod
     async def _connect(self) -> None:
-        """Open the connection; raises ArmSilentError."""
+        """Open the connection; raise ArmSilentError if this fails."""
 
     @abstractmethod
     async def _request(
@@ -225,9 +227,9 @@ class ConnectedLink(ABC):
     ) -> tuple[ArmStatus, tuple[int, ...]]:
         """Send one command, wait for its answer, and return the status and its counters.
 
-        mode, joints_rad: see `ArmLink`.  now_ns: time of the command.  The counters are 32-bit
-        counters of the controller; the first one counts its joint measurements.  Raises
-        ArmSilentError, ArmRefusedError or ArmAnswerError.
+        mode, joints_rad: see `ArmLink`.  now_ns: time of the command.  The counters have 32 bits;
+        the first one counts the joint measurements of the controller.  Raises ArmSilentError,
+        ArmRefusedError or ArmAnswerError.
         """
 
     @abstractmethod
@@ -235,11 +237,14 @@ class ConnectedLink(ABC):
         """Close the connection, if any."""
 
     def due(self, now_ns: int) -> bool:
-        """Return whether a connection is open, or the pause before the next attempt is over."""
+        """Return whether an exchange may be tried now.
+
+        After a failure, the next exchange must wait for a pause.
+        """
         return self.connected or now_ns >= self._try_again_ns
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:
-        """Send one command and return the status that answers it; raises ArmLinkError."""
+        """Send a command and return the arm's answer; raise ArmLinkError if this fails."""
         loop = asyncio.get_running_loop()
         start_s = loop.time()
         try:
@@ -253,8 +258,7 @@ class ConnectedLink(ABC):
         except ArmLinkError:
             self.close()
             self._try_again_ns = now_ns + int(self._pause_s * 1e9)
-            doubled_s = max(2.0 * self._pause_s, self._min_pause_s)
-            self._pause_s = min(doubled_s, self._max_pause_s)
+            self._pause_s = min(max(2.0 * self._pause_s, MIN_PAUSE_S), MAX_PAUSE_S)
             raise
         except asyncio.CancelledError:
             # A late answer could otherwise be taken for the answer to the next command.
@@ -277,21 +281,22 @@ class ConnectedLink(ABC):
 
 
 def validate_joints(joints_rad: Floats) -> tuple[float, ...]:
-    """Return joints as numbers; raises ValueError unless there are six, all finite.
+    """Return joints (6,) rad as Python numbers; raise ValueError unless there are six finite
+    joints.
 
-    The limiter already ensures this.  Drivers check it once more before they send a command.
+    The limiter already ensures this, but drivers check it again before they send a command.
     """
     joints = tuple(float(angle) for angle in joints_rad)
     if len(joints) != JOINTS or not all(math.isfinite(angle) for angle in joints):
-        raise ValueError(f"joints to send must be {JOINTS} finite angles, not {joints}")
+        raise ValueError(f"the joints of a command must be {JOINTS} finite angles, not {joints}")
     return joints
 
 
 def propagate_cancellation() -> None:
-    """Raise CancelledError again if a time-out of Python 3.11 has suppressed it.
+    """Raise CancelledError if the current task was cancelled.
 
-    This happens if an answer or a time-out arrives in the same iteration of the event loop as the
-    cancellation.  Otherwise the task would never end.
+    A time-out of Python 3.11 suppresses this error if an answer or the time-out arrives in the same
+    iteration of the event loop as the cancellation.  The task would then never end.
     """
     task = asyncio.current_task()
     if task is not None and task.cancelling():

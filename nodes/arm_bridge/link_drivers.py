@@ -12,7 +12,7 @@ from flexsheet.nodes.arm_bridge.mxt import MxtLink
 Driver = Literal["modbus", "mxt", "lines"]
 
 TCP_DRIVERS: frozenset[Driver] = frozenset({"modbus", "lines"})
-"""Drivers whose controllers listen for TCP connections, which `flexsheet doctor` tries."""
+"""The drivers whose controllers listen for TCP connections, which `flexsheet doctor` checks."""
 
 _LINKS: dict[Driver, Any] = {"modbus": ModbusLink, "mxt": MxtLink, "lines": LineLink}
 
@@ -20,8 +20,9 @@ _LINKS: dict[Driver, Any] = {"modbus": ModbusLink, "mxt": MxtLink, "lines": Line
 def make_link(
     driver: Driver, host: str, port: int, timeout_s: float | None, *, with_currents: bool = False
 ) -> ArmLink:
-    """Create the link to an arm, without opening it; timeout_s None: the driver's default.
+    """Make the link to an arm, without opening a connection.
 
+    timeout_s: maximum time to wait for an answer; None: the driver's default.
     with_currents: whether to request the motor currents, which only MXT reports.
     """
     options: dict[str, Any] = {} if timeout_s is None else {"timeout_s": timeout_s}

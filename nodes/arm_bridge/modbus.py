@@ -83,7 +83,7 @@ FAULT_BITS = {
 
 
 def make_struct_format(block: Sequence[BlockField]) -> str:
-    """Return the block's format for Python's `struct`, big-endian."""
+    """Return the format of a register block for Python's `struct`, big-endian."""
     return ">" + "".join(f"{field.count}{field.kind}" for field in block)
 
 
@@ -101,7 +101,7 @@ _STATUS_REGISTERS = count_registers(STATUS)
 
 @dataclass(frozen=True, slots=True)
 class ModbusStatus(ArmStatus):
-    """Contents of a status block; `STATUS` describes the fields."""
+    """The contents of a status block; `STATUS` describes the fields."""
 
     accepted: int
     cycle: int
@@ -127,9 +127,11 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
 
 
 def decode_status(registers: Sequence[int]) -> ModbusStatus:
-    """Decode a status block; raises ArmAnswerError if it is invalid."""
+    """Decode a status block; raise ArmAnswerError if it is invalid."""
     if len(registers) != _STATUS_REGISTERS:
-        raise ArmAnswerError(f"status of {len(registers)} registers, expected {_STATUS_REGISTERS}")
+        raise ArmAnswerError(
+            f"the status has {len(registers)} registers instead of {_STATUS_REGISTERS}"
+        )
     whole = struct.pack(f">{len(registers)}H", *registers)
     magic, version, accepted, cycle, time_us, state, faults, *rest = struct.unpack(
         _STATUS_FORMAT, whole
@@ -137,16 +139,17 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
     *joints, refused, crc = rest
     if magic != MAGIC:
         raise ArmAnswerError(
-            f"status magic 0x{magic:04x}, expected 0x{MAGIC:04x}: unknown register map"
+            f"the status has the magic number 0x{magic:04x} instead of 0x{MAGIC:04x}, so its "
+            "register map is unknown"
         )
     if version != VERSION:
-        raise ArmAnswerError(f"register map version {version}, expected {VERSION}")
+        raise ArmAnswerError(f"the status has the register map version {version}, not {VERSION}")
     if crc != zlib.crc32(whole[:-4]):
-        raise ArmAnswerError("status block fails its CRC")
+        raise ArmAnswerError("the status block is damaged: its CRC is wrong")
     if state >= len(STATES):
-        raise ArmAnswerError(f"unknown arm state {state}")
+        raise ArmAnswerError(f"the status has the unknown arm state {state}")
     if not all(math.isfinite(angle) for angle in joints):
-        raise ArmAnswerError("measured joints are not finite")
+        raise ArmAnswerError("the measured joints are not finite")
     return ModbusStatus(
         accepted=accepted,
         cycle=cycle,
@@ -159,10 +162,9 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
 
 
 class _Framer(FramerSocket):
-    """Framer that fails the pending request when an answer cannot be decoded.
+    """A framer that fails the pending request if an answer cannot be decoded.
 
-    pymodbus itself raises the error into the event loop.  This ends the connection, prints a trace,
-    and lets the request wait for its time-out.
+    Without it, pymodbus raises the error in the event loop, and the request waits for its time-out.
     """
 
     def __init__(self, client: AsyncModbusTcpClient) -> None:
@@ -186,15 +188,15 @@ class _Framer(FramerSocket):
 
 
 class ModbusLink(ConnectedLink):
-    """Driver for one arm by one Modbus TCP connection.
+    """A driver for one arm that uses one Modbus TCP connection.
 
-    The connection is closed after any failure after which an answer can still arrive, because
-    pymodbus 3.16.1 can return a late answer to the next request.  Other wrong answers are detected
-    by their sequence number and CRC.
+    After a failure the connection is closed if an answer can still arrive, because pymodbus 3.16.1
+    can return a late answer to the next request.  Other wrong answers are detected by their
+    sequence number and CRC.
     """
 
-    def __init__(self, host: str, port: int, *, timeout_s: float = 0.03, **pauses: float) -> None:
-        super().__init__(host, port, timeout_s=timeout_s, **pauses)
+    def __init__(self, host: str, port: int, *, timeout_s: float = 0.03) -> None:
+        super().__init__(host, port, timeout_s=timeout_s)
         self._client: AsyncModbusTcpClient | None = None
         self._framer: _Framer | None = None
         self._sequence = 0
@@ -231,7 +233,9 @@ class ModbusLink(ConnectedLink):
             )
         except ModbusException as error:
             if self._framer is not None and self._framer.undecodable:
-                raise ArmAnswerError(f"answer of {self.host}:{self.port} is not Modbus") from error
+                raise ArmAnswerError(
+                    f"the answer of {self.host}:{self.port} is not Modbus"
+                ) from error
             raise ArmSilentError(
                 f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
             ) from error

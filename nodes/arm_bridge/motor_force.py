@@ -1,7 +1,7 @@
 """Estimate the pull of the sheet on an arm from the arm's motor currents.
 
-The difference of a current from that in the same pose without the sheet is proportional to a torque
-of the joint. Static friction of the gears adds an unknown torque of about a tenth of the rated one.
+A motor current minus the current in the same pose without the sheet is proportional to a torque of
+the joint. Static friction of the gears adds an unknown torque of about a tenth of the rated torque.
 The estimate therefore detects errors of the sheet's tension of several newtons, but is not precise
 enough to calibrate the sheet.
 """
@@ -24,13 +24,14 @@ Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 STEP_RAD = 1e-5
 MAX_SPEED_RAD_PER_S = 0.02
-"""Joint speed above which currents also depend on sliding friction and acceleration."""
+"""The maximum joint speed of a valid estimate.  At higher speeds, the currents also depend on
+sliding friction and acceleration."""
 
 PERIOD_NS = 50_000_000
 
 
 class MotorForceCalibration(LimitedModel):
-    """Constants that convert motor currents to a force; to measure them, see docs/force.md."""
+    """The constants that convert motor currents to a force (docs/force.md)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -38,7 +39,8 @@ class MotorForceCalibration(LimitedModel):
         description="torque of each joint per percent of its motor's rated current, N m"
     )
     unloaded_percent: Six = Field(
-        description="currents at the working pose without the sheet, percent of the rated currents"
+        description="motor currents at the working pose without the sheet, percent of the rated "
+        "currents"
     )
     friction_percent: Positive = Field(
         default=10.0,
@@ -55,12 +57,12 @@ def estimate_pull_n(
     *,
     forward: Callable[[Floats], Floats],
 ) -> tuple[float, float]:
-    """Return the pull on the edge towards the base, and its standard deviation, N.
+    """Return the pull on the edge and its standard deviation, N, by weighted least squares.
 
-    forward: function from joints (6,) rad to the flange's pose in the base (4, 4).
-    joints_rad, currents_percent: (6,). edge_flange_m: centre (3,) of the edge in the flange frame.
-    towards_base: direction of the pull, a unit vector (3,). The fit over the joints is by weighted
-    least squares.
+    joints_rad, currents_percent: joints (6,) rad and motor currents (6,), percent.
+    edge_flange_m: centre (3,) of the edge in the flange frame.
+    towards_base: direction of the pull, a unit vector (3,) in the base frame.
+    forward: function from joints (6,) rad to the flange's pose (4, 4) in the base frame.
     """
     at_edge = np.append(edge_flange_m, 1.0)
     edge_m = (forward(joints_rad) @ at_edge)[:3]
@@ -76,7 +78,7 @@ def estimate_pull_n(
 
 
 class MotorForceEstimator:
-    """Estimator of the sheet's pull on an arm, which gives up to 20 estimates per second."""
+    """An estimator of the sheet's pull on an arm, which returns up to 20 estimates per second."""
 
     def __init__(self, calibration: MotorForceCalibration, side: Side) -> None:
         self._calibration, self._side = calibration, side
@@ -93,7 +95,10 @@ class MotorForceEstimator:
         *,
         forward: Callable[[Floats], Floats],
     ) -> Force | None:
-        """Return the estimated force at `at_ns`; None if the last estimate is too recent."""
+        """Return the estimated force at `at_ns`; None if the last estimate is too recent.
+
+        The other arguments are those of `estimate_pull_n`.
+        """
         before_ns, before_rad = self._last_ns, self._last_rad
         if before_ns is not None and at_ns - before_ns < PERIOD_NS:
             return None

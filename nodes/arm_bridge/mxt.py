@@ -40,7 +40,7 @@ COMMAND_NONE, COMMAND_MOVE, COMMAND_END = 0, 1, 255
 TYPE_NONE, TYPE_JOINTS, TYPE_JOINTS_MEASURED, TYPE_CURRENTS_MEASURED = 0, 2, 8, 11
 
 MAX_PLAUSIBLE_RAD = 4.0 * math.pi
-"""Maximum plausible angle of a joint; an answer with a larger angle is invalid."""
+"""The maximum plausible angle of a joint.  An answer with a larger angle is invalid."""
 
 PACKET = (
     BlockField("command", "H", 1, "0 none, 1 move, 255 end"),
@@ -73,7 +73,7 @@ PACKET = (
 
 
 def make_struct_format(packet: Sequence[BlockField]) -> str:
-    """Return the packet's format for Python's `struct`: little-endian, without padding."""
+    """Return the format of a packet for Python's `struct`, little-endian without padding."""
     return "<" + "".join(f"{field.count}{field.kind}" for field in packet)
 
 
@@ -82,7 +82,10 @@ _PACKET = struct.Struct(make_struct_format(PACKET))
 
 @dataclass(frozen=True, slots=True)
 class MxtStatus(ArmStatus):
-    """Contents of an answer packet; count and timeouts are counters of the controller."""
+    """The contents of an answer packet.
+
+    count: number of communications of the controller.  timeouts: cycles without a command.
+    """
 
     count: int
     timeouts: int
@@ -91,8 +94,9 @@ class MxtStatus(ArmStatus):
 def encode(
     command: int, *, send_type: int = 0, data: Sequence[float] = (), with_currents: bool = False
 ) -> bytes:
-    """Encode a command packet whose answer contains the measured joints; data: up to 8 numbers.
+    """Encode a command packet that requests the measured joints.
 
+    send_type, data: type of the command's data, and up to 8 numbers.
     with_currents: whether to request the motor currents too.
     """
     padded = (*data, *([0.0] * (8 - len(data))))
@@ -101,7 +105,7 @@ def encode(
 
 
 def encode_joints(joints_rad: Floats, *, with_currents: bool = False) -> bytes:
-    """Encode a motion to joints (6,) rad; raises ValueError unless there are six finite ones."""
+    """Encode a motion to joints (6,) rad; raise ValueError unless there are six finite joints."""
     return encode(
         COMMAND_MOVE,
         send_type=TYPE_JOINTS,
@@ -111,9 +115,12 @@ def encode_joints(joints_rad: Floats, *, with_currents: bool = False) -> bytes:
 
 
 def decode_answer(packet: bytes) -> MxtStatus:
-    """Decode an answer; raises ArmAnswerError if it is invalid."""
+    """Decode an answer; raise ArmAnswerError if it is invalid.
+
+    Raises ArmRefusedError if the controller has ended external control.
+    """
     if len(packet) != PACKET_BYTES:
-        raise ArmAnswerError(f"answer of {len(packet)} bytes, expected {PACKET_BYTES}")
+        raise ArmAnswerError(f"the answer has {len(packet)} bytes instead of {PACKET_BYTES}")
     numbers = _PACKET.unpack(packet)
     (command, send_type, receive_type), data = numbers[:3], numbers[3:11]
     timeouts, count, monitor_type = numbers[18:21]
@@ -122,12 +129,12 @@ def decode_answer(packet: bytes) -> MxtStatus:
     # According to the manual, both fields contain the type of the answer's data.
     if {send_type, receive_type} - {TYPE_NONE} != {TYPE_JOINTS_MEASURED}:
         raise ArmAnswerError(
-            f"answer of types {send_type} and {receive_type}, expected {TYPE_JOINTS_MEASURED} "
-            "(measured joints)"
+            f"the answer has the data types {send_type} and {receive_type} instead of "
+            f"{TYPE_JOINTS_MEASURED} (measured joints)"
         )
     joints = np.array(data[:JOINTS])
     if not (np.abs(joints) <= MAX_PLAUSIBLE_RAD).all():
-        raise ArmAnswerError("measured joints are not angles: a value is too large or NaN")
+        raise ArmAnswerError("a measured joint is not an angle: its value is too large or NaN")
     currents = None
     if monitor_type == TYPE_CURRENTS_MEASURED:
         currents = np.array(numbers[21 : 21 + JOINTS], dtype=np.float64)
@@ -141,17 +148,18 @@ def decode_answer(packet: bytes) -> MxtStatus:
 
 
 def has_advanced(count: int, before: int, steps: int) -> bool:
-    """Return whether a 32-bit counter has advanced by at least `steps`, and not run backwards."""
+    """Return whether a 32-bit counter has advanced by at least `steps`."""
     return steps <= (count - before) % 2**32 < 2**31
 
 
 class MxtLink:
-    """`ArmLink` for a controller that runs an `Mxt` program.
+    """A driver for a controller that runs an `Mxt` program.
 
     The socket stays open, so that the controller always answers to the same port.  Late answers are
-    dropped before the next command.  Others are detected by the controller's counter, which must
-    advance by the number of commands since the last answer.  After a lost command, the next answer
-    is therefore dropped too.  The mode `idle` restarts the comparison of the counter.
+    detected by the controller's counter, which must advance by the number of commands since the
+    last answer.  After a lost command, the next answer is therefore dropped too.  The mode `idle`
+    restarts the comparison of the counter.
+    stale: number of late answers.
     """
 
     def __init__(
@@ -171,13 +179,13 @@ class MxtLink:
         self._unanswered = 0
 
     def due(self, now_ns: int) -> bool:
-        """Return True: UDP has no connection that would have to be opened first."""
+        """Return True, because UDP needs no connection."""
         return True
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> MxtStatus:
-        """Send one command and return the status that answers it; raises ArmLinkError.
+        """Send a command and return the arm's answer; raise ArmLinkError if this fails.
 
-        The controller answers in its own cycle, after up to CONTROLLER_CYCLE_S.
+        The controller answers within its cycle time CONTROLLER_CYCLE_S.
         """
         if mode == "idle":
             self._count, self._unanswered = None, 0
@@ -213,7 +221,7 @@ class MxtLink:
         return replace(status, freshness=freshness)
 
     async def _open(self) -> socket.socket:
-        """Return the socket; it is connected, so only the controller's packets reach it."""
+        """Return the socket, which is connected so that it receives only the controller's packets."""
         if self._socket is None:
             link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             link.setblocking(False)
@@ -245,7 +253,10 @@ class MxtLink:
             self.stale += 1
 
     def close(self) -> None:
-        """End external control; if the packet is lost, the controller's time-out ends it."""
+        """End external control.
+
+        If the packet is lost, the time-out of the controller ends external control.
+        """
         if self._socket is not None:
             with contextlib.suppress(OSError):
                 self._socket.send(encode(COMMAND_END))

@@ -1,4 +1,4 @@
-"""Move one edge of the sheet: convert the sheet's target to one arm's joints in each cycle."""
+"""Move one edge of the sheet by commands to one arm."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
 from flexsheet.nodes.node import Input, Node, Output, periodic
 
 MIN_SERVO_LAG_S = 0.002
-"""Minimum lag of an arm that is accepted as measured; no arm's servo is faster."""
+"""The minimum plausible value of a measured lag; no servo of an arm is faster."""
 
 CHECK_PERIOD_NS = 100_000_000
-"""Period of the self-checks of the arm, whose results are published once per second."""
+"""The period of the arm's self-checks.  Their results are published once per second."""
 
 
 class ArmBridge(Node):
-    """Send one arm's joints over its network, and publish the arm's measured state."""
+    """A node that sends commands to one arm, and publishes the arm's measured state."""
 
     opens_devices: ClassVar[bool] = True
     watched_inputs: ClassVar[frozenset[str]] = frozenset({"sheet_target", "other_arm"})
@@ -65,8 +65,8 @@ class ArmBridge(Node):
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
         return (
-            "it commands an arm, whose answers are in the bag only as this node's output; "
-            "`bag verify planner` checks the targets that it received"
+            "it commands an arm, and the bag does not contain the arm's answers as an input; "
+            "`bag verify planner` checks the targets that the arm received"
         )
 
     async def setup(self) -> None:
@@ -101,7 +101,7 @@ class ArmBridge(Node):
         self._cycling = asyncio.Lock()
 
     async def close(self) -> None:
-        """Send the arm a stop; if this fails, the arm's own watchdog stops it."""
+        """Send a stop to the arm; if this fails, the arm's own watchdog stops the arm."""
         async with self._cycling:
             self._geometry, joints_rad = None, self._control.commanded_rad
             try:
@@ -109,7 +109,7 @@ class ArmBridge(Node):
                     now_ns = self.clock.now_ns()
                     await self._link.exchange(mode="stop", joints_rad=joints_rad, now_ns=now_ns)
             except ArmLinkError as error:
-                self.log.warning("stop command not delivered to the arm", problem=str(error))
+                self.log.warning("the arm has not received the stop command", problem=str(error))
             self._link.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
@@ -126,7 +126,7 @@ class ArmBridge(Node):
         self._target_period = MeasuredPeriod(target_period_s)
 
     def _measure_target_period(self, source_ns: int) -> None:
-        """Measure the targets' period, unless it is a parameter; cameras may have other rates."""
+        """Measure the period of the targets, unless it is given by a parameter."""
         if self.parameters.target_period_s is not None:
             return
         period_s = self._target_period.add(source_ns)
@@ -138,14 +138,14 @@ class ArmBridge(Node):
         stamp_ns, now_ns = header.source_ns, self.clock.now_ns()
         clock_problem = self.estop.clock_problem
         if refusal := self._control.on_estop(estop, stamp_ns, now_ns, clock_problem):
-            self.log.warning("reset refused", reason=refusal)
+            self.log.warning("the reset of the e-stop is refused", reason=refusal)
 
     def on_arming(self, arming: Arming, header: Header) -> None:
         if refusal := self._control.on_arming(arming, self.arming.age_s()):
-            self.log.warning("arming refused", reason=refusal)
+            self.log.warning("the enabling of the arm is refused", reason=refusal)
 
     async def on_sheet_target(self, target: SheetTarget, header: Header) -> None:
-        """Send a command as soon as a target arrives, up to 7 ms before the next periodic one."""
+        """Send a command as soon as a target arrives, without waiting for the next period."""
         if self._geometry is not None:
             self._measure_target_period(header.source_ns)
         if self._control.is_idle:
@@ -207,7 +207,7 @@ class ArmBridge(Node):
         except ArmLinkError as error:
             self._failures += 1
             if control.on_exchange_failed(str(error), silent=isinstance(error, ArmSilentError)):
-                self.log.warning("arm lost", problem=str(error))
+                self.log.warning("the connection to the arm is lost", problem=str(error))
             return
         last.on_answer(self.clock.now_ns())
         control.on_measurement(status.joints_rad, status.faults, status.freshness)
@@ -255,9 +255,9 @@ class ArmBridge(Node):
             self.arm_latency.publish(ArmLatency(side=self.parameters.side, latency_s=latency_s))
 
     def _read_goal(self, trajectory: SheetTrajectory | None) -> Goal | None:
-        """Return the newest sheet target, moved to the time at which this command takes effect.
+        """Return the newest sheet target at the time at which the next command takes effect.
 
-        trajectory: trajectory of the target, if the other arm follows it too.
+        trajectory: trajectory of the target if the other arm follows it too, otherwise None.
         """
         target = self.sheet_target.message
         if target is None:

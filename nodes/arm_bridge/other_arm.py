@@ -1,4 +1,4 @@
-"""Represent the other arm of the sheet by the state that its node publishes."""
+"""Represent the arm at the other edge of the sheet by the state that its node publishes."""
 
 from __future__ import annotations
 
@@ -16,24 +16,25 @@ from flexsheet.nodes.models.rigid import is_rigid
 Floats = NDArray[np.float64]
 
 MAX_FUTURE_S = 0.02
-"""Maximum time by which a state's timestamp may lie in the future; errors of clock offsets are
-smaller.  Without this limit, such a state would count as fresh until that time."""
+"""The maximum time by which the timestamp of a state may lie in the future.  Errors of the clock
+offsets are smaller."""
 
 MAX_TARGET_DIFFERENCE_NS = round(1e9 * MAX_TRAJECTORY_S)
-"""Maximum time between the camera exposures of two targets with overlapping trajectories."""
+"""The maximum time between the camera exposures of two targets whose trajectories overlap."""
 
 MAX_TRAJECTORY_END_NS = round(1e9 * (MAX_PREDICTION_S + MAX_TRAJECTORY_S))
-"""Maximum time from the camera exposure of a target to the end of its trajectory."""
+"""The maximum time from the camera exposure of a target to the end of its trajectory."""
 
 
 @dataclass(frozen=True)
 class OtherArm:
-    """State of the other arm: joints (6,) rad, world poses (4, 4), mode, faults, and its age.
+    """The state of the other arm: joints (6,) rad, world poses (4, 4), mode, faults and age.
 
-    ready: whether the other arm may move.  estop_engaged: whether its node has latched an e-stop.
+    ready: whether the other arm may move.
+    estop_engaged: whether the other arm's bridge has latched an e-stop.
     agrees: whether the other arm may follow the trajectory of the same or an adjacent target.  The
         age is then counted from the end of that trajectory.
-    ended: whether the other arm's bridge has ended since this state; it then does not agree.
+    ended: whether the other arm's bridge has ended since this state.
     """
 
     joints_rad: Floats
@@ -57,8 +58,9 @@ class OtherArm:
         now_ns: int = 0,
         ended: bool = False,
     ) -> OtherArm:
-        """Convert a message from the other arm's node, which is `age_s` old.
+        """Convert a message of the other arm's bridge.
 
+        age_s: age of the message.
         target_source_ns: time of the camera exposure from which this arm's target was computed.
         """
         other_ns = state.target_source_ns
@@ -91,12 +93,12 @@ class OtherArm:
         if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):
             return "its flange is not a rigid pose"
         if self.age_s < -MAX_FUTURE_S:
-            return f"it is stamped {-self.age_s:.3g} s in the future"
+            return f"its timestamp is {-self.age_s:.3g} s in the future"
         return None
 
     @property
     def estopped(self) -> bool:
-        """Return whether an e-stop is engaged; no arm then moves, not even to slacken the sheet."""
+        """Return whether an e-stop is engaged; no arm may then move."""
         return self.mode == "estop" or self.estop_engaged
 
     @property

@@ -15,7 +15,7 @@ from flexsheet.nodes.parameter_marks import DeviceHost, DevicePort
 
 
 class ArmBridgeParameters(NodeParameters):
-    """Parameters of `arm_bridge`."""
+    """The parameters of an arm bridge."""
 
     side: Side = Field(description="arm of the scene that this bridge commands")
     host: DeviceHost = Field(default="127.0.0.1", description="address of the arm's controller")
@@ -28,23 +28,25 @@ class ArmBridgeParameters(NodeParameters):
     )
     driver: Driver = Field(default="modbus", description="protocol of the arm's controller")
     timeout_s: Positive | None = Field(
-        default=None, description="maximum wait for the arm's answer, s; null: the driver's default"
+        default=None,
+        description="maximum time to wait for the arm's answer, s; null: the driver's default",
     )
     servo_lag_s: NonNegative = Field(
         default=0.03,
-        description="lag of the arm behind commands of constant velocity, s; with "
-        "measure_servo_lag, the value until the lag is measured",
+        description="lag of the arm behind commands of constant velocity, s. With "
+        "measure_servo_lag, it is the initial value",
     )
     measure_servo_lag: bool = Field(
-        default=True, description="measure the arm's lag while it moves, and use the measured value"
+        default=True,
+        description="whether to measure the arm's lag while it moves, and use the measured value",
     )
     max_servo_lag_s: Positive = Field(
         default=0.1, description="maximum lag of the arm that is measured and used, s"
     )
     target_period_s: Positive | None = Field(
         default=None,
-        description="period of the sheet targets, s; null: it is measured, and until then that of "
-        "the camera in the scene",
+        description="period of the sheet targets, s; null: the measured period; its initial value "
+        "is the period of the camera in the scene",
     )
     hold_after_s: Positive = Field(
         default=0.02,
@@ -65,17 +67,21 @@ class ArmBridgeParameters(NodeParameters):
     )
     arming: Literal["manual", "auto"] = Field(
         default="manual",
-        description="manual: the operator enables the arm's motion with `flexsheet arms enable`, "
-        "at first and after each stop; auto: it enables itself, only for simulated arms",
+        description="manual: the operator enables the arm's motion with `flexsheet arms enable` "
+        "after the start and after each stop; auto: the arm is enabled automatically, which is "
+        "permitted only for simulated arms",
     )
     motor_force: MotorForceCalibration | None = Field(
         default=None,
-        description="publish the sheet's pull, estimated from the motor currents, as topic force; "
-        "only with driver mxt; null: the currents are not requested",
+        description="calibration for the estimate of the sheet's pull from the motor currents, "
+        "which is published as topic force; only for the driver mxt; null: no estimate",
     )
 
     @model_validator(mode="after")
     def _check_motor_force(self) -> Self:
         if self.motor_force is not None and self.driver != "mxt":
-            raise ValueError(f"motor_force requires driver mxt: {self.driver} has no currents")
+            raise ValueError(
+                f"motor_force requires driver mxt, because {self.driver} reports no motor currents; "
+                "remove motor_force or change the driver"
+            )
         return self

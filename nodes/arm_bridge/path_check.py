@@ -1,9 +1,9 @@
 """Check before a motion whether both arms can move the sheet to its target.
 
-Each arm's node receives both arms' joints.  It simulates the sheet's motion and checks at each pose
-whether both arms are within their limits.  A check needs some milliseconds and therefore runs
-outside the cycle that sends commands.  If necessary, the arms first align: they move from their
-positions to joints at which the sheet is flat and on the path.
+The bridge of each arm receives the joints of both arms.  It simulates the sheet's motion and checks
+at each pose whether both arms are within their limits.  A check takes some milliseconds and
+therefore runs outside the cycle that sends commands.  If necessary, the arms are first aligned:
+they move to joints at which the sheet is flat and on the path.
 """
 
 from __future__ import annotations
@@ -48,37 +48,39 @@ START_BOUNDS = SheetBounds(
 
 REHEARSAL_STEP_S = 0.05
 MAX_REHEARSAL_S = 60.0
-"""Maximum duration of a simulated motion.  With START_BOUNDS, crossing the workspace takes less."""
+"""The maximum duration of a simulated motion.  A motion across the workspace with START_BOUNDS
+takes less time."""
 
 CORNER_EVERY = 4
-"""Number of simulated steps between two corners of the checked path.  Straight lines between the
-corners deviate from the motion by less than 1 mm."""
+"""The number of simulated steps between two corners of the checked path.  Straight lines between
+the corners deviate from the motion by less than 1 mm."""
 
 NEAR_M, NEAR_RAD, NEAR_STRETCH = 0.03, 0.2, 0.02
-"""Distance from the checked target up to which the check is also valid for a newer target."""
+"""The distances from the checked target up to which a check is also valid for a newer target."""
 
 MAX_START_MOTION_RAD = 0.002
-"""Joint motion since a check up to which the check remains valid."""
+"""The joint motion since a check up to which the check remains valid."""
 
 ALIGN_FRACTIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""Fractions of the path to which the arms may align; the first feasible one is used."""
+"""The fractions of the path to which the arms may align.  The first feasible fraction is used."""
 
 MAX_ALIGN_STEP_RAD = 0.02
-"""Maximum change of a joint between two checked points of an alignment."""
+"""The maximum change of a joint between two checked points of an alignment."""
 
 MAX_ALIGN_RAD = 1.0
-"""Maximum joint motion of an alignment; a larger one would change the branch of joint solutions."""
+"""The maximum joint motion of an alignment.  A larger motion would change the branch of joint
+solutions."""
 
 ALIGN_SPEED_M_PER_S, ALIGN_SPEED_RAD_PER_S = 0.06, 0.5
-"""Maximum speed of any point of an edge, and of any joint, during an alignment."""
+"""The maximum speeds of the points of an edge and of the joints during an alignment."""
 
 PEAK_TO_MEAN_SPEED = 1.5
-"""Ratio of the largest to the mean speed of the smoothstep 3 x^2 - 2 x^3."""
+"""The ratio of the maximum speed to the mean speed of the smoothstep 3 x^2 - 2 x^3."""
 
 
 @dataclass(frozen=True, slots=True)
 class PathCheckRequest:
-    """Path to check: the sheet's start and target, and both arms' joints (6,) rad."""
+    """A path to check: start and target of the sheet, and joints (6,) rad of both arms."""
 
     start: SheetMotion
     goal: SheetMotion
@@ -94,21 +96,21 @@ class PathCheckRequest:
         return moved_rad <= MAX_START_MOTION_RAD
 
     def leads_to(self, target: SheetMotion) -> bool:
-        """Return whether a target that has moved since the check is still near the path's end."""
+        """Return whether a newer target is near the target of the checked path."""
         distance_m, angle_rad = measure_distance(self.goal, target)
         stretch = abs(target.stretch_ratio - self.goal.stretch_ratio)
         return distance_m <= NEAR_M and angle_rad <= NEAR_RAD and stretch <= NEAR_STRETCH
 
 
 def measure_distance(sheet: SheetMotion, target: SheetMotion) -> tuple[float, float]:
-    """Return distance (m) and angle (rad) between two sheet poses."""
+    """Return the distance (m) and the angle (rad) between two poses of the sheet."""
     rotation = target.world_from_sheet[:3, :3] @ sheet.world_from_sheet[:3, :3].T
     offset = target.world_from_sheet[:3, 3] - sheet.world_from_sheet[:3, 3]
     return float(np.linalg.norm(offset)), float(np.linalg.norm(vector_from_rotation(rotation)))
 
 
 def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[SheetMotion]:
-    """Simulate the sheet's motion from the start to a resting goal; return points on its path."""
+    """Simulate the sheet's motion from the start to a goal at rest; return points of its path."""
     resting = replace(goal, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
     sheet, corners = start, [start]
     for step in range(1, round(MAX_REHEARSAL_S / REHEARSAL_STEP_S)):
@@ -126,10 +128,10 @@ def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[Sh
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Straight motion of an arm's joints from its position onto the sheet's path.
+    """A straight joint motion of one arm from its position to the path of the sheet.
 
-    It is necessary after a fault.  The arms may then have stopped with a twisted or skewed sheet,
-    or at the end of a joint's range, so that their joints correspond to no pose of a flat sheet.
+    An alignment is necessary if the arms have stopped with a twisted sheet, or at the end of a
+    joint's range.  Their joints then do not correspond to a pose of a flat sheet.
 
     sheet: first pose on the path that both arms can reach.
     from_rad, to_rad: this arm's joints (6,) at start and end.
@@ -149,10 +151,7 @@ class Alignment:
 
 
 def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> Alignment | str:
-    """Return the alignment of this arm to the path, or the reason why an arm cannot follow it.
-
-    The reason names the arm, the limit and the position.
-    """
+    """Return the alignment of this arm to the path, or a text why an arm cannot follow the path."""
     left, right = (arm, other) if arm.left else (other, arm)
     if not (is_rigid(request.start.world_from_sheet) and is_rigid(request.goal.world_from_sheet)):
         return (
@@ -192,9 +191,9 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
 def _check_alignment(
     left: ArmGeometry, right: ArmGeometry, begin: PathStep, there: PathStep
 ) -> None:
-    """Raise PathError unless both arms' joints can move straight from `begin` to `there`.
+    """Raise PathError unless the joints of both arms can move straight from `begin` to `there`.
 
-    The sheet's limits apply to the whole motion, widened where the start exceeds them.
+    Limits of the sheet that the start exceeds are widened.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)
@@ -213,7 +212,7 @@ def _check_alignment(
                 poses[1], poses[3], left=arm.left, limits=limits[number]
             )
             if violation is None and max_change_rad > MAX_ALIGN_RAD:
-                violation = "its joints would jump onto the path"
+                violation = "its joints are too far from the path of the sheet"
             if violation is not None:
                 raise PathError(
                     violation,
@@ -242,7 +241,7 @@ def _find_duration_s(
 
 
 class PathChecker:
-    """Runner of path checks in a thread, one at a time, while command cycles continue."""
+    """A runner of path checks in a thread, one at a time."""
 
     def __init__(self, arm: ArmGeometry, other: ArmGeometry) -> None:
         self._arm, self._other = arm, other
@@ -253,7 +252,7 @@ class PathChecker:
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
         """Return a finished request with its result, or None; must be called in every cycle.
 
-        request: check to start unless a check is already running; None: no check is wanted.
+        request: check to start unless another check is running; None: start no check.
         """
         if self._running is None:
             if request is not None:

@@ -1,4 +1,4 @@
-"""Build the messages that an arm's node publishes: the arm's state, and its mean latency."""
+"""Compute the state of an arm and its mean latency for the messages of an arm bridge."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.models.servo_lag import ServoLagEstimator
 
 REPORTED_TARGETS = 12
-"""Number of targets in one reported mean: at 60 Hz, five reports per second."""
+"""The number of targets in one reported mean.  At 60 Hz, there are five reports per second."""
 
 
 @dataclass(slots=True)
 class LastExchange:
-    """Times of the newest exchange with the arm, ns on this computer's clock; 0: never.
+    """The times of the newest exchange with the arm, ns on this computer's clock; 0: never.
 
     target, received_ns: header and arrival of the sheet target from which the command was computed.
-    trajectory_ends_ns: time of the last command that follows that target's trajectory; 0: none.
+    trajectory_ends_ns: end of the target's trajectory; 0 without a trajectory.
     sent_ns, measured_ns: times of the last command and of the last answer.
+    duration_s: duration of the last exchange.
     """
 
     target: Header | None = None
@@ -37,14 +38,17 @@ class LastExchange:
 
 
 class LatencyMean:
-    """Mean latency from the camera exposure of each new target until the arm has moved to it."""
+    """The mean latency from the camera exposure of a target until the arm has moved."""
 
     def __init__(self) -> None:
         self._target: Header | None = None
         self._sum_s, self._count = 0.0, 0
 
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
-        """Add the first exchange with a target; return the mean (s) once per REPORTED_TARGETS."""
+        """Add an exchange, unless its target was already added.
+
+        Return the mean latency (s) after every REPORTED_TARGETS targets, otherwise None.
+        """
         target, before = exchange.target, self._target
         self._target = target
         if target is None or target is before or lag.estimate is None:
@@ -66,7 +70,7 @@ def make_arm_state(
     lag: ServoLagEstimator,
     now_ns: int,
 ) -> ArmState:
-    """Make the state message of an arm that has been measured at least once."""
+    """Make the state message of an arm that has answered at least once."""
     measured = control.last_measured_rad
     assert measured is not None
     if other is not None and other.invalid_reason is not None:

@@ -9,17 +9,20 @@ from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.models.servo_lag import LagEstimate
 
 LAG_THRESHOLD_S = 0.01
-"""Deviation from the configured lag above which it is suspected to be wrong: five standard
-deviations of a calibrated lag (2 ms)."""
+"""The maximum deviation of the measured lag from the configured lag: five standard deviations of a
+calibrated lag (2 ms)."""
 
 TRACKING_THRESHOLD_RAD = 0.005
-"""Excess of the tracking error over the error of an ideal servo with the measured lag, above which
-the arm is suspected not to follow.  It is 2 mm at 0.4 m, four times the effect of the largest
-tabulated backlash (0.6 mrad per joint)."""
+"""The maximum excess of the tracking error over the error of an ideal servo with the measured lag.
+It corresponds to 2 mm at 0.4 m: four times the effect of the largest tabulated backlash (0.6 mrad
+per joint)."""
 
 
 class ServoCheck:
-    """Self-checks of one arm, which use the estimates of its lag."""
+    """The self-checks of one arm that use estimates of the arm's lag.
+
+    configured_lag_s: lag of the arm in the parameters.
+    """
 
     def __init__(self, side: Side, configured_lag_s: float) -> None:
         self._side, self._configured_lag_s = side, configured_lag_s
@@ -30,10 +33,10 @@ class ServoCheck:
     def update(
         self, estimate: LagEstimate | None, round_trip_s: float, at_ns: int
     ) -> tuple[SelfCheck, ...]:
-        """Add the newest estimate of the lag; return the checks that have enough data.
+        """Add the newest estimate of the lag, and return the checks that have enough data.
 
-        round_trip_s: time from a command to its answer. The arm reads its joints at an unknown time
-        in between, so half of it may be an error of the estimate, as on an overloaded computer.
+        round_trip_s: time from a command to its answer. The estimate may be wrong by half of this
+        time, because the arm reads its joints at an unknown time in between.
         """
         if estimate is not None:
             deviation_s = estimate.lag_s - self._configured_lag_s

@@ -1,4 +1,4 @@
-"""Detect from an arm's measured joints whether it stands still; repeated answers do not count."""
+"""Detect from an arm's measured joints whether the arm stands still."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from flexsheet.nodes.arm_bridge.link import Freshness
 Floats = NDArray[np.float64]
 
 STANDSTILL_COUNT = 5
-"""Number of fresh, unchanged measurements in a row that show a standstill."""
+"""The number of consecutive fresh, unchanged measurements that show a standstill."""
 
 SETTLED_COUNT = 100
-"""The same number for an arm that is not at its last command.  It is large enough for measurements
-that lag by 0.7 s."""
+"""The number of consecutive fresh, unchanged measurements that show a standstill of an arm that is
+not at its last command.  It is sufficient for measurements that lag by 0.7 s."""
 
 STANDSTILL_RAD = 1e-3
-"""Maximum difference of measurements that count as unchanged, 200 times the encoder noise."""
+"""The maximum difference of unchanged measurements: 200 times the encoder noise."""
 
 MAX_RESTART_SHIFT_M = 0.005
-"""Maximum distance between commanded and measured edge at which the arm may restart from the
-measurement.  Joint servos with a lag of 15 ms or more cover it with less than 0.25 m/s."""
+"""The maximum distance between the commanded and the measured edge from which the arm may restart
+at the measured position.  Joint servos with a lag of 15 ms or more move there with less than 0.25
+m/s.
+"""
 
 JUMP_MARGIN_RAD = 0.002
 JUMP_SPEED_RAD_PER_S = 0.5
-"""Step and speed by which measurements may change without a command, because the operator may move
-the arm with its teach pendant."""
+"""The step and the speed by which measurements may change without a command, because the operator
+may move the arm with its teach pendant."""
 
 OVERSPEED = 1.5
-"""Factor by which an arm may exceed its commanded speed while it catches up."""
+"""The factor by which an arm may exceed its commanded speed while it catches up."""
 
 MEMORY_S = 0.1
-"""Time constant with which recent commanded speeds and joints are forgotten."""
+"""The time constant with which the ranges of recent commanded speeds and joints decay."""
 
 ON_PATH_RAD = 0.005
-"""Distance from the recently commanded joints within which any measurement is plausible."""
+"""The distance from the recently commanded joints within which every measurement is plausible."""
 
 
 class StandstillMonitor:
-    """Counter of fresh, unchanged measurements since the last command that moved the arm.
+    """A counter of fresh, unchanged measurements since the last command that moved the arm.
 
-    is_alive: whether measurements differ in the last digits, as those of encoders do.  A frozen
-        reading repeats itself exactly.
     has_jumped: whether measurements have changed faster than the arm can move.
     """
 
@@ -55,27 +55,30 @@ class StandstillMonitor:
         self._lowest_rad, self._highest_rad = np.full(6, np.inf), np.full(6, -np.inf)
 
     def is_standing(self, *, at_command: bool) -> bool:
-        """Return whether the arm is at rest; at_command: whether it is at its last command."""
+        """Return whether the arm is at rest.
+
+        at_command: whether the measured joints are at the last command.
+        """
         return self._count >= (STANDSTILL_COUNT if at_command else SETTLED_COUNT)
 
     @property
     def is_alive(self) -> bool:
-        """Return whether the measurements show the noise of encoders."""
+        """Return whether the measurements show encoder noise; a frozen measurement does not."""
         return self._alive
 
     def restart(self) -> None:
-        """Count measurements from zero again, after a motion."""
+        """Restart the count of measurements after a motion."""
         self._count, self._alive = 0, False
 
     def forget(self) -> None:
-        """Forget the position too, after a gap in the measurements."""
+        """Discard the count and the last position after a gap in the measurements."""
         self.restart()
         self._last_rad = np.full(6, np.nan)
 
     def on_command(self, joints_rad: Floats, velocity_rad_per_s: Floats, step_s: float) -> None:
-        """Update the monitor after a command that is valid for `step_s`.
+        """Update the monitor after a command that covers `step_s`.
 
-        joints_rad (6,): commanded joint angles. velocity_rad_per_s (6,): their velocities.
+        joints_rad: commanded joints (6,). velocity_rad_per_s: commanded joint velocities (6,).
         """
         self._elapsed_s += step_s
         speeds = np.abs(velocity_rad_per_s)
@@ -92,7 +95,7 @@ class StandstillMonitor:
             self.restart()
 
     def on_measurement(self, joints_rad: Floats, freshness: Freshness) -> None:
-        """Update from measured joints (6,) rad."""
+        """Update the monitor after a measurement of the joints (6,) rad."""
         if freshness == Freshness.REPEATED:
             return
         if not freshness.is_usable:

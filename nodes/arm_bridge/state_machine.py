@@ -1,8 +1,4 @@
-"""Define the states and events of an arm's control, and the table of all transitions.
-
-`ArmControl` changes its state only through `TRANSITIONS`.  docs/arms.md renders the table, and
-tests/test_arm_state_machine.py checks every pair of state and event.
-"""
+"""Define the states and events of an arm's control, and the table of all transitions."""
 
 from __future__ import annotations
 
@@ -13,9 +9,9 @@ from flexsheet.messages.types import ArmMode
 
 
 class State(Enum):
-    """States of an arm's control, with their descriptions for the documentation.
+    """The states of an arm's control, with their descriptions for the documentation.
 
-    In states `..._TAUT` an earlier motion may have stretched the sheet, so the arm may slacken it.
+    In states `..._TAUT` the sheet may be stretched, and the arm may slacken the sheet.
     """
 
     STARTING = "the arm has not answered since its bridge started"
@@ -38,7 +34,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """Events of an arm's control, with their descriptions for the documentation."""
+    """The events of an arm's control, with their descriptions for the documentation."""
 
     CONNECTION_LOST = "two exchanges without an answer, or an invalid answer"
     CONNECTED = "the arm has answered"
@@ -74,9 +70,9 @@ RELAXING = frozenset({S.RELAX})
 
 CHECKING_STATES = frozenset({S.CHECKING, S.CHECKING_TAUT})
 READY_STATES = ARMED_AT_REST | TRACKING | PAUSING_STATES
-"""States in which the arm is armed by the operator or by `arming: auto`."""
+"""The states in which the arm is armed and may move."""
 MOTION_STATES = TRACKING | PAUSING_STATES | STOPPING_STATES | RELAXING
-"""States in which commands may change the joints."""
+"""The states in which commands may change the joints."""
 
 MODES: Mapping[State, ArmMode] = {
     S.STARTING: "starting",
@@ -97,13 +93,16 @@ MODES: Mapping[State, ArmMode] = {
     S.STOPPING_TAUT: "stopping",
     S.RELAX: "relax",
 }
-"""Mode that is published for each state; for TAUT with a latched fault it is `fault`."""
+"""The mode that is published for each state.  With a latched fault, the mode of TAUT is `fault`."""
 
 Row = dict[tuple[State, Event], State | None]
 
 
 def _row(event: Event, to: Mapping[State, State], *ignored_in: Iterable[State]) -> Row:
-    """Return the transitions of one event; raises ValueError for a state that is given twice."""
+    """Return the transitions of one event; raise ValueError if a state is given twice.
+
+    to: next state by state.  ignored_in: groups of states that ignore the event.
+    """
     ignored = [state for group in ignored_in for state in group]
     row: Row = {(state, event): None for state in ignored} | {
         (state, event): target for state, target in to.items()
@@ -359,4 +358,4 @@ TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
         RELAXING,
     ),
 }
-"""Next state by state and event; None: the event is ignored in that state."""
+"""The next state for each pair of state and event; None: the state ignores the event."""
