@@ -335,7 +335,7 @@ def test_a_target_that_makes_no_sense_is_a_fault(motion: SheetMotion, words: str
     ("motion", "words"),
     [
         (sheet_at(z=0.29), "outside the workspace|reach|joint ranges"),
-        (sheet_at(stretch=1.2), "sheet of|edge force"),
+        (sheet_at(stretch=1.2), "the sheet is|edge force"),
     ],
 )
 def test_a_target_past_the_limits_stops_both_within_them(motion: SheetMotion, words: str) -> None:

@@ -203,8 +203,8 @@ async def test_a_status_that_is_repeated_makes_no_arm_leap(
         ("silent", "no answer"),
         ("slow", "no answer"),
         ("exception", "Modbus exception 4"),
-        ("bad_crc", "fails its CRC"),
-        ("old_version", "register map version 0, expected 1"),
+        ("bad_crc", "its CRC is wrong"),
+        ("old_version", "register map version 0, not 1"),
         ("repeated", "answer to command"),
     ],
 )

@@ -74,9 +74,9 @@ def test_a_sound_status_is_decoded() -> None:
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"magic": 0x1234}, "magic 0x1234, expected 0x4653"),
-        ({"version": 2}, "register map version 2, expected 1"),
-        ({"crc": 1}, "fails its CRC"),
+        ({"magic": 0x1234}, "magic number 0x1234 instead of 0x4653"),
+        ({"version": 2}, "register map version 2, not 1"),
+        ({"crc": 1}, "its CRC is wrong"),
         ({"state": 9}, "unknown arm state 9"),
         ({"j3": float("nan")}, "not finite"),
     ],
@@ -87,7 +87,7 @@ def test_an_unsound_status_is_rejected(changed: dict[str, int | float], words: s
 
 
 def test_a_status_of_another_length_is_rejected() -> None:
-    with pytest.raises(ArmAnswerError, match="status of 3 registers"):
+    with pytest.raises(ArmAnswerError, match="the status has 3 registers"):
         decode_status([1, 2, 3])
 
 

@@ -124,14 +124,14 @@ def test_a_sound_answer_is_decoded() -> None:
 @pytest.mark.parametrize(
     ("packet", "words"),
     [
-        (b"", "answer of 0 bytes"),
-        (answer()[:-1], "answer of 195 bytes"),
-        (answer() + b"x", "answer of 197 bytes"),
-        (bytes(312), "answer of 312 bytes"),
+        (b"", "the answer has 0 bytes"),
+        (answer()[:-1], "the answer has 195 bytes"),
+        (answer() + b"x", "the answer has 197 bytes"),
+        (bytes(312), "the answer has 312 bytes"),
         (answer(types=(2, 8)), "types 2 and 8"),
         (answer(types=(0, 0)), "types 0 and 0"),
-        (answer(joints=(0, 0, float("nan"), 0, 0, 0)), "not angles"),
-        (answer(joints=(0, 0, 0, 0, 0, 1e6)), "not angles"),
+        (answer(joints=(0, 0, float("nan"), 0, 0, 0)), "is not an angle"),
+        (answer(joints=(0, 0, 0, 0, 0, 1e6)), "is not an angle"),
     ],
 )
 def test_an_unsound_answer_is_rejected(packet: bytes, words: str) -> None:
@@ -382,7 +382,7 @@ async def test_closing_ends_external_control() -> None:
         ("silent", ArmSilentError, "no answer from .* within 30 ms"),
         ("slow", ArmSilentError, "no answer from .* within 30 ms"),
         ("exception", ArmAnswerError, "types 3 and 3"),
-        ("bad_crc", ArmAnswerError, "answer of 192 bytes"),
+        ("bad_crc", ArmAnswerError, "the answer has 192 bytes"),
         ("repeated", ArmSilentError, "no answer"),
     ],
 )

@@ -363,8 +363,8 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
     skew_rad = angle_between(across if left else -across, edge[:3, 0])
     if not skew_rad <= limits.max_twist_rad:
         return (
-            f"the edge is skewed by {np.degrees(skew_rad):.1f} degrees relative to the line between "
-            f"both edges, maximum {np.degrees(limits.max_twist_rad):.1f}"
+            f"the edge is skewed by {np.degrees(skew_rad):.1f} degrees relative to the line "
+            f"between both edges, maximum {np.degrees(limits.max_twist_rad):.1f}"
         )
     return None
 

@@ -221,7 +221,7 @@ class MxtLink:
         return replace(status, freshness=freshness)
 
     async def _open(self) -> socket.socket:
-        """Return the socket, which is connected so that it receives only the controller's packets."""
+        """Return the connected socket, which receives only the controller's packets."""
         if self._socket is None:
             link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             link.setblocking(False)

@@ -81,7 +81,7 @@ class ArmBridgeParameters(NodeParameters):
     def _check_motor_force(self) -> Self:
         if self.motor_force is not None and self.driver != "mxt":
             raise ValueError(
-                f"motor_force requires driver mxt, because {self.driver} reports no motor currents; "
+                f"motor_force requires driver mxt, because {self.driver} has no motor currents; "
                 "remove motor_force or change the driver"
             )
         return self
