@@ -170,13 +170,17 @@ def edge(x: float, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Floats:
     [
         (edge(-0.125), edge(0.125), None),
         (edge(-0.11), edge(0.11), None),
-        (edge(-0.135), edge(0.135), "sheet of 270.0 mm, at most 260.4 mm"),
-        (edge(-0.13015), edge(0.13015), "edge force 20"),
-        (edge(-0.125, (0.3, 0.0, 0.0)), edge(0.125), "edges rotated by 17.2 degrees"),
+        (edge(-0.135), edge(0.135), "the sheet is 270.0 mm long, maximum 260.4 mm"),
+        (edge(-0.13015), edge(0.13015), "the edge force is 20"),
+        (
+            edge(-0.125, (0.3, 0.0, 0.0)),
+            edge(0.125),
+            "the edges are rotated relative to each other by 17.2 degrees",
+        ),
         (
             edge(-0.125, (0.0, 0.0, 0.25)),
             edge(0.125, (0.0, 0.0, 0.25)),
-            "edge skewed by 14.3 degrees",
+            "the edge is skewed by 14.3 degrees",
         ),
     ],
 )

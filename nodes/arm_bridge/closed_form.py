@@ -326,7 +326,6 @@ class ClosedFormKinematics:
     def _unreachable(
         self, base_from_flange: Floats, solutions: list[tuple[float, ...]]
     ) -> UnreachableError:
-        """Make the error for a pose for which no solution is within the joint ranges."""
         # Adding zero turns a negative zero into zero.
         x, y, z = np.round(base_from_flange[:3, 3] * 1e3) + 0.0
         where = f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base"

@@ -299,7 +299,6 @@ class ArmControl:
             self.faults = tuple(f"arm: {FAULT_TEXTS[fault]}" for fault in arm_faults)
 
     def _restart_idle(self) -> None:
-        """Discard the motion, and restart the arm's controller by the mode `idle`."""
         self._discard_motion()
         self._standstill.restart()
         self._must_idle = True
@@ -646,7 +645,6 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """Start the motion along a checked path with the measured joints as first command."""
         self.handle(Event.PATH_CLEAR)
         self._sheet = sheet if alignment is None else alignment.sheet
         self._alignment, self._aligned_s = alignment, 0.0
@@ -716,7 +714,6 @@ class ArmControl:
         return self._command_joints(goal_rad, geometry, other, step_s)
 
     def _limits(self, geometry: ArmGeometry) -> SheetLimits:
-        """Return the present limits of the sheet; during an alignment they are wider."""
         return geometry.sheet_limits if self._alignment is None else self._relaxed_limits
 
     def _command_joints(
@@ -938,13 +935,11 @@ class ArmControl:
 
 
 def _find_late_note(goal: Goal, other: OtherArm) -> NodeNote:
-    """Return the note that explains a late sheet target or a late state of the other arm."""
     if goal.planner_ended:
         return NodeNote.PLANNER_ENDED
     return NodeNote.OTHER_BRIDGE_ENDED if other.ended else NodeNote.TARGET_OR_ARM_LATE
 
 
 def _is_valid(motion: SheetMotion) -> bool:
-    """Return whether a target has a rigid pose and finite rates."""
     rates = (*motion.twist_world, motion.stretch_ratio, motion.stretch_rate_per_s)
     return is_rigid(motion.world_from_sheet) and bool(np.isfinite(rates).all())

@@ -284,7 +284,6 @@ def bound_step(
 
 
 def _longest(shifts: Floats) -> float:
-    """Return the length of the longest of vectors (n, 3)."""
     return math.sqrt(float((shifts * shifts).sum(axis=1).max()))
 
 
@@ -333,7 +332,6 @@ def relax_limits(
 
 
 def _twist(edge: Floats, other_edge: Floats) -> float:
-    """Return the angle (rad) between the orientations of two edges."""
     # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2).
     apart = (other_edge[:3, :3] - edge[:3, :3]).ravel()
     return 2.0 * math.asin(min(1.0, math.sqrt(float(apart @ apart) / 8.0)))

@@ -126,7 +126,6 @@ class ArmBridge(Node):
         self._target_period = MeasuredPeriod(target_period_s)
 
     def _measure_target_period(self, source_ns: int) -> None:
-        """Measure the period of the targets, unless it is given by a parameter."""
         if self.parameters.target_period_s is not None:
             return
         period_s = self._target_period.add(source_ns)
@@ -236,7 +235,6 @@ class ArmBridge(Node):
             self.force.publish(force, source_ns=self._last.measured_ns)
 
     def _measure_lag(self, command: Command, status: ArmStatus) -> None:
-        """Update the estimated lag of the arm from an exchange that commanded a motion."""
         if command.mode != "move":
             self._lag.restart()
             return

@@ -226,7 +226,6 @@ def _check_alignment(
 def _find_duration_s(
     left: ArmGeometry, right: ArmGeometry, begin: PathStep, there: PathStep
 ) -> float:
-    """Return the duration (s) of an alignment at its maximum speeds."""
     duration_s = 0.0
     for arm, start, end in (
         (left, begin.left_rad, there.left_rad),

@@ -403,7 +403,6 @@ def _explain_jump(
     *,
     fraction: float,
 ) -> PathError:
-    """Return the error for joints that jump between `before_rad` (6,) and the next pose."""
     reach = compute_reach(arm, other, _make_poses([there]), arm.kinematics.find_branch(before_rad))
     binding = int(reach.binding[0])
     limit = "jump" if binding < 0 else LIMITS[binding]

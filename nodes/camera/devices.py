@@ -115,7 +115,6 @@ class ReaderThread(threading.Thread):
                 return
 
     def _read(self, reader: Reader) -> None:
-        """Deliver pairs until the source ends or the thread is stopped."""
         start_ns: int | None = None
         newest_ns: int | None = None
         while not self._stopping.is_set():

@@ -245,7 +245,6 @@ class CameraReader:
         return self._make_pair(frames)
 
     def _by_stamp(self) -> bool:
-        """Return whether images are paired by the drivers' timestamps instead of their arrival."""
         return all(stream.trusts_stamps for stream in self._streams)
 
     def _exposure_ns(self, frame: CapturedFrame) -> int:

@@ -202,7 +202,6 @@ def fix_settings(
 
 
 def _describe(capture: Device, device: object, rate_hz: float, exposure_s: float | None) -> str:
-    """Return a text with the actual image size, pixel format, rate, exposure and gain."""
     width, height, code, gain = (
         capture.get(one)
         for one in (

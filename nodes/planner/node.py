@@ -191,7 +191,6 @@ class Planner(Node):
         self._publish(planned, source_ns)
 
     def _adapt_horizon(self, fingertip: Fingertip, age_s: float) -> float:
-        """Update the prediction horizon, and return the change of the horizon (s)."""
         self._actuation.on_fingertip(age_s)
         if self.parameters.prediction_horizon_s is not None:
             return 0.0

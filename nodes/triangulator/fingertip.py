@@ -208,7 +208,6 @@ def detect_all(
 
 
 def _finite_gate(gate: Gate | None) -> Gate | None:
-    """Return the gate, or None if its centre is not finite."""
     return gate if gate is not None and np.isfinite(gate.point).all() else None
 
 
@@ -390,7 +389,6 @@ def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[Refi
 
 
 def _refine_flat(inputs: DetectionInput, rejected: Sequence[RefinedPair]) -> list[RefinedPair]:
-    """Refine rejected pairs as flat markers, and return those that are flat markers."""
     refine = FLAT_METHODS.get(inputs.config.refine)
     if refine is None:
         return []
@@ -444,7 +442,6 @@ def _check_flat_pair(
 def _flat_pose(
     inputs: DetectionInput, point_world: Floats, markers: tuple[Marker, Marker]
 ) -> FlatPose:
-    """Estimate the orientation of a flat marker at a world point (3,) m from its two images."""
     geometry = inputs.geometry
     left_from_world, right_from_left = geometry.left_from_world, geometry.right_from_left
     in_left = left_from_world[:3, :3] @ point_world + left_from_world[:3, 3]
@@ -544,7 +541,6 @@ def _size_deviation(inputs: DetectionInput, radius_px: float, depth_m: float) ->
 
 
 def _focal_px(geometry: StereoGeometry) -> float:
-    """Return the mean focal length of both cameras, px."""
     return 0.5 * float(geometry.matrices[0][0, 0] + geometry.matrices[1][0, 0])
 
 

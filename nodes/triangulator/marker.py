@@ -227,7 +227,6 @@ def _detect_in_box(
 
 
 def _add_border(box: Sequence[int]) -> Window:
-    """Return the rows and columns of a box (x, y, width, height) with its surroundings."""
     x, y, width, height = box
     return (
         slice(max(y - SURROUND_PX, 0), y + height + SURROUND_PX),

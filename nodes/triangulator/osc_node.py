@@ -190,7 +190,6 @@ class OscInput(Node):
         self._last_eye = Eye(valid=False, centre_world_m=scene.eyes.centre_world_m)
 
     def _receive(self, data: bytes) -> None:
-        """Publish the positions in a packet, and count the rejected and the ignored messages."""
         now_ns = self.clock.now_ns()
         if len(data) > MAX_PACKET_BYTES:
             self.rejected[Rejection.MALFORMED] += 1
