@@ -696,8 +696,8 @@ def test_a_slack_sheet_is_held_until_the_flanges_come_too_near() -> None:
 @pytest.mark.parametrize(
     ("shift", "turn", "words"),
     [
-        ((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), "edges rotated by 14.3 degrees"),
-        ((0.0, 0.06, 0.0), (0.0, 0.0, 0.0), "edge skewed by"),
+        ((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), "the edges are rotated by 14.3 degrees"),
+        ((0.0, 0.06, 0.0), (0.0, 0.0, 0.0), "the edge is skewed by"),
         ((0.03, 0.0, 0.0), (0.0, 0.0, 0.0), "sheet of"),
         ((0.0154, 0.0, 0.0), (0.0, 0.0, 0.0), "edge force 20"),
     ],

@@ -175,7 +175,7 @@ def edge(x: float, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Floats:
         (
             edge(-0.125, (0.3, 0.0, 0.0)),
             edge(0.125),
-            "the edges are rotated relative to each other by 17.2 degrees",
+            "the edges are rotated by 17.2 degrees relative to each other",
         ),
         (
             edge(-0.125, (0.0, 0.0, 0.25)),
@@ -205,7 +205,7 @@ def test_flanges_outside_the_workspace_or_too_near_are_a_violation() -> None:
     assert "outside the workspace" in outside
     near = check_flange(transform(np.eye(3), [0.2, 0.0, 0.0]), far, SHEET)
     assert near is not None
-    assert "flanges 100 mm apart" in near
+    assert "the flanges are 100 mm apart" in near
 
 
 @given(st.one_of(st.floats(max_value=0.99e-6), st.floats(min_value=10.1), st.just(float("nan"))))

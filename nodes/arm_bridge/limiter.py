@@ -355,7 +355,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
     twist = _twist(edge, other_edge)
     if not twist <= limits.max_twist_rad:
         return (
-            f"the edges are rotated relative to each other by {np.degrees(twist):.1f} degrees, "
+            f"the edges are rotated by {np.degrees(twist):.1f} degrees relative to each other, "
             f"maximum {np.degrees(limits.max_twist_rad):.1f}"
         )
     skew_rad = angle_between(across if left else -across, edge[:3, 0])
