@@ -538,7 +538,7 @@ def test_a_sheet_that_seems_impossibly_long_is_not_relaxed() -> None:
     for _ in range(200):
         arms[1].cycle(on_time(sheet_at(stretch=1.05)), phantom)
     assert arms[1].edge == pytest.approx(before, abs=1e-4)
-    assert "measured length is not possible" in arms[1].control.reason
+    assert "measured length of the sheet is not possible" in arms[1].control.reason
 
 
 def test_a_target_that_arrived_just_now_but_is_old_is_overdue() -> None:
@@ -698,8 +698,8 @@ def test_a_slack_sheet_is_held_until_the_flanges_come_too_near() -> None:
     [
         ((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), "the edges are rotated by 14.3 degrees"),
         ((0.0, 0.06, 0.0), (0.0, 0.0, 0.0), "the edge is skewed by"),
-        ((0.03, 0.0, 0.0), (0.0, 0.0, 0.0), "sheet of"),
-        ((0.0154, 0.0, 0.0), (0.0, 0.0, 0.0), "edge force 20"),
+        ((0.03, 0.0, 0.0), (0.0, 0.0, 0.0), "the sheet is"),
+        ((0.0154, 0.0, 0.0), (0.0, 0.0, 0.0), "the edge force is 20"),
     ],
 )
 def test_a_sheet_measured_twisted_or_too_taut_stops_both_at_once(
