@@ -386,6 +386,17 @@ def test_images_are_those_of_the_session(page: str) -> None:
     assert re.search(r"2\.21 s\.[^<]*<strong>Bookmark: &lt;b&gt;first touch", page)
 
 
+def test_the_page_states_how_many_images_it_omits(
+    bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flexsheet.launch.bags.report.page.draw_charts", lambda session: {})
+    monkeypatch.setattr("flexsheet.launch.bags.report.session.STEREO_SHOTS", 1)
+    session = read_session(bag)
+    shown = len(session.stereo.shots())
+    assert shown < session.stereo.count
+    assert f"<p>{shown} of {session.stereo.count} are shown" in render_page(session)
+
+
 @pytest.mark.parametrize("scheme", COLOURS)
 def test_text_has_the_contrast_of_wcag_aa(scheme: str) -> None:
     colours = COLOURS[scheme]

@@ -427,7 +427,7 @@ def _images(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
             continue
         if numbers["images"][key] > len(shots):
             rest = f", without {album.left_out} shots at bookmarks" if album.left_out else ""
-            yield f"<p>{len(shots)} of {numbers['pictures'][key]}{rest}.</p>"
+            yield f"<p>{len(shots)} of {numbers['images'][key]} are shown{rest}.</p>"
         yield from _album(title, album)
 
 
