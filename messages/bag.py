@@ -126,7 +126,7 @@ class BagWriter:
             self._file: IO[bytes] = self.path.open("xb")
         except FileExistsError:
             raise BagError(
-                f"{self.path}: the file exists already; a bag is not overwritten, give a new name"
+                f"{self.path}: the file exists already; a bag cannot be overwritten"
             ) from None
         except OSError as error:
             raise BagError(str(make_write_error(self.path, error))) from error
@@ -781,7 +781,7 @@ def recover(
             writer.finish()
     except FileExistsError:
         raise BagError(
-            f"{path_out}: the file exists already; a bag is not overwritten, give a new name"
+            f"{path_out}: the file exists already; a bag cannot be overwritten, give a new file"
         ) from None
     except OSError as error:
         with suppress(OSError):

@@ -20,7 +20,7 @@ class NodeNote(Enum):
         "Nodes wait for a processor. End other programs, or give the graph more cores.",
     )
     TARGET_OR_ARM_LATE = (
-        "sheet target or other arm late",
+        "the sheet target or the other arm is late",
         BUSY_FIRST + "Then check the network, and the rate of each topic: `flexsheet topic hz`.",
     )
     OTHER_ARM_SILENT = (
@@ -249,8 +249,8 @@ SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "camera_moved": "Fasten the camera, and calibrate its pose again (docs/set-up-camera.md).",
     "cameras_misaligned": "Fasten both cameras and lenses, and run `flexsheet calibrate stereo`.",
     "marker_offset": "Put the marker back where it was, or calibrate its offset again.",
-    "servo_lag": "The measured lag is already in use. Check the payload and filters of the arm, or "
-    "set `servo_lag_s` of its bridge to the measured lag.",
+    "servo_lag": "The measured lag is used. Check the payload and filters of the arm, or set "
+    "`servo_lag_s` of its bridge to the measured lag.",
     "sheet_stiffness": "Set `sheet.young_modulus_pa` of the scene to the calibrated value over the "
     "thickness, or calibrate the sheet again.",
     "arm_not_following": "Check the arm for a collision, its load, and the backlash of its gears.",

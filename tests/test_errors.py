@@ -71,7 +71,7 @@ def test_every_cause_of_a_self_check_has_a_finding_and_a_remedy() -> None:
         ("the handler of a message failed: UnreachableError: no joint angles", "unreachable"),
         (f'topic "arm_left": host left {NodeNote.KEY_REFUSED.phrase}', "key-refused"),
         ('unknown topic "fingr"; did you mean "finger"?', "unknown-topic"),
-        ("a.mcap: the file exists already; a bag is not overwritten", "bag"),
+        ("a.mcap: the file exists already; a bag cannot be overwritten", "bag"),
         ("no graph is running; start one with: flexsheet launch FILE", "no-graph"),
     ],
 )

@@ -340,9 +340,9 @@ def test_common_foreign_files_are_rejected(tmp_path: Path) -> None:
 
 def test_existing_files_are_not_overwritten(whole: Path, tmp_path: Path) -> None:
     before = whole.read_bytes()
-    with pytest.raises(BagError, match="a bag is not overwritten"):
+    with pytest.raises(BagError, match="cannot be overwritten"):
         BagWriter(whole)
-    with pytest.raises(BagError, match="a bag is not overwritten"):
+    with pytest.raises(BagError, match="cannot be overwritten"):
         recover(whole, whole)
     assert whole.read_bytes() == before
     with pytest.raises(BagError, match="cannot be written"):

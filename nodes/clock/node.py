@@ -23,7 +23,7 @@ class ClockParameters(NodeParameters):
     rate_hz: Positive = Field(default=8.0, description="rate at which pings are sent, Hz")
     max_offset_uncertainty_s: Positive = Field(
         default=0.005,
-        description="maximum uncertainty (s) of a clock offset with which nodes still work",
+        description="maximum uncertainty of a clock offset, s; above it, no arm moves",
     )
     max_drift_ratio: float = Field(
         default=5e-4,
