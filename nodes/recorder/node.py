@@ -54,9 +54,7 @@ class Recorder(Node):
         )
         if not self.parameters.start_paused:
             self._recording.start()
-            self.log.info(
-                "recording has started", bag=str(self._recording.path), inputs=len(self.inputs)
-            )
+            self.log.info("recording", bag=str(self._recording.path), inputs=len(self.inputs))
         self.note = self._recording.note
 
     @periodic("watch_hz")
