@@ -1,10 +1,9 @@
 """Define the apparatus: the true parameters of the simulated hardware, relative to the scene.
 
-The scene is what the nodes assume. The apparatus is the truth, which only the simulator and the
-evaluation of experiments read. In a nominal apparatus, which equals its scene, all offsets are zero
-and all ratios are one. An offset is the true value minus the scene's value. Rotation offsets are
-rotation vectors about the world's axes (for the edge: the flange's axes), applied about the frame's
-own origin.
+The nodes assume the scene. Only the simulator and the evaluation of experiments read the apparatus.
+If the true parameters equal the scene's, all offsets are zero and all ratios are one. An offset is
+the true value minus the scene's value. A rotation offset is a rotation vector about the world's
+axes, through the frame's own origin. For the clamped edge, it is about the flange's axes.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from flexsheet.messages.scene import (
 
 Pair = tuple[Finite, Finite]
 Triple = tuple[Finite, Finite, Finite]
-Share = Annotated[float, Field(ge=0, lt=1)]
+BelowOne = Annotated[float, Field(ge=0, lt=1)]
 SmallTriple = tuple[Small, Small, Small]
 NearOne = Annotated[float, Field(ge=0.5, le=2.0)]
 
@@ -44,7 +43,7 @@ ZERO_6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class LensTruth(Part):
-    """Deviations of a lens from the scene's; for a camera, from that of its device."""
+    """The deviations of a lens from the scene's lens, or from the lens of the simulated device."""
 
     focal_ratio: NearOne = Field(
         default=1.0, description="true focal length divided by the scene's focal length"
@@ -56,7 +55,7 @@ class LensTruth(Part):
 
 
 class CameraTruth(Part):
-    """Deviations of the simulated stereo camera from the one that the scene specifies."""
+    """The deviations of the simulated stereo camera from the scene's camera."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
@@ -75,7 +74,8 @@ class CameraTruth(Part):
     )
     skew_s: Annotated[float, Field(ge=-0.05, le=0.05)] = Field(
         default=0.0,
-        description="right image's exposure time minus the left one's, which is not reported",
+        description="exposure time of the right image minus that of the left image; the camera "
+        "does not report it",
     )
     exposure_jitter_s: Annotated[float, Field(ge=0, le=0.05)] = Field(
         default=0.0,
@@ -87,7 +87,7 @@ class CameraTruth(Part):
 
 
 class ArmTruth(Part):
-    """Deviations of one arm from the scene's arm, and the behaviour of its controller."""
+    """The deviations of one arm from the scene's arm, and the behaviour of its controller."""
 
     base_position_offset_m: SmallTriple = ZERO_3
     base_rotation_offset_rad: SmallTriple = ZERO_3
@@ -99,7 +99,7 @@ class ArmTruth(Part):
         default=ZERO_6, description="true joint angles minus the angles that the encoders report"
     )
     flange_compliance_m_per_n: Annotated[float, Field(ge=0, le=1e-2)] = Field(
-        default=0.0, description="displacement of the flange per newton of the sheet's pull"
+        default=0.0, description="displacement of the flange per newton of the sheet's tension"
     )
     servo_lag_s: Positive | None = Field(
         default=None,
@@ -121,7 +121,7 @@ class ArmTruth(Part):
 
     @classmethod
     def of(cls, arm: ArmSpec) -> Self:
-        """Return an arm without deviations from the scene's arm."""
+        """Return the parameters of an arm that does not deviate from the scene's arm."""
         return cls(
             joint_offsets_rad=arm.joint_offsets_rad,
             flange_compliance_m_per_n=arm.flange_compliance_m_per_n,
@@ -134,7 +134,7 @@ class ArmsTruth(Part):
 
 
 class SheetTruth(Part):
-    """Deviations of the true sheet from the scene's sheet, and properties not in the scene."""
+    """The deviations of the true sheet from the scene's sheet, and properties not in the scene."""
 
     modulus_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
     thickness_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
@@ -143,7 +143,7 @@ class SheetTruth(Part):
         description="relative change of the thickness from one edge to the other, along x and y",
     )
     slack_width_offset_m: Small = 0.0
-    clamp_slip_m: tuple[Share, Share] = Field(
+    clamp_slip_m: tuple[BelowOne, BelowOne] = Field(
         default=(0.0, 0.0),
         description="length of rubber that slips through the left and right clamp",
     )
@@ -154,19 +154,20 @@ class SheetTruth(Part):
         default=None,
         description="friction between finger and sheet; null: the finger does not slip",
     )
-    hysteresis_ratio: Share = Field(
+    hysteresis_ratio: BelowOne = Field(
         default=0.0, description="fraction of the stored energy that is lost in a loading cycle"
     )
-    creep_ratio_per_decade: Share = Field(
+    creep_ratio_per_decade: BelowOne = Field(
         default=0.0, description="relative loss of tension per tenfold increase of time"
     )
 
 
 class FingerTruth(Part):
-    """Deviations of the finger, its marker and its motion from the nodes' assumptions.
+    """The deviations of the finger, its marker and its motion from the nodes' assumptions.
 
-    Finger frame: origin at the contact point of the fingertip pad (the fingertip of all messages),
-    x along the finger towards the hand, z from the pad to the nail, y = z x x (cross product).
+    Finger frame: origin at the contact point of the fingertip's pad (the fingertip of all
+        messages), x along the finger towards the hand, z from the pad to the nail, y = z x x (cross
+        product).
     """
 
     radius_offset_m: Small = 0.0
@@ -196,7 +197,7 @@ class FingerTruth(Part):
         description="rms tremor per axis, on paths with tremor; null: the value of the path",
     )
     voluntary_bandwidth_hz: Annotated[float, Field(ge=0.2, le=20)] = Field(
-        default=1.2, description="upper frequency limit of slow random finger motion"
+        default=1.2, description="maximum frequency of the slow random motion of the finger"
     )
     hand_mass_kg: Positive | None = Field(
         default=None,
@@ -204,13 +205,14 @@ class FingerTruth(Part):
         "`hand: coupled`; null: an average hand",
     )
     hand_damping_ratio: NonNegative | None = Field(
-        default=None, description="damping of the hand over its critical damping"
+        default=None,
+        description="damping of the hand divided by its critical damping; null: an average hand",
     )
     hand_stiffness_n_per_m: NonNegative | None = None
 
 
 class GaugeTruth(Part):
-    """Errors of the simulated force gauge."""
+    """The errors of the simulated force gauge."""
 
     noise_n: Annotated[float, Field(ge=0, le=10)] = Field(
         default=0.0, description="standard deviation of a reading"
@@ -225,7 +227,7 @@ class GaugeTruth(Part):
 
 
 class EyesTruth(Part):
-    """Deviations of the true eye positions from the tracked ones, or from those in the scene."""
+    """The deviations of the true eye positions from the tracked positions, or from the scene's."""
 
     centre_offset_m: SmallTriple = ZERO_3
     interocular_offset_m: Small = 0.0
@@ -238,11 +240,11 @@ class EyesTruth(Part):
 
 
 NOMINAL_DISPLAY_LATENCY_S = 0.008
-"""Time from the swap of an image to the middle of its display, to which deviations refer."""
+"""The time from the swap of an image to the middle of its display, to which deviations refer."""
 
 
 class ProjectorTruth(Part):
-    """Deviations of the projector from the scene's projector."""
+    """The deviations of the projector from the scene's projector."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
@@ -254,7 +256,7 @@ class ProjectorTruth(Part):
 
 
 class Devices(Part):
-    """Devices of the scene to which the deviations refer."""
+    """The devices of the scene to which the deviations refer."""
 
     camera: StereoCamera
     arms: Arms
@@ -265,7 +267,7 @@ class Devices(Part):
 
 
 class Apparatus(Message):
-    """True parameters of the simulated hardware, as deviations from a scene."""
+    """The true parameters of the simulated hardware, as deviations from a scene."""
 
     scene: str = Field(description="name of the scene to which the deviations refer")
     scene_id: str | None = Field(
@@ -287,9 +289,9 @@ class Apparatus(Message):
 
 
 def identify_scene(scene: Scene) -> str:
-    """Return a hash (16 digits) that identifies a scene's object and devices.
+    """Return a hash (16 hexadecimal digits) that identifies a scene's object and devices.
 
-    Values that a calibration replaces are not included, so that a calibrated scene keeps its hash.
+    Values that a calibration replaces are not included, so a calibrated scene keeps its hash.
     """
     values = {
         "name": scene.name,
@@ -305,7 +307,7 @@ def identify_scene(scene: Scene) -> str:
 
 
 def devices_of(scene: Scene) -> Devices:
-    """Return the device parts of a scene."""
+    """Return the devices of a scene."""
     return Devices(
         camera=scene.camera,
         arms=scene.arms,

@@ -1,4 +1,4 @@
-"""Define the calibration file of the poses of the arms' bases, from `flexsheet calibrate arms`."""
+"""Define the calibration file of the arms' bases, which `flexsheet calibrate arms` writes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,9 @@ from flexsheet.messages.calibration import Board, Covariance
 from flexsheet.messages.calibration_file import read_calibration, write_calibration
 from flexsheet.messages.scene import NonNegative, Part, Pose
 
-ARMS_CALIBRATION_VERSION = 1
-
 
 class ArmPoseFit(Part):
-    """Residual of one pose of the arm."""
+    """The residual of one pose of the arm."""
 
     name: str
     used: bool
@@ -30,7 +28,7 @@ class ArmPoseFit(Part):
 
 
 class ArmBase(Part):
-    """Pose of one arm's base, with its uncertainty as standard deviations."""
+    """The pose of one arm's base, with its uncertainty as standard deviations."""
 
     world_from_base: Pose
     flange_from_board: Pose
@@ -63,7 +61,7 @@ class ArmBase(Part):
 
 
 class ArmsCalibration(Part):
-    """Calibration of the poses of both arms' bases; an arm that was not measured is null."""
+    """The calibration of the poses of both arms' bases. An arm that was not measured is null."""
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
@@ -76,14 +74,11 @@ class ArmsCalibration(Part):
 
 
 def save_arms_calibration(calibration: ArmsCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the calibration file; raises FileWriteError if it cannot be written."""
+    """Write an arms calibration to a file. Raises FileWriteError if it cannot be written."""
     title = f"Bases of the arms of scene {calibration.scene}, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_arms_calibration(path: Path) -> ArmsCalibration:
-    """Read the calibration file; raises CalibrationFileError if it is invalid."""
-    command = "flexsheet calibrate arms"
-    return read_calibration(
-        ArmsCalibration, path, version=ARMS_CALIBRATION_VERSION, command=command
-    )
+    """Read an arms calibration from a file. Raises CalibrationFileError if it is invalid."""
+    return read_calibration(ArmsCalibration, path, command="flexsheet calibrate arms")

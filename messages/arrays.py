@@ -1,7 +1,7 @@
-"""Define array fields whose element type and shape are part of the message's type.
+"""Define array fields whose element type and shape are part of the message type.
 
-A field is declared as ``Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]``.  The common types
-have names (``Vector3``, ``Transform``, ...).  A valid array is not copied by the validation, so a
+A field is declared as ``Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]``. The common types
+have names (``Vector3``, ``Transform``, ...). Validation does not copy a valid array, so a
 subscriber reads the memory that was received from the socket.
 """
 
@@ -19,16 +19,16 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 Dimension = int | str
-"""Length of an axis: fixed, or the name of a variable length; equal names mean equal lengths."""
+"""The length of an axis, or the name of a variable length. Equal names mean equal lengths."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArraySpec:
-    """Element type and shape of an array field.
+    """The element type and shape of an array field.
 
-    dtype: numpy type string with byte order, little-endian ("<f8", "|u1").
+    dtype: numpy type string with little-endian byte order ("<f8", "|u1").
     shape: length of each axis; a name means any length.
-    finite: reject NaN and infinity (floating types only).
+    finite: whether NaN and infinity are rejected (only for floating-point types).
     """
 
     dtype: str
@@ -36,30 +36,33 @@ class ArraySpec:
     finite: bool = True
 
     def validate(self, value: object) -> NDArray[Any]:
-        """Return `value` as an array of this type; raises ValueError if its type or shape differs.
+        """Return `value` as an array. Raises ValueError if its type, shape or an element is
+        invalid.
 
-        Arrays must have the exact dtype, because a silent conversion from float64 to float32 would
-        lose digits. Nested lists, as in a scene file, are converted.
+        An array must have the exact dtype, because a silent conversion from float64 to float32
+        would lose digits. Nested lists, as in a scene file, are converted.
         """
         expected = _dtype(self.dtype)
         if isinstance(value, np.ndarray):
             array = value
             if array.dtype is not expected and array.dtype != expected:
-                raise ValueError(f"array of {array.dtype}, expected {expected}")
+                raise ValueError(f"the array has the type {array.dtype}, expected {expected}")
         elif isinstance(value, (list, tuple)):
             array = _convert_lists(value, expected)
         else:
             raise ValueError(f"{type(value).__name__} cannot be used as an array of {expected}")
         if not _has_shape(array.shape, self.shape):
-            raise ValueError(f"array of shape {array.shape}, expected {self.describe_shape()}")
+            raise ValueError(
+                f"the array has the shape {array.shape}, expected {self.describe_shape()}"
+            )
         if not array.flags.c_contiguous:
             array = np.ascontiguousarray(array)
         if self.finite and expected.kind == "f" and not _all_finite(array):
-            raise ValueError("array has NaN or infinite elements")
+            raise ValueError("the array has NaN or infinite elements")
         return array
 
     def describe_shape(self) -> str:
-        """Return the shape as text: "(3,)", "(height, width)"."""
+        """Return the shape as text, such as "(3,)" or "(height, width)"."""
         inner = ", ".join(str(length) for length in self.shape)
         return f"({inner},)" if len(self.shape) == 1 else f"({inner})"
 
@@ -71,7 +74,6 @@ class ArraySpec:
         array_type, has_shape, all_finite = np.ndarray, _has_shape, _all_finite
 
         def validate(value: object) -> NDArray[Any]:
-            """Accept a valid array quickly; otherwise run the full validation."""
             if (
                 type(value) is array_type
                 and value.dtype is expected
@@ -107,7 +109,6 @@ def _dtype(name: str) -> np.dtype[Any]:
 
 @lru_cache(maxsize=4096)
 def _has_shape(shape: tuple[int, ...], expected: tuple[Dimension, ...]) -> bool:
-    """Return whether an array's shape matches the expected dimensions."""
     if len(shape) != len(expected):
         return False
     lengths: dict[str, int] = {}
@@ -123,15 +124,15 @@ def _convert_lists(value: list[Any] | tuple[Any, ...], expected: np.dtype[Any]) 
         if expected.kind in "iu" and not np.array_equal(np.asarray(value), array):
             raise ValueError("an element is not a whole number")
     except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"not an array of {expected}: {error}") from error
+        raise ValueError(f"the value is not an array of {expected}: {error}") from error
     return array
 
 
 def _all_finite(array: NDArray[Any], few: int = 64, isfinite: Any = math.isfinite) -> bool:
     """Return whether no element is NaN or infinite.
 
-    A sum is NaN or infinite if an element is.  For few elements, a sum is faster than numpy's test.
-    A sum of finite elements may overflow; then numpy's test decides.
+    For at most `few` elements, their sum is tested, which is faster than numpy's test. If the sum
+    is not finite, numpy's test decides, because a sum of finite elements may overflow.
     """
     if array.size <= few and isfinite(sum(array.ravel().tolist())):
         return True
@@ -143,7 +144,7 @@ Vector3 = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
 Vector6 = Annotated[NDArray[np.float64], ArraySpec("<f8", (6,))]
 Matrix6 = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
 Transform = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
-"""Homogeneous rigid transform ``a_from_b``: metres, row-major."""
+"""The homogeneous matrix of a rigid transform ``a_from_b``, with positions in metres."""
 Points3 = Annotated[NDArray[np.float32], ArraySpec("<f4", ("points", 3))]
 Vertices = Annotated[NDArray[np.float64], ArraySpec("<f8", ("vertices", 3))]
 Triangles = Annotated[NDArray[np.int32], ArraySpec("<i4", ("triangles", 3))]

@@ -1,19 +1,19 @@
-"""Read and write bags: MCAP files of messages as serialized for transport, with schemas and times.
+"""Read and write bags: MCAP files that contain serialized messages, their schemas and their times.
 
 This module defines what MCAP leaves to the application:
 
-- Profile "flexsheet"; one schema per message type (JSON Schema); one channel per topic, encoding
-  "flexsheet/2", with the type's fingerprint in the channel's metadata.
-- `log_time` is when the recorder received the message, `publish_time` is the source timestamp of
-  the message's header; both in ns of a monotonic clock, not since 1970.
-- The data of one message are its frames (byte strings of a ZeroMQ multipart message): uint32
-  number of frames, four zero bytes, and a uint64 length per frame.  Then the frames follow, each
-  padded with zeros to a multiple of eight bytes, so that arrays are aligned and can be read without
-  a copy.  All numbers are little-endian.
+- The profile is "flexsheet". Each message type has a schema (JSON Schema). Each topic has a channel
+  with the encoding "flexsheet/2" and the type's fingerprint in the channel's metadata.
+- `log_time` is when the recorder received the message, and `publish_time` is the source timestamp
+  in the message's header. Both are in ns of a monotonic clock, not since 1970.
+- The data of a message are its frames (byte strings of a ZeroMQ multipart message): a uint32 with
+  the number of frames, four zero bytes, and a uint64 with the length of each frame. The frames
+  follow. Each frame is padded with zeros to a multiple of eight bytes, so that arrays are aligned
+  and can be read without a copy. All numbers are little-endian.
 
-A writer flushes its data to the disk every second.  A reader scans the records from the start and
-does not need the index at the end.  A file that was truncated by a crash can therefore be read up
-to the truncation; `BagReader.complete` is then false.
+A writer flushes its data to the disk every second. A reader scans the records from the start, so it
+does not need the index at the end. A file that was truncated by a crash can therefore be read up to
+the truncation; `BagReader.complete` is then false.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ CHUNK_BYTES = 1 << 20
 FLUSH_PERIOD_S = 1.0
 MAX_SUMMARY_RECORD_BYTES = 64 << 20
 MAX_CHUNK_BYTES = 256 << 20
-"""Maximum uncompressed size of a chunk; a writer starts a new chunk after 1 MiB."""
+"""The maximum uncompressed size of a chunk. A writer starts a new chunk after 1 MiB."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQ")
 
 
 class BagError(FlexsheetError):
-    """A bag that cannot be written or read; the text names the file and the cause."""
+    """Raised if a bag cannot be written or read. The text names the file and the cause."""
 
     code = "bag"
     remedy = (
@@ -68,7 +68,10 @@ class BagError(FlexsheetError):
 
 
 def join_frames(frames: Sequence[Any]) -> bytes:
-    """Encode the frames of one message for the bag; the module's docstring specifies the layout."""
+    """Encode the frames of a message as the data of an MCAP record.
+
+    The module's docstring specifies the layout.
+    """
     lengths = [len(frame) for frame in frames]
     parts: list[Any] = [struct.pack(f"<II{len(lengths)}Q", len(lengths), 0, *lengths)]
     for frame, length in zip(frames, lengths, strict=True):
@@ -77,7 +80,7 @@ def join_frames(frames: Sequence[Any]) -> bytes:
 
 
 def split_frames(data: bytes) -> list[memoryview]:
-    """Decode the result of `join_frames` as views; raises WireError for other data."""
+    """Return views of the frames that `join_frames` encoded. Raises WireError for invalid data."""
     view = memoryview(data)
     count = struct.unpack_from("<I", view)[0] if len(view) >= 8 else 0
     offset = 8 + 8 * count
@@ -95,14 +98,16 @@ def split_frames(data: bytes) -> list[memoryview]:
 
 
 class BagWriter:
-    """Writer of one bag, a context manager; its methods must be called from one thread.
+    """A writer of one bag, usable as a context manager. Its methods must be called from one thread.
 
     metadata: named tables of text that identify the recording (clock, hosts, git state).
-    compress: whether to compress chunks of about 1 MiB by zstd.  Without compression, writing
-        images takes less time and more disk space.
+    compress: whether to compress chunks of about 1 MiB by zstd. Without compression, images are
+        written faster but need more disk space.
 
-    A separate thread flushes the file to the disk every second (fsync).  A killed process therefore
-    loses at most the last second, and a power failure slightly more.
+    A separate thread flushes the file to the disk every second (fsync). If the process is killed,
+    at most the last second is lost; after a power failure slightly more.
+
+    Raises BagError if the file exists or cannot be created.
     """
 
     def __init__(
@@ -148,13 +153,19 @@ class BagWriter:
         self._flusher.start()
 
     def write(self, topic: Topic, message: Message, header: Header, log_time_ns: int) -> None:
-        """Serialize a message and record it."""
+        """Serialize a message and write it to the bag.
+
+        log_time_ns: time when the message was received, ns of the recorder's clock.
+        """
         self.write_frames(topic, encode(message, header), header, log_time_ns)
 
     def write_frames(
         self, topic: Topic, frames: Sequence[Any], header: Header, log_time_ns: int
     ) -> None:
-        """Record a message that is already serialized into frames."""
+        """Write a message that is already serialized into frames.
+
+        For `log_time_ns`, see `write`.
+        """
         data = join_frames(frames)
         with self._writing():
             self._writer.add_message(
@@ -167,7 +178,7 @@ class BagWriter:
             self.messages += 1
 
     def add_attachment(self, name: str, data: bytes, media_type: str) -> None:
-        """Add a file to the bag: launch file, scene, calibration, git state."""
+        """Add a file to the bag, such as the launch file, the scene or a calibration."""
         with self._writing():
             self._writer.add_attachment(0, 0, name, media_type, data)
 
@@ -177,7 +188,7 @@ class BagWriter:
             self._writer.add_metadata(name, dict(values))
 
     def flush(self) -> None:
-        """Flush the file to the disk, and wait until it is stored."""
+        """Write all buffered data, and wait until the disk has stored them."""
         with self._writing():
             self._writer.flush()
         # Outside the lock: a slow disk must not delay the next message.
@@ -188,7 +199,7 @@ class BagWriter:
             raise BagError(str(make_write_error(self.path, error))) from error
 
     def close(self) -> None:
-        """Write the index and close the file; raises BagError if any data could not be written."""
+        """Write the index and close the file. Raises BagError if any data could not be written."""
         if self._file.closed:
             return
         self._closing.set()
@@ -258,7 +269,11 @@ class BagWriter:
 
 @dataclass(slots=True)
 class Chunk:
-    """Position and time range of a chunk, and the log times of its messages by channel."""
+    """The position and time range of a chunk in the file.
+
+    offset, length: position and size of the chunk, bytes.
+    times_ns: log times of the messages by channel number, ns.
+    """
 
     offset: int
     length: int
@@ -269,7 +284,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class ChannelDecoder:
-    """Decoder of one channel: its recorded message type, and the migration to the current type."""
+    """The topic of a channel, its recorded message type, and the migration to the current type."""
 
     topic: Topic
     recorded_type: str
@@ -279,9 +294,9 @@ class ChannelDecoder:
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """Summary of one topic in a bag.
+    """A summary of one topic in a bag.
 
-    readable: whether the recorded message type is the current one or can be migrated to it.
+    readable: whether the recorded message type is the current type or can be migrated to it.
     """
 
     name: str
@@ -293,7 +308,10 @@ class TopicInfo:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentInfo:
-    """Description of a file that is attached to a bag, with its position in the bag."""
+    """A description of a file that is attached to a bag.
+
+    offset, length: position and size of the attachment's record in the bag, bytes.
+    """
 
     name: str
     media_type: str
@@ -304,7 +322,7 @@ class AttachmentInfo:
 
 @dataclass(frozen=True, slots=True)
 class BagInfo:
-    """Summary of a bag; times are on the recorder's clock.
+    """A summary of a bag. Times are on the recorder's clock.
 
     problem: reason why the bag is incomplete; empty for a complete bag.
     """
@@ -322,10 +340,15 @@ class BagInfo:
 
 
 class BagReader:
-    """Reader of a complete or truncated bag; iterates over (topic, message, header, log_time_ns).
+    """A reader of a complete or truncated bag.
 
-    topics: names of the topics to read; None: all.  start_ns, end_ns: range of log time to read;
-    `end_ns` itself is excluded.  Messages are yielded in the order of log time.
+    Iterating over the reader yields (topic name, message, header, log time in ns) in the order of
+    log time.
+
+    topics: names of the topics to read; None: all topics.
+    start_ns, end_ns: range of log time to read. A message at `end_ns` is not included.
+
+    Raises BagError if the file cannot be read, is not a bag, or if a topic name is unknown.
     """
 
     def __init__(
@@ -359,9 +382,9 @@ class BagReader:
         self._check_topics()
 
     def __iter__(self) -> Iterator[tuple[str, Message, Header, int]]:
-        """Yield decoded messages; messages of older types are migrated by `messages.migrations`.
+        """Yield decoded messages. Messages of older types are migrated to the current types.
 
-        Raises BagError for a topic whose recorded type has no migration.
+        Raises BagError for invalid messages, and for a recorded type that has no migration.
         """
         decoders = {
             channel.topic: self._make_decoder(channel) for channel in self._selected().values()
@@ -378,7 +401,7 @@ class BagReader:
     def open_record(
         self, channel: mcap_records.Channel, record: mcap_records.Message
     ) -> tuple[Message, Header]:
-        """Decode one record of `records` or `read_chunk`; raises BagError."""
+        """Decode a record from `records` or `read_chunk`. Raises BagError for an invalid record."""
         try:
             return _decode(split_frames(record.data), self._make_decoder(channel))
         except WireError as error:
@@ -387,7 +410,7 @@ class BagReader:
             ) from error
 
     def frames(self) -> Iterator[tuple[str, list[memoryview], int]]:
-        """Yield (topic name, frames, log_time_ns) as recorded, without any migration."""
+        """Yield (topic name, frames, log time in ns) of each message, as recorded."""
         for channel, record in self.records():
             try:
                 frames = split_frames(record.data)
@@ -396,7 +419,7 @@ class BagReader:
             yield channel.topic, frames, record.log_time
 
     def records(self) -> Iterator[tuple[mcap_records.Channel, mcap_records.Message]]:
-        """Yield the MCAP channel and message of each record, in the order of log time."""
+        """Yield the MCAP channel and message of each record in the order of log time."""
         selected = self._selected()
         start = self._start_ns if self._start_ns is not None else -1
         end = self._end_ns if self._end_ns is not None else 1 << 64
@@ -425,11 +448,14 @@ class BagReader:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Return the names of the recorded topics, mapped to the names of their types."""
+        """Return the message types of the recorded topics, by topic name."""
         return {channel.topic: _find_type_name(channel) for channel in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:
-        """Return the newest attachment of this name; raises BagError if there is none."""
+        """Return the content of the newest attachment of this name.
+
+        Raises BagError if there is none.
+        """
         for one in reversed(self.attachments):
             if one.name == name:
                 with self.path.open("rb") as file:
@@ -441,7 +467,7 @@ class BagReader:
         )
 
     def info(self) -> BagInfo:
-        """Return the summary of the whole bag; the selected topics and times do not limit it."""
+        """Return a summary of the whole bag, including topics and times that are not selected."""
         times: dict[int, list[int]] = {}
         for chunk in self.chunks:
             for channel_id, stamps in chunk.times_ns.items():
@@ -475,29 +501,31 @@ class BagReader:
         )
 
     def _scan(self, file: IO[bytes]) -> None:
-        """Index the records of the file, up to the first truncated or invalid one."""
+        """Index the records of the file, up to the first truncated or invalid record."""
         size = os.fstat(file.fileno()).st_size
         magic = file.read(len(MCAP0_MAGIC))
         if magic != MCAP0_MAGIC:
-            what = "is empty" if not magic else "is not an MCAP file"
-            raise BagError(f"{self.path}: {what}; bags are written by `flexsheet bag record`")
+            what = "the file is empty" if not magic else "this is not an MCAP file"
+            raise BagError(f"{self.path}: {what}; give a bag of `flexsheet bag record`")
         offset = len(MCAP0_MAGIC)
         first = True
         while True:
             head = _read_at(file, offset, _RECORD_HEAD.size)
             if len(head) < _RECORD_HEAD.size:
-                self.problem = f"truncated after {offset} of {size} bytes; it was not closed"
+                self.problem = f"truncated after {offset} of {size} bytes: it was not closed"
                 break
             opcode, length = _RECORD_HEAD.unpack(head)
             offset += _RECORD_HEAD.size
             if offset + length > size or opcode == 0:
                 self.problem = (
-                    f"truncated after {offset - _RECORD_HEAD.size} of {size} bytes; "
+                    f"truncated after {offset - _RECORD_HEAD.size} of {size} bytes: "
                     "it was not closed"
                 )
                 break
             if first and opcode != Opcode.HEADER:
-                raise BagError(f"{self.path}: not a bag: its first record is not an MCAP header")
+                raise BagError(
+                    f"{self.path}: this is no bag, because its first record is not an MCAP header"
+                )
             try:
                 self._index_record(file, opcode, offset, length)
             except BagError:
@@ -543,8 +571,8 @@ class BagReader:
             profile = mcap_records.Header.read(stream).profile
             if profile != PROFILE:
                 raise BagError(
-                    f'{self.path}: MCAP file has profile "{profile[:40]}", expected "flexsheet"; '
-                    "give a bag recorded by flexsheet"
+                    f'{self.path}: the MCAP file has the profile "{profile[:40]}", expected '
+                    '"flexsheet"; give a bag of `flexsheet bag record`'
                 )
         elif opcode == Opcode.CHANNEL:
             self._add_channel(mcap_records.Channel.read(stream))
@@ -559,15 +587,15 @@ class BagReader:
             self.chunks[-1].times_ns[index.channel_id] = [time for time, _ in index.records]
 
     def _add_channel(self, channel: mcap_records.Channel) -> None:
-        """Store a channel; a renamed topic is stored under its current name."""
+        """Store a channel under the current name of its topic, which may have been renamed."""
         channel.topic = RENAMED_TOPICS.get(channel.topic, channel.topic)
         self.channels[channel.id] = channel
 
     def _index_remaining_chunks(self, file: IO[bytes]) -> None:
         """Index the chunks of a truncated bag whose channels or message times are unknown.
 
-        The message index after the last chunk may be truncated.  A damaged chunk raises an error
-        only when its messages are read.
+        These include the last chunk, because the message index after it may be truncated. A damaged
+        chunk raises an error only when its messages are read.
         """
         for chunk in self.chunks:
             last = chunk is self.chunks[-1]
@@ -589,7 +617,7 @@ class BagReader:
             chunk.times_ns = times
 
     def read_chunk(self, file: IO[bytes], chunk: Chunk) -> list[mcap_records.McapRecord]:
-        """Return the chunk's records; raises BagError if the chunk is damaged."""
+        """Return the MCAP records of a chunk. Raises BagError if the chunk is damaged."""
         body = _read_at(file, chunk.offset, chunk.length)
         try:
             parsed = mcap_records.Chunk.read(ReadDataStream(BytesIO(body)))
@@ -629,7 +657,7 @@ class BagReader:
         return find_migration(topic.message, fingerprint, recorded)
 
     def _make_decoder(self, channel: mcap_records.Channel) -> ChannelDecoder:
-        """Make the decoder of a channel; raises BagError if its message type has no migration."""
+        """Make the decoder of a channel. Raises BagError if its message type has no migration."""
         if channel.topic not in TOPICS:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" does not exist any more in this version; '
@@ -658,7 +686,7 @@ def _find_type_name(channel: mcap_records.Channel) -> str:
 
 
 def _decode(frames: list[memoryview], decoder: ChannelDecoder) -> tuple[Message, Header]:
-    """Decode a message and migrate it to the current type; raises WireError."""
+    """Decode a message and migrate it to the current type. Raises WireError if it is invalid."""
     envelope = read_envelope(
         frames, decoder.topic, fingerprint=decoder.fingerprint, type_name=decoder.recorded_type
     )
@@ -667,15 +695,17 @@ def _decode(frames: list[memoryview], decoder: ChannelDecoder) -> tuple[Message,
 
 
 def info(path: Path | str) -> BagInfo:
-    """Return the summary of a bag."""
+    """Return a summary of a bag. Raises BagError if it cannot be read."""
     return BagReader(path).info()
 
 
 @dataclass(frozen=True, slots=True)
 class RecoverReport:
-    """Result of `recover`.
+    """The result of `recover`.
 
-    orphan_messages: number of messages whose channel is unknown, so that they are lost.
+    messages, attachments: numbers of recovered messages and attachments.
+    was_complete, problem: whether the original bag was complete, and if not, the reason.
+    orphan_messages: number of messages that were lost because their channel is unknown.
     """
 
     messages: int
@@ -694,8 +724,9 @@ def recover(
 ) -> RecoverReport:
     """Write the readable part of a truncated or damaged bag to a new bag.
 
-    progress: called with the number of chunks that are done, and the total number.  Raises BagError
-    if nothing is readable, or if the new file exists or cannot be written.
+    progress: function that is called with the number of processed chunks and the total number.
+
+    Raises BagError if nothing is readable, or if the new file exists or cannot be written.
     """
     reader = BagReader(path_in)
     path_out = Path(path_out)
@@ -750,14 +781,16 @@ def recover(
             writer.finish()
     except FileExistsError:
         raise BagError(
-            f"{path_out}: the file exists already; a bag cannot be overwritten, give a new name"
+            f"{path_out}: the file exists already; a bag cannot be overwritten, give a new file"
         ) from None
     except OSError as error:
         with suppress(OSError):
             path_out.unlink(missing_ok=True)
         raise BagError(str(make_write_error(path_out, error))) from error
     if not BagReader(path_out).complete:
-        raise BagError(f"{path_out}: the recovered bag cannot be read back; is the disk full?")
+        raise BagError(
+            f"{path_out}: the recovered bag cannot be read again; check the disk and repeat"
+        )
     return RecoverReport(
         messages=messages,
         attachments=len(reader.attachments),
@@ -774,9 +807,10 @@ def _read_at(file: IO[bytes], offset: int, length: int) -> bytes:
 
 
 def _decompress(chunk: mcap_records.Chunk) -> bytes:
-    """Decompress a chunk; raises ValueError if its size is too large or not as its header states.
+    """Decompress a chunk. At most the size that its header states is decompressed.
 
-    A few compressed bytes can expand to a huge amount, so at most the stated size is decompressed.
+    This limits the memory, because a few compressed bytes can expand to a huge amount. Raises
+    ValueError if the stated size is too large or wrong.
     """
     stated = chunk.uncompressed_size
     if stated > MAX_CHUNK_BYTES:
@@ -799,7 +833,7 @@ def _decompress(chunk: mcap_records.Chunk) -> bytes:
 
 
 def _parse_attachment(body: bytes) -> mcap_records.Attachment:
-    """Decode an attachment; raises ValueError if its checksum is wrong."""
+    """Decode an attachment. Raises ValueError if its checksum is wrong."""
     if zlib.crc32(memoryview(body)[:-4]) != int.from_bytes(body[-4:], "little"):
         raise ValueError("an attachment is damaged: its checksum is wrong")
     attachment: mcap_records.Attachment = mcap_records.Attachment.read(

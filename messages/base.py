@@ -1,4 +1,4 @@
-"""Define the base class of messages, and the header that is sent with each of them."""
+"""Define the base class of messages, and the header of each message."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from pydantic import BaseModel, ConfigDict
 
 @dataclass(frozen=True, slots=True)
 class StampMark:
-    """Annotation of a field that is a time on the clock of the header's timestamps."""
+    """The annotation of a field that is a time on the clock of the header's timestamps."""
 
 
 Stamp = Annotated[int, StampMark()]
-"""Timestamp in ns on the clock of the message's header; 0: none.
+"""A timestamp in ns on the clock of the message's header; 0: none.
 
-A subscriber with another clock receives these fields converted to its own clock.  A duration is an
-`int`.
+A subscriber on another host receives these fields converted to its own clock. A field that is a
+duration has the type `int`.
 """
 
 
 class Message(BaseModel):
-    """Base class of typed, immutable messages.
+    """The base class of messages. Messages are typed and immutable.
 
-    Subclasses declare fields; `flexsheet.messages.arrays` defines array types.  Numbers are in SI
-    units and radians.  Units and frames are in the names (`age_s`, `world_from_sheet`).  A type's
-    validator is built on its first use, because a node uses few of the types.
+    Numbers are in SI units and radians. Names contain units and frames (`age_s`,
+    `world_from_sheet`). `flexsheet.messages.arrays` defines array types. A type's validator is
+    built on its first use, because a node uses only a few types.
     """
 
     model_config = ConfigDict(
@@ -38,7 +38,7 @@ class Message(BaseModel):
 
 
 class MessagePart(BaseModel):
-    """Base class of the named groups of fields in a message."""
+    """The base class of named groups of fields in a message."""
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, arbitrary_types_allowed=True, defer_build=True
@@ -47,17 +47,16 @@ class MessagePart(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Header of one message.
+    """The header of one message.
 
-    sequence: sequence number of the message among those of its writer, from 1; a gap is a loss.
-    source_ns: time of the measurement on the clock `clock_id`; for everything that is derived from
-    an
-      image, the midpoint of the exposure.
+    sequence: sequence number of the message among those of its writer, from 1. A gap means a loss.
+    source_ns: time of the measurement on the clock `clock_id`. For all values that are derived from
+        an image, it is the midpoint of the exposure.
     publish_ns: time when the message was passed to the socket, on the same clock.
-    clock_id: clock of both timestamps; timestamps of different clocks must not be subtracted.
-    writer: name of the node that published.
-    epoch: time when the writer started, ns on the same clock.  It distinguishes a restart from a
-      loss, and is used to reject older messages.
+    clock_id: clock of both timestamps. Timestamps of different clocks must not be subtracted.
+    writer: name of the node that published the message.
+    epoch: time when the writer started, ns on the same clock. It distinguishes a restart from a
+        loss, and is used to reject older messages.
     plan: hash of the writer's plan; empty in bags of the first wire protocol.
     """
 
@@ -72,7 +71,7 @@ class Header:
 
 @cache
 def find_stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
-    """Return the names of the message's fields that are timestamps (of type `Stamp`)."""
+    """Return the names of a message type's fields that are timestamps (of the type `Stamp`)."""
     return tuple(
         name
         for name, field in message_type.model_fields.items()
@@ -82,16 +81,16 @@ def find_stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
 
 @cache
 def compute_fingerprint(message_type: type[Message]) -> bytes:
-    """Return the first 8 bytes of the SHA-256 of the type's JSON Schema without descriptions.
+    """Return the first 8 bytes of the SHA-256 of a type's JSON Schema without descriptions.
 
-    It changes with the names, types, ranges, dtypes and shapes of the fields.
+    The fingerprint depends on the names, types, ranges, dtypes and shapes of the fields.
     """
     schema = json.dumps(_remove_descriptions(message_type.model_json_schema()), sort_keys=True)
     return hashlib.sha256(schema.encode()).digest()[:8]
 
 
 def _remove_descriptions(schema: object) -> object:
-    """Return a JSON Schema without titles and descriptions; fields with these names remain."""
+    """Return a JSON Schema without titles and descriptions. Fields with these names remain."""
     if isinstance(schema, dict):
         return {
             key: _remove_descriptions(value)

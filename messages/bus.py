@@ -45,7 +45,7 @@ from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
 Handler = Callable[[Any, Header], None]
 Problem = Callable[[str], None]
 MessageFilter = Callable[[Any, Header], str | None]
-"""Function that returns why a valid message is rejected, or None to accept it."""
+"""A function that returns why a valid message is rejected, or None to accept the message."""
 
 QUEUE_S = 0.5
 MAX_QUEUE_LENGTH = 1000
@@ -58,12 +58,15 @@ BIND_TIMEOUT_S = 1.0
 IPC_CLOSING_S = 0.02
 MAX_EXCESS_BYTES = 256 << 20
 MAX_SUBSCRIPTION_BYTES = 512
-"""Size limit of the frames that a publisher receives; the largest one ends a CURVE handshake."""
+"""The maximum size of a frame that a publisher receives.
+
+The largest such frame is the last one of a CURVE handshake.
+"""
 
 HANDSHAKE_MS = 5000
 REOPEN_DELAY_S = 0.5
 WATCHED_RECONNECT_MS = 50
-"""Maximum period of reconnection attempts to a writer whose end the subscriber must detect."""
+"""The maximum reconnection period for subscribers that report the end of a connection."""
 
 MAX_PAST_CLOCKS = 16
 
@@ -75,11 +78,12 @@ _log = logging.getLogger("flexsheet.bus")
 
 
 HEARTBEATS = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TIMEOUT: 5000, zmq.HEARTBEAT_TTL: 5000}
-"""Publishers send heartbeats over tcp only, because ipc reports the end of a process by itself.
+"""The socket options of publishers on tcp. With ipc, the end of a process is detected without
+heartbeats.
 
-Subscribers send none: libzmq 4.3.5 aborts the process if a heartbeat is due after the publisher has
-disconnected while its messages still fill the queue.  A subscriber that is busy for seconds does
-not answer heartbeats and would be disconnected, so publishers send none over ipc.
+Subscribers send no heartbeats: libzmq 4.3.5 aborts the process if a heartbeat is due after the
+    publisher has disconnected while its messages still fill the queue. Publishers send none over
+    ipc: a subscriber that is busy for seconds does not answer and would be disconnected.
 """
 
 TCP_KEEPALIVE_OPTIONS = {
@@ -90,10 +94,11 @@ TCP_KEEPALIVE_OPTIONS = {
     zmq.TCP_MAXRT: 5000,
     zmq.CONNECT_TIMEOUT: 2000,
 }
-"""TCP keep-alive probes by which a subscriber detects within 5 s that the publisher's host is gone.
+"""The options with which a subscriber detects within 5 s that the publisher's host does not
+respond.
 
-If that host has restarted meanwhile, it is detected at once.  The publisher's heartbeats are not
-enough: libzmq 4.3.5 stops waiting for the next one as soon as a message arrives.
+A restart of that host is detected at once. The publisher's heartbeats are not enough: libzmq 4.3.5
+stops waiting for the next heartbeat as soon as a message arrives.
 """
 
 HANDSHAKE_FAILED: dict[int, str] = {
@@ -106,14 +111,14 @@ MONITORED_EVENTS = zmq.EVENT_DISCONNECTED | sum(RECONNECTED) | sum(HANDSHAKE_FAI
 
 
 class BusError(FlexsheetError, RuntimeError):
-    """Raised if a socket cannot be opened; the text names the topic and the endpoint."""
+    """Raised if a socket cannot be opened. The text names the topic and the endpoint."""
 
     code = "bus"
     remedy = "Another graph has the endpoint. End that graph, or run `flexsheet doctor --sweep`."
 
 
 class Counts(Protocol):
-    """Counters of the messages that a subscriber does not pass to its handler."""
+    """The interface of the counters of messages that a subscriber does not pass to its handler."""
 
     dropped: int
     gaps: int
@@ -121,10 +126,11 @@ class Counts(Protocol):
 
 
 def compute_queue_length(topic: Topic) -> int:
-    """Return the length (messages) of the queue at each end of a connection.
+    """Return the maximum number of messages in the queue at each end of a connection.
 
-    A full queue drops the newest message.  On `latest` topics the queue therefore holds half a
-    second of messages at the topic's highest rate.  On other topics only memory limits it.
+    A full queue drops the newest message. On `latest` topics, the queue therefore holds only the
+    messages of half a second at the topic's maximum rate. On other topics, the queue is limited by
+    its memory use.
     """
     if topic.delivery is Delivery.LATEST and topic.rate_hz is not None:
         length = round(QUEUE_S * topic.rate_hz[1])
@@ -135,9 +141,10 @@ def compute_queue_length(topic: Topic) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """Endpoint to which a subscriber connects, and the writer that is expected there (None: any).
+    """An endpoint to which a subscriber connects.
 
-    host: the host whose key a tcp endpoint must prove, if keys are used.
+    writer: name of the node that publishes at the endpoint; None: any node.
+    host: name of the host whose key the endpoint must prove if keys are used.
     """
 
     endpoint: str
@@ -146,16 +153,16 @@ class Source:
 
 
 class Publisher:
-    """Publisher of one topic.
+    """A publisher of one topic.
 
-    It needs a running asyncio loop if the topic is latched or keys are used.
+    It needs a running asyncio loop if the topic is latched, or if `keys` or `local` is given.
 
-    bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" is a free port).
-    keys: only hosts of this key ring may connect over tcp; None: tcp is bound to loopback only.
-    on_refused: called with a text for each connection that was refused or closed; without a
-        running loop, on a separate thread.
-    local: bus inside this process.  Its readers get messages without serialization, and the socket
-        is used only while another process has subscribed; needs a running loop.
+    bind: endpoints, "ipc:///path" or "tcp://address:port". "tcp://127.0.0.1:*" selects a free port.
+    keys: keys of the hosts that may connect over tcp; None: tcp is bound to the loopback interface.
+    on_refused: function that is called with a text for each refused or closed connection. Without a
+        running loop, it is called on a separate thread.
+    local: bus of this process, whose readers get messages without serialization. The socket is then
+        used only while another process has subscribed.
     """
 
     def __init__(
@@ -216,13 +223,13 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Reopen the socket if the key of any host in the ring, including this one, has changed."""
+        """Reopen the socket if the key of any host in the key ring has changed."""
         if self._keys is not None and not self._socket.closed and (change.own or change.hosts):
             self._close_socket(unbind=True)
             self._open(self.endpoints)
 
     def interrupt(self) -> None:
-        """Disconnect all readers, as if this process had ended.
+        """Disconnect all subscribers, as if this process had ended.
 
         They reconnect automatically. Messages that were sent before are still delivered.
         """
@@ -233,10 +240,10 @@ class Publisher:
             self._open(self.endpoints)
 
     def send(self, message: Message, header: Header) -> None:
-        """Pass the message to the socket without blocking.
+        """Send a message without blocking.
 
-        Large arrays are not copied and must not be changed afterwards.  Raises WireError for a
-        message that is larger than the topic allows.
+        Large arrays are not copied, so the caller must not change them afterwards. Raises WireError
+        if the message is larger than the topic allows.
         """
         if self._channel is not None:
             self._channel.send(self.topic, message, header)
@@ -264,7 +271,8 @@ class Publisher:
             send(frames[-1], NOBLOCK, copy=False)
 
     def _serve_late_subscribers(self) -> None:
-        """Read a batch of subscriptions; resend the last message if one of them is new.
+        """Read a batch of subscriptions, and resend the last message if there is a new
+        subscription.
 
         An XPUB socket reports only the first subscription and the end of the last one.
         """
@@ -286,7 +294,10 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def _on_closed_by_guard(self, address: str, reason: str) -> None:
-        """Report a connection that the guard closed; called on the guard's thread."""
+        """Report a connection that the connection guard closed.
+
+        This function runs on the guard's thread.
+        """
         text = f'topic "{self.topic.name}": a connection from {address} was closed: {reason}'
         if self._loop is None:
             self._on_refused(text)
@@ -296,13 +307,16 @@ class Publisher:
             self._loop.call_soon_threadsafe(self._on_refused, text)
 
     def forget(self) -> None:
-        """Discard the stored message for late subscribers, until the next `send`."""
+        """Discard the message that is stored for late subscribers."""
         self._last = None
         if self._channel is not None:
             self._channel.forget()
 
     def close(self) -> None:
-        """Release the endpoints; messages sent before are delivered for half a second more."""
+        """Release the endpoints.
+
+        Messages that were sent before are delivered for up to half a second.
+        """
         if self._socket.closed:
             return
         for endpoint in self.endpoints:
@@ -329,23 +343,24 @@ class Publisher:
 
 
 class Subscriber:
-    """Subscriber of one topic, which calls `on_message(message, header)` on the loop's thread.
+    """A subscriber of one topic, which calls `on_message(message, header)` on the loop's thread.
 
-    connect: the endpoints of all writers; a writer may start later or restart.  A `Source` also
-      names the writer expected there, and the host whose key the endpoint must prove.
+    connect: endpoints of all writers. A writer may start later than the subscriber, or restart.
     counts: counters of superseded, lost and rejected messages.
-    on_problem: called with a text for losses (the 1st, 2nd, 4th, 8th, ...; not on `latest` topics,
-      which may lose messages), and for the first rejection of each cause.  Also called for an
-      exception in `on_message`, after which the subscriber continues.
-    on_handshake_failed: called with a text for each failed handshake; None: `on_problem` is called.
-    raw: call `on_message(frames, header)` with every message, whatever the topic's delivery; the
-      fields are not validated.
-    keys: keys of this host and the others; None: tcp connects to loopback only.
+    on_problem: function that is called with a text for the first rejection of each cause, for an
+        exception in `on_message`, and each time the number of lost messages has doubled. Losses on
+        `latest` topics are not reported.
+    on_handshake_failed: function that is called with a text for each kind of failed handshake;
+        None: `on_problem` is called.
+    raw: whether `on_message(frames, header)` is called with the frames of every message. The fields
+        are then not validated.
+    keys: keys of this host and of the other hosts; None: tcp connects to the loopback interface
+        only.
     plan: hash of the plan whose messages are accepted; None: messages of any plan.
-    message_filter: called with each valid message before `on_message`.
-    on_disconnected: called after the last message of a connection that has ended: because the
-      writer's process has ended, because of `Publisher.interrupt`, or by a fault of the network.
-    local: bus inside this process, by which writers of the same process are read; not with `raw`.
+    message_filter: function that is called with each valid message before `on_message`.
+    on_disconnected: function that is called when a connection has ended, after its last message.
+    local: bus of this process, from which messages of writers in this process are read. It is
+        ignored if `raw` is true.
     """
 
     def __init__(
@@ -400,9 +415,9 @@ class Subscriber:
             )
 
     def start(self) -> None:
-        """Connect and start to deliver; needs a running loop."""
+        """Connect, and start to deliver messages. This requires a running loop."""
         if self._started:
-            raise BusError(f'topic "{self.topic.name}": the subscriber is started already')
+            raise BusError(f'topic "{self.topic.name}": start() was called twice; call it once')
         try:
             for connection in self._connections:
                 connection.open()
@@ -412,12 +427,12 @@ class Subscriber:
         self._started = True
 
     def close(self) -> None:
-        """Disconnect; may be called from the handler."""
+        """Disconnect. The message handler may call this method."""
         for connection in self._connections:
             connection.close()
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Reconnect to hosts whose keys have changed; to all if this host's key has changed."""
+        """Reconnect to hosts with changed keys, or to all hosts if this host's key has changed."""
         for connection in self._connections:
             if (
                 isinstance(connection, _HostConnection)
@@ -429,7 +444,10 @@ class Subscriber:
                 connection.open()
 
     def accept(self, frames: list[Any], writers: frozenset[str] | None) -> Envelope | None:
-        """Read a message's envelope and count lost messages; None if it is rejected or repeated."""
+        """Read a message's envelope with the checks of `accept_header`.
+
+        Return None if the message is rejected, or has arrived before.
+        """
         try:
             envelope = read_envelope(frames, self.topic)
         except WireError as error:
@@ -438,16 +456,17 @@ class Subscriber:
         return envelope if self.accept_header(envelope.header, writers) else None
 
     def accept_header(self, header: Header, writers: frozenset[str] | None) -> bool:
-        """Check a header and count lost messages; return False if it is rejected or repeated.
+        """Check a header, and count lost messages.
 
-        writers: the writers expected at the endpoint; None: any.
+        Return False if the message is rejected, or has arrived before.
+        writers: names of the writers that are expected at the endpoint; None: any writer.
         """
         try:
             if writers is not None and header.writer not in writers:
                 raise WireError(
                     "writer",
-                    f"unexpected writer {header.writer!r:.60}; expected "
-                    f"{', '.join(sorted(writers))} from this endpoint",
+                    f"the message names the writer {header.writer!r:.60}, but only "
+                    f"{', '.join(sorted(writers))} may write to this endpoint",
                 )
             if self._plan is not None and header.plan != self._plan:
                 raise WireError(
@@ -476,7 +495,7 @@ class Subscriber:
         return True
 
     def deliver(self, envelope: Envelope) -> None:
-        """Validate the message and call the handler."""
+        """Validate a message, and call the handler with it."""
         header = envelope.header
         try:
             message = envelope.open()
@@ -489,21 +508,22 @@ class Subscriber:
         self.call(message, header)
 
     def call(self, message: Any, header: Header) -> None:
-        """Call the handler; report an exception and continue."""
+        """Call the handler. If it raises an exception, report the exception and continue."""
         try:
             self._on_message(message, header)
         except Exception as error:
-            _log.exception("handler of topic %s failed", self.topic.name)
+            _log.exception('the handler of topic "%s" raised an exception', self.topic.name)
             self.on_problem(
-                f'topic "{self.topic.name}": handler failed: {type(error).__name__}: {error}'
+                f'topic "{self.topic.name}": the handler of a message failed: '
+                f"{type(error).__name__}: {error}"
             )
 
     def reject(self, error: WireError) -> None:
-        """Count a rejected message; report only the first rejection of each cause."""
+        """Count a rejected message, and report the first rejection of each cause."""
         self.counts.rejected += 1
         if error.cause not in self._reported_causes:
             self._reported_causes.add(error.cause)
-            self.on_problem(f'topic "{self.topic.name}": message refused: {error}')
+            self.on_problem(f'topic "{self.topic.name}": a message was refused: {error}')
 
     def _count_gap(self, lost: int, writer: str) -> None:
         self.counts.gaps += lost
@@ -511,16 +531,17 @@ class Subscriber:
         if not latest_only and self.counts.gaps >= self._report_gaps_from:
             self._report_gaps_from = 2 * self.counts.gaps
             self.on_problem(
-                f'topic "{self.topic.name}": {lost} messages of {writer} lost, '
+                f'topic "{self.topic.name}": {lost} messages of {writer} were lost, '
                 f"{self.counts.gaps} in total; {NodeNote.READER_TOO_SLOW.phrase}"
             )
 
 
 class _Writer:
-    """Newest start time (epoch) and sequence number of a writer, to reject replayed older messages.
+    """The start time (epoch) and sequence number of the newest message of a writer.
 
-    A writer that restarts on the same clock has a later epoch.  After a reboot of its host it has a
-    new clock identifier, and messages of its former clocks are rejected.
+    They are used to reject old messages that are sent again. A writer that restarts on the same
+    clock has a later epoch. After a reboot of its host it has a new clock identifier, and messages
+    of its former clocks are rejected.
     """
 
     __slots__ = ("clock_id", "epoch", "past_clocks", "sequence")
@@ -530,10 +551,10 @@ class _Writer:
         self.past_clocks: deque[str] = deque(maxlen=MAX_PAST_CLOCKS)
 
     def update(self, header: Header) -> int:
-        """Return the number of messages lost before this one.
+        """Return the number of messages that were lost before this message.
 
-        A negative number marks an old message; -1 marks a repetition of the newest one.  Raises
-        WireError for a message that was sent before the writer's latest restart.
+        -1 means that the newest message was repeated; other negative numbers mean an older message.
+        Raises WireError for a message that was sent before the writer's latest restart.
         """
         if header.clock_id != self.clock_id:
             if header.clock_id in self.past_clocks:
@@ -556,13 +577,13 @@ class _Writer:
 
 
 def _list_writers(sources: Sequence[Source]) -> frozenset[str] | None:
-    """Return the writers expected at these endpoints; None if one of them is unknown."""
+    """Return the writers expected at these endpoints, or None if a writer is unknown."""
     known = [one.writer for one in sources if one.writer is not None]
     return frozenset(known) if len(known) == len(sources) > 0 else None
 
 
 class _HostConnection:
-    """Socket of a subscriber that receives the messages of one host."""
+    """A subscriber's socket that receives the messages of one host."""
 
     def __init__(
         self,
@@ -595,7 +616,7 @@ class _HostConnection:
         return self._keys is not None and self.host is not None
 
     def open(self) -> None:
-        """Connect and start to read."""
+        """Connect, and start to read messages."""
         topic = self._subscriber.topic
         self._loop = asyncio.get_running_loop()
         self._socket = _open_socket(zmq.SUB, topic)
@@ -647,9 +668,9 @@ class _HostConnection:
         self._disconnected.clear()
 
     def _handle_monitor_events(self) -> None:
-        """Report the end of a connection, and connect again if ZeroMQ does not; a loop callback.
+        """Report the end of a connection, and connect again. This is a callback of the loop.
 
-        ZeroMQ ends a connection permanently after a rejected key and after corrupted data.
+        ZeroMQ itself does not reconnect after a rejected key or after corrupted data.
         """
         while self._monitor is not None:
             try:
@@ -680,7 +701,7 @@ class _HostConnection:
             self.open()
 
     def _read(self) -> None:
-        """Deliver the messages that have arrived, in batches; a loop callback."""
+        """Deliver a batch of the messages that have arrived. This is a callback of the loop."""
         if self._socket is None or self._socket.closed or self._loop is None:
             return
         drained = False
@@ -691,9 +712,11 @@ class _HostConnection:
                 self._loop.call_soon(self._read)
 
     def _deliver_newest(self) -> bool:
-        """Deliver the newest message of each writer; skip the older ones without validating them.
+        """Deliver the newest message of each writer, and skip older messages without validating
+        them.
 
-        If the first message is younger than half a period, it is delivered at once.
+        A first message that is younger than half a period is delivered at once. Return whether the
+        socket has no more messages.
         """
         newest: dict[str, Envelope] = {}
         drained = False
@@ -746,7 +769,7 @@ class _HostConnection:
         return bool(events & POLLIN)
 
     def _receive(self) -> list[Any] | None:
-        """Return the frames of one message without a copy, or None if there is no message."""
+        """Return the frames of one message without copying them, or None if there is no message."""
         if self._socket is None or self._socket.closed:
             return None
         try:
@@ -790,7 +813,7 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
 
 
 def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRing | None) -> str:
-    """Bind the socket and return the endpoint with the port number that was assigned."""
+    """Bind the socket, and return the endpoint with the assigned port number."""
     _check_endpoint(topic, endpoint)
     if keys is None:
         _refuse_beyond_loopback(topic, endpoint)
@@ -811,7 +834,7 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
             if time.monotonic() > deadline_s:
                 raise BusError(
                     f'topic "{topic.name}": {endpoint} is in use by another process; '
-                    "is the same launch file running already?"
+                    "end the other run of this launch file"
                 ) from error
             time.sleep(0.01)
     bound: str = opened.getsockopt_string(zmq.LAST_ENDPOINT)
@@ -819,15 +842,20 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
 
 
 def _check_endpoint(topic: Topic, endpoint: str) -> None:
-    """Raise BusError for an invalid endpoint that ZeroMQ accepts silently or reports unclearly."""
+    """Raise BusError for an invalid endpoint.
+
+    ZeroMQ would accept some of them, or report them unclearly.
+    """
     transport, _, address = endpoint.partition("://")
     port = address.rpartition(":")[2]
     if transport == "tcp" and port != "*" and not (port.isdecimal() and 0 < int(port) < 1 << 16):
-        raise BusError(f'topic "{topic.name}": {endpoint}: the port must be in 1..65535')
+        raise BusError(
+            f'topic "{topic.name}": {endpoint}: the port must be a number from 1 to 65535'
+        )
     if transport == "ipc" and len(os.fsencode(address)) > IPC_PATH_BYTES:
         raise BusError(
             f'topic "{topic.name}": the path of {endpoint} has {len(os.fsencode(address))} bytes, '
-            f"the system allows {IPC_PATH_BYTES}; choose a shorter folder for sockets"
+            f"but the system allows only {IPC_PATH_BYTES}; choose a folder with a shorter path"
         )
     if transport not in ("tcp", "ipc"):
         raise BusError(
@@ -836,7 +864,7 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
 
 
 def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
-    """Raise BusError for a tcp endpoint that other hosts can reach; called if there are no keys."""
+    """Raise BusError for a tcp endpoint that other hosts can reach."""
     transport, _, address = endpoint.partition("://")
     if transport != "tcp":
         return
@@ -847,13 +875,16 @@ def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
         inside = False
     if not inside:
         raise BusError(
-            f'topic "{topic.name}": {endpoint} is beyond loopback and there are no keys; '
-            "create them: flexsheet keys new"
+            f'topic "{topic.name}": other hosts can reach {endpoint}, but there are no keys; '
+            "create keys with: flexsheet keys new"
         )
 
 
 def _ipc_is_served(endpoint: str) -> bool:
-    """Return whether a process listens at the ipc path; binding would take over its path."""
+    """Return whether a process listens at an ipc endpoint.
+
+    Binding this endpoint would take it away from that process.
+    """
     path = endpoint.removeprefix(IPC)
     if path == endpoint or path.startswith("@"):
         return False

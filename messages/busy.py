@@ -1,4 +1,4 @@
-"""Decide from a launcher's message whether its computer is too busy for its nodes, and why."""
+"""Decide whether a computer is too busy for its nodes, and describe why."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import CpuPressure, HostStatus
 
 MAX_LOAD_RATIO = 1.5
-"""Maximum load per core, used if a computer cannot measure how long its nodes wait."""
+"""The maximum load per core, used if a computer cannot measure how long its nodes wait."""
 
 BUSY_REMEDY = (
     "the arms may pause meanwhile; end other programs, give the graph more cores, start fewer "
@@ -20,7 +20,7 @@ def is_busy(host: HostStatus) -> bool:
 
 
 def describe_busy(host: HostStatus) -> str:
-    """Return one sentence that says why a computer is busy; empty if it is not busy."""
+    """Return a sentence that says why a computer is busy, or "" if it is not busy."""
     if not is_busy(host):
         return ""
     if host.cpu is None:
@@ -31,7 +31,7 @@ def describe_busy(host: HostStatus) -> str:
 
 
 def describe_pressure(cpu: CpuPressure) -> str:
-    """Say which node waits for a processor, for how long, and which programs use the cores."""
+    """Describe which node waits for a processor, for how long, and which programs use the cores."""
     waits = f"{cpu.node} waits for a processor {cpu.wait_ratio:.0%} of the time"
     if not cpu.programs:
         return waits

@@ -17,15 +17,13 @@ from flexsheet.messages.calibration_file import (
 )
 from flexsheet.messages.scene import Lens, NonNegative, Part, Positive, StereoCamera
 
-CALIBRATION_VERSION = 2
-
 Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", ("numbers", "numbers"))]
 
 
 class Board(Part):
-    """Calibration board: a chessboard, or a ChArUco board with markers in its white squares.
+    """A calibration board: a chessboard, or a ChArUco board with markers in its white squares.
 
-    columns, rows: numbers of inner corners, for both kinds.
+    columns, rows: numbers of inner corners, for both kinds of board.
     """
 
     kind: Literal["chessboard", "charuco"] = "chessboard"
@@ -42,7 +40,7 @@ class Board(Part):
 
 
 class PairResidual(Part):
-    """Reprojection error of one image pair: root mean square over the corners of each view."""
+    """The reprojection error of one image pair: root mean square over the corners of each view."""
 
     left: str
     right: str
@@ -59,10 +57,10 @@ class PairResidual(Part):
 
 
 class Uncertainty(Part):
-    """Uncertainty of the stereo camera, as standard deviations of normally distributed errors.
+    """The uncertainty of the stereo camera, as standard deviations of normally distributed errors.
 
-    It describes the offset that all measured fingertips have in common, not the scatter of single
-    ones.
+    It describes the error that all measured fingertips have in common, not the scatter of single
+    measurements.
     """
 
     corner_sigma_px: NonNegative = Field(
@@ -84,7 +82,7 @@ class Uncertainty(Part):
 
 
 class StereoCalibration(Part):
-    """Calibration of a stereo camera: both lenses and the transform between them."""
+    """The calibration of a stereo camera: both lenses and the transform between them."""
 
     version: Literal[2] = 2
     device: str
@@ -103,10 +101,10 @@ class StereoCalibration(Part):
 
 
 def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) -> None:
-    """Raise CalibrationMismatchError unless the calibration matches the camera and image size."""
+    """Raise CalibrationMismatchError if a calibration does not match the camera and image size."""
     if calibration.device != camera.device:
         raise CalibrationMismatchError(
-            f'calibration is of device "{calibration.device}", the scene\'s camera is '
+            f'the calibration is of the camera "{calibration.device}", but the scene\'s camera is '
             f'"{camera.device}": set the parameter "calibration" to the file of this camera, or '
             "calibrate this camera"
         )
@@ -114,18 +112,17 @@ def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) ->
     expected = (camera.width_px, camera.height_px)
     if measured != expected:
         raise CalibrationMismatchError(
-            f"calibration of {calibration.device} is for {measured[0]}x{measured[1]} px, the "
-            f"scene's camera delivers {expected[0]}x{expected[1]} px: calibrate at this size"
+            f"the calibration of {calibration.device} is for {measured[0]}x{measured[1]} px, but "
+            f"the scene's camera delivers {expected[0]}x{expected[1]} px: calibrate at this size"
         )
 
 
 def save_calibration(calibration: StereoCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the calibration file; raises FileWriteError if it cannot be written."""
+    """Write a stereo calibration to a file. Raises FileWriteError if it cannot be written."""
     title = f"Stereo calibration of {calibration.device}, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_calibration(path: Path) -> StereoCalibration:
-    """Read the calibration file; raises CalibrationFileError if it is invalid."""
-    command = "flexsheet calibrate stereo"
-    return read_calibration(StereoCalibration, path, version=CALIBRATION_VERSION, command=command)
+    """Read a stereo calibration from a file. Raises CalibrationFileError if it is invalid."""
+    return read_calibration(StereoCalibration, path, command="flexsheet calibrate stereo")

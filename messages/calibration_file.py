@@ -1,4 +1,4 @@
-"""Read and write calibrations as readable YAML, with every number in full precision."""
+"""Read and write calibrations as YAML files with every number in full precision."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_CALIBRATION_DEPTH = 12
 
 
 class CalibrationFileError(FlexsheetError, ValueError):
-    """Raised for an invalid calibration file; the text names file, key and remedy."""
+    """Raised for an invalid calibration file. The text names file, key and remedy."""
 
     code = "calibration-file"
     exit_code = 2
@@ -35,7 +35,7 @@ class CalibrationFileError(FlexsheetError, ValueError):
 
 
 class CalibrationMismatchError(FlexsheetError, ValueError):
-    """Raised if a calibration was made for a camera, sheet or other device not in the scene."""
+    """Raised if a calibration is not of the scene's camera, sheet or other device."""
 
     code = "calibration-mismatch"
     exit_code = 2
@@ -43,9 +43,10 @@ class CalibrationMismatchError(FlexsheetError, ValueError):
 
 
 def write_calibration(calibration: Part, path: Path, *, title: str, comment: str) -> None:
-    """Write a calibration file; an existing file is only replaced when the new one is complete.
+    """Write a calibration file. An existing file is replaced only after the new file is complete.
 
-    title: first comment line.  comment: second comment line, such as the command; may be empty.
+    title: first comment line. comment: second comment line, such as the command; may be empty.
+    Raises FileWriteError if the file cannot be written.
     """
     yaml = YAML()
     yaml.default_flow_style = None
@@ -59,31 +60,34 @@ def write_calibration(calibration: Part, path: Path, *, title: str, comment: str
 
 
 def _parse(path: Path) -> Any:
-    """Parse a YAML file; raises YAMLError if no calibration command can have written it."""
+    """Parse a YAML file. Raises YAMLError if no calibration command can have written it."""
     with path.open("rb") as file:
         data = file.read(MAX_CALIBRATION_BYTES + 1)
     if len(data) > MAX_CALIBRATION_BYTES:
-        raise YAMLError(f"the file has more than {MAX_CALIBRATION_BYTES} bytes")
+        raise YAMLError(f"the file is larger than {MAX_CALIBRATION_BYTES} bytes")
     return _parse_text(data.decode())
 
 
 @lru_cache(maxsize=8)
 def _parse_text(text: str) -> Any:
-    """Parse YAML text.  The values are shared by all calls: they must not be changed."""
+    """Parse YAML text.
+
+    The caller must not change the result, because later calls return it again.
+    """
     yaml = YAML(typ="safe", pure=True)
     yaml.Composer = CalibrationComposer
     return yaml.load(text)
 
 
 class CalibrationComposer(Composer):
-    """YAML composer that rejects aliases and excessive nesting depth."""
+    """A YAML composer that rejects aliases and excessive nesting."""
 
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         # A few aliases could expand to any number of values.
         if self.parser.check_event(AliasEvent):
-            raise YAMLError("the file contains a YAML alias (*), which calibrations never do")
+            raise YAMLError("the file contains a YAML alias (*), which no calibration contains")
         self.depth += self.parser.check_event(CollectionStartEvent)
         if self.depth > MAX_CALIBRATION_DEPTH:
             raise YAMLError(f"more than {MAX_CALIBRATION_DEPTH} lists or mappings are nested")
@@ -92,13 +96,13 @@ class CalibrationComposer(Composer):
         return node
 
 
-def read_calibration(
-    kind: type[Calibration], path: Path, *, version: int, command: str
-) -> Calibration:
+def read_calibration(kind: type[Calibration], path: Path, *, command: str) -> Calibration:
     """Read a calibration file of one kind.
 
-    command: the command that writes such files, for errors.  Raises CalibrationFileError for a file
-    that is missing, incomplete, of another kind or of another version.
+    version: expected version of the file format. command: command that writes such files, for
+        errors.
+
+    Raises CalibrationFileError if the file is missing, incomplete, or of another kind or version.
     """
     try:
         content = _parse(path)
@@ -109,15 +113,16 @@ def read_calibration(
     # The parser raises undocumented errors for invalid numbers and dates.
     except (YAMLError, ValueError, RecursionError, TypeError) as error:
         raise CalibrationFileError(
-            f"{path}: not a valid calibration file: {str(error)[:200]}; run `{command}` again"
+            f"{path}: this is not a valid calibration file: {str(error)[:200]}; run `{command}`"
         ) from error
     if not isinstance(content, dict) or "version" not in content:
         raise CalibrationFileError(
-            f'{path}: does not contain the key "version": not a calibration; run `{command}`'
+            f"{path}: this is not a calibration, because it has no key `version`; run `{command}`"
         )
+    version = kind.model_fields["version"].default
     if content["version"] != version:
         raise CalibrationFileError(
-            f"{path}: key version: expected {version}, found {content['version']!r}; "
+            f"{path}: the key `version` is {content['version']!r}, expected {version}; "
             f"calibrate again with `{command}`"
         )
     try:
@@ -128,5 +133,5 @@ def read_calibration(
             for problem in error.errors()[:5]
         )
         raise CalibrationFileError(
-            f"{path}: not a calibration of `{command}`: {problems}"
+            f"{path}: this is not a calibration of `{command}`: {problems}"
         ) from error

@@ -1,4 +1,4 @@
-"""Define the clocks of nodes: the system's clock, and a virtual one for tests and replays."""
+"""Define the clocks of nodes: the system's clock, and a virtual clock for tests and replays."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Interface of a monotonic clock; timestamps of clocks with equal `id` may be subtracted."""
+    """The interface of a monotonic clock.
+
+    Timestamps of clocks with equal `id` may be subtracted.
+    """
 
     @property
     def id(self) -> str: ...
@@ -18,14 +21,14 @@ class Clock(Protocol):
 
 
 def read_boot_id() -> str:
-    """Return the kernel's random identifier of this boot, since which CLOCK_MONOTONIC counts."""
+    """Return the kernel's random identifier of the present boot of this host."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def read_namespace_offset() -> str:
-    """Return the time namespace's offset of CLOCK_MONOTONIC, such as "+36000.0".
+    """Return the offset (s) of CLOCK_MONOTONIC in this time namespace, such as "+36000.0".
 
-    Return an empty string if there is none.
+    Return an empty string if there is no offset.
     """
     try:
         lines = Path("/proc/self/timens_offsets").read_text().splitlines()
@@ -52,7 +55,7 @@ class SystemClock:
 
 
 class VirtualClock:
-    """Clock for replays and tests that advances only by `move_to`."""
+    """A clock for replays and tests that advances only by `move_to`."""
 
     def __init__(self, start_ns: int = 0, *, clock_id: str = "virtual") -> None:
         self._now_ns = start_ns
@@ -66,5 +69,5 @@ class VirtualClock:
         return self._now_ns
 
     def move_to(self, now_ns: int) -> None:
-        """Set the time; an earlier time than the current one is ignored."""
+        """Set the time to `now_ns`, unless this is earlier than the current time."""
         self._now_ns = max(self._now_ns, now_ns)

@@ -15,11 +15,11 @@ from flexsheet.messages.types import ClockOffset, Clocks
 M = TypeVar("M", bound=Message)
 
 MAX_STAMP_AHEAD_NS = 20_000_000
-"""Maximum time by which timestamps of another clock may lie in the future of the local clock."""
+"""The maximum time by which another clock's timestamps may be ahead of the local clock."""
 
 
 class ClockTable:
-    """Table of the offsets of other hosts' clocks, from the newest `Clocks` message."""
+    """A table of the offsets of other hosts' clocks, from the newest `Clocks` message."""
 
     def __init__(self, clock_id: str) -> None:
         self._own = clock_id
@@ -28,12 +28,15 @@ class ClockTable:
         self.offsets: dict[str, ClockOffset] = {}
 
     def update(self, clocks: Clocks) -> None:
-        """Replace all offsets by those in a message from the clock node."""
+        """Replace all offsets by those in a message of the clock node."""
         self._limit_s, self._max_drift = clocks.max_offset_uncertainty_s, clocks.max_drift_ratio
         self.offsets = {one.clock_id: one for one in clocks.offsets}
 
     def find_problem(self, clock_id: str, now_ns: int) -> str:
-        """Return why timestamps of a clock are not accurate enough; empty if they are."""
+        """Return why the timestamps of a clock are not accurate enough, or "" if they are.
+
+        now_ns: current time on the local clock.
+        """
         if clock_id == self._own:
             return ""
         offset = self.offsets.get(clock_id)
@@ -49,10 +52,11 @@ class ClockTable:
         )
 
     def shift_ns(self, clock_id: str, at_ns: int) -> int | None:
-        """Return the shift (ns) of timestamps near `at_ns` to the local clock; None: unknown.
+        """Return the shift (ns) that converts timestamps near `at_ns` to the local clock.
 
-        at_ns: publication time of the message on that clock.  All timestamps of a message get the
-        same shift, which preserves their differences.
+        at_ns: publication time of the message on the clock `clock_id`. All timestamps of a message
+            get the same shift, which preserves their differences. Returns None if the offset is
+            unknown.
         """
         offset = self.offsets.get(clock_id)
         if offset is None:
@@ -62,7 +66,8 @@ class ClockTable:
         return -offset.offset_ns - round(since_ns * drift / (1.0 + drift))
 
     def localize(self, message: M, header: Header, now_ns: int) -> tuple[M, Header, str]:
-        """Convert a message and header to the local clock; return also `find_problem` of theirs.
+        """Convert a message and its header to the local clock, and return the result of
+        `find_problem`.
 
         If the offset of a clock is not measured, the message counts as published on arrival.
         """
@@ -85,7 +90,7 @@ class ClockTable:
 
 
 def shift_stamps(message: M, shift_ns: int) -> M:
-    """Return the message with its timestamps shifted; a timestamp of 0 means none and remains 0."""
+    """Return a message with its timestamps shifted, ns. A timestamp of 0 (none) remains 0."""
     moved = {
         name: max(1, value + shift_ns)
         for name in find_stamp_fields(type(message))

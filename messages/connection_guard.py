@@ -1,14 +1,14 @@
-"""Close tcp connections to publishers over which a peer sends more than a subscriber does.
+"""Close tcp connections to publishers on which a peer sends more data than a subscriber does.
 
-A ZeroMQ publisher stores every subscription that a peer sends, in about 45 times its size.  It does
-so within the call that sends the next message, and that call does not return while more
-subscriptions arrive.  ZeroMQ has no option that limits the number of subscriptions or the frames of
-one message.
+A ZeroMQ publisher stores every subscription that a peer sends, which needs about 45 times its size.
+It does so within the call that sends the next message, and that call does not return while more
+subscriptions arrive. ZeroMQ has no option that limits the number of subscriptions or the frames of
+a message.
 
-A subscriber of this package sends only a handshake, one subscription and one answer to each
-heartbeat.  So a thread counts the bytes that the kernel received on each accepted connection
-(TCP_INFO), and closes a connection that received more.  The thread sleeps until data arrives
-(edge-triggered epoll), so it needs no processor time while peers are silent.
+A subscriber of this package sends only a handshake, one subscription, and one reply to each
+heartbeat. A thread therefore counts the bytes that the kernel has received on each accepted
+connection (TCP_INFO), and closes a connection that has received more. The thread sleeps until data
+arrives (edge-triggered epoll), so it needs no processor time while peers send nothing.
 """
 
 from __future__ import annotations
@@ -29,30 +29,39 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 MAX_BYTES_AT_ONCE = 4096
-"""Bytes that a connection may receive at once; a CURVE handshake and a subscription have 900."""
+"""The number of bytes that a connection may receive at once.
+
+A CURVE handshake and a subscription have 900 bytes.
+"""
 
 MAX_BYTES_PER_S = 256
-"""Further bytes per second; an encrypted answer to a heartbeat has 40, once per second."""
+"""The number of further bytes that a connection may receive per second.
+
+An encrypted reply to a heartbeat has 40 bytes and is sent once per second.
+"""
 
 MAX_CONNECTIONS_PER_ADDRESS = 64
-"""Maximum connections of a publisher from one address: a computer's nodes, recorder and tools."""
+"""The maximum number of connections to a publisher from one address.
+
+A computer's nodes, recorder and tools have fewer.
+"""
 
 EXCLUSION_S = 1.0
-"""Time for which new connections are refused from an address that sent too much."""
+"""The time for which new connections are refused from an address that sent too much."""
 
 RECEIVE_BUFFER_BYTES = 16_384
-"""Receive buffer of a connection; its content is still read after the connection is closed."""
+"""The receive buffer of a connection. Its content is still read after the connection is closed."""
 
 THREAD_NAME = "connection guard"
 TCP_INFO_FORMAT, TCP_INFO_BYTES_RECEIVED = "=Q", 128
 
 OnRefused = Callable[[str, str], None]
-"""Callback on the guard's thread, with the peer's address and the reason of the refusal."""
+"""A callback on the guard's thread, with the peer's address and the reason of the refusal."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Publisher:
-    """Monitor socket of a publisher, and the callback for its closed connections."""
+    """The monitor socket of a publisher, and the callback for its closed connections."""
 
     monitor: zmq.Socket[bytes]
     on_refused: OnRefused
@@ -60,7 +69,7 @@ class _Publisher:
 
 @dataclass(frozen=True, slots=True)
 class _Connection:
-    """Accepted connection; identified by its two addresses, because file descriptors are reused."""
+    """An accepted connection, identified by its two addresses. File descriptors are reused."""
 
     publisher: _Publisher
     local: tuple[object, ...]
@@ -72,7 +81,7 @@ class _Connection:
         return str(self.remote[0])
 
     def open(self, fd: int) -> socket.socket | None:
-        """Return a duplicate of the descriptor `fd`; None if another connection uses it now."""
+        """Return a duplicate of the descriptor `fd`, or None if another connection now uses it."""
         try:
             opened = socket.socket(fileno=os.dup(fd))
         except OSError:
@@ -84,7 +93,7 @@ class _Connection:
 
 
 class ConnectionGuard:
-    """Thread that monitors the accepted connections of all publishers of this process."""
+    """A thread that monitors the accepted connections of all publishers of this process."""
 
     _present: ClassVar[ConnectionGuard | None] = None
     _lock: ClassVar[threading.Lock] = threading.Lock()
@@ -98,7 +107,7 @@ class ConnectionGuard:
 
     @classmethod
     def watch(cls, publisher: zmq.Socket[bytes], on_refused: OnRefused) -> None:
-        """Monitor all future connections of a socket, until its monitor is disabled."""
+        """Monitor all future connections of a publisher's socket, until its monitor is disabled."""
         publisher.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER_BYTES)
         events = int(zmq.EVENT_ACCEPTED | zmq.EVENT_MONITOR_STOPPED)
         monitor = publisher.get_monitor_socket(events, f"inproc://accepted-{next(cls._numbers)}")
@@ -123,7 +132,7 @@ class ConnectionGuard:
                     return
 
     def _read_monitor(self, fd: int, publisher: _Publisher) -> bool:
-        """Register new connections; return False if no publisher is left."""
+        """Register new connections. Return False if no publisher is left."""
         while True:
             try:
                 news = parse_monitor_message(publisher.monitor.recv_multipart(zmq.NOBLOCK))
@@ -136,7 +145,7 @@ class ConnectionGuard:
                 self._accept(int(news["value"]), int(endpoint.rpartition(":")[2]), publisher)
 
     def _accept(self, fd: int, port: int, publisher: _Publisher) -> None:
-        """Monitor a connection; close it if its address is excluded or has too many connections."""
+        """Monitor a connection. Close it if its address is excluded or has too many connections."""
         with suppress(OSError), socket.socket(fileno=os.dup(fd)) as opened:
             local, remote = _ends(opened)
             if not remote or local[1] != port:
@@ -160,7 +169,7 @@ class ConnectionGuard:
         self._check(fd)
 
     def _count(self, new: _Connection) -> int:
-        """Count the other connections from the same address; forget those that have ended."""
+        """Count the other connections from the same address, and remove those that have ended."""
         number = 0
         for fd, known in list(self._connections.items()):
             if known.publisher is new.publisher and known.address == new.address:
@@ -173,7 +182,7 @@ class ConnectionGuard:
         return number
 
     def _check(self, fd: int) -> None:
-        """Close a connection that received more than a subscriber sends."""
+        """Close a connection that has received more bytes than a subscriber sends."""
         connection = self._connections.get(fd)
         opened = None if connection is None else connection.open(fd)
         if connection is None or opened is None:
@@ -196,7 +205,7 @@ class ConnectionGuard:
         )
 
     def _remove_publisher(self, fd: int, publisher: _Publisher) -> bool:
-        """Stop monitoring a publisher; return False if it was the last one."""
+        """Stop monitoring a publisher. Return False if no publisher is left."""
         self._epoll.unregister(fd)
         for connected_fd, connection in list(self._connections.items()):
             if connection.publisher is publisher:
@@ -215,7 +224,7 @@ class ConnectionGuard:
 
 
 def _ends(opened: socket.socket) -> tuple[tuple[object, ...], tuple[object, ...]]:
-    """Return the local and the remote address of a connection; empty if it is not connected."""
+    """Return the local and the remote address of a connection, or empty tuples if it is closed."""
     try:
         local, remote = opened.getsockname(), opened.getpeername()
     except OSError:

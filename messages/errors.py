@@ -6,10 +6,10 @@ from typing import ClassVar
 
 
 class FlexsheetError(Exception):
-    """Base class of errors that a user can correct.
+    """The base class of errors that a user can correct.
 
-    code: name of the error for `flexsheet explain`.  remedy: what the user can do.
-    exit_code: exit status of a command that ends with this error.
+    code: name of the error for `flexsheet explain`. remedy: what the user can do. exit_code: exit
+        status of a command that ends with this error.
     """
 
     code: ClassVar[str]
@@ -17,5 +17,5 @@ class FlexsheetError(Exception):
     exit_code: int = 1
 
     def __str__(self) -> str:
-        """Return the error text; without this method, a KeyError would return it in quotes."""
+        """Return the error text. Without this method, a KeyError would return it in quotes."""
         return Exception.__str__(self)

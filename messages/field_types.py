@@ -14,7 +14,7 @@ from flexsheet.messages.arrays import ArraySpec
 
 
 def describe_field_type(field: FieldInfo) -> str:
-    """Return a field's type as Markdown text; models are links to their sections."""
+    """Return a field's type as Markdown. A model is a link to its section."""
     for extra in field.metadata:
         if isinstance(extra, ArraySpec):
             return _array(extra)
@@ -22,7 +22,7 @@ def describe_field_type(field: FieldInfo) -> str:
 
 
 def describe_field(field: FieldInfo) -> dict[str, str]:
-    """Return a field's type without Markdown, its default or "required", and its description."""
+    """Return the type (without Markdown), default and description of a field."""
     # Links keep their text only.
     kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
     return {
@@ -39,7 +39,7 @@ def _default(field: FieldInfo) -> str:
 
 
 def get_annotation(field: FieldInfo) -> Any:
-    """Return the type of a field and its metadata as one annotation (`typing.Annotated`)."""
+    """Return the type of a field and its metadata as one `typing.Annotated`."""
     annotation: Any = field.annotation
     for mark in field.metadata:
         annotation = Annotated[annotation, mark]
@@ -56,7 +56,7 @@ def split_annotation(annotation: Any) -> tuple[Any, ArraySpec | None]:
 
 
 def is_image(spec: ArraySpec) -> bool:
-    """Return whether an array is an image: it has more than one axis of variable length."""
+    """Return whether an array is an image, which has more than one axis of variable length."""
     return sum(isinstance(length, str) for length in spec.shape) > 1
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 from flexsheet.messages.errors import FlexsheetError
 
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO})
-"""Error numbers (errno) that are caused by the disk or its file system."""
+"""The error numbers (errno) that are caused by the disk or its file system."""
 
 
 class FileWriteError(FlexsheetError, OSError):
-    """Raised if a file cannot be written; the text names path, cause, needed and free space."""
+    """Raised if a file cannot be written. The text names path, cause, and needed and free space."""
 
     code = "file-write"
     remedy = "Free space on the disk, create the folder, or give another file."
@@ -24,9 +24,11 @@ class FileWriteError(FlexsheetError, OSError):
 
 
 def write_file(path: Path, content: str | bytes, *, mode: int | None = None) -> None:
-    """Write a file atomically; if writing fails, an existing file remains unchanged.
+    """Write a file atomically. If writing fails, an existing file remains unchanged.
 
-    mode: file permissions; None: the default of the process.  Raises FileWriteError.
+    mode: file permissions; None: the default of the process.
+
+    Raises FileWriteError if the file cannot be written.
     """
     data = content.encode() if isinstance(content, str) else content
     part = path.with_name(f"{path.name}.part")
@@ -48,7 +50,10 @@ def write_file(path: Path, content: str | bytes, *, mode: int | None = None) -> 
 def make_write_error(
     path: Path, error: OSError, *, needed_bytes: int | None = None
 ) -> FileWriteError:
-    """Make the error for a file that could not be written, with a remedy that fits the cause."""
+    """Make the error for a file that could not be written, with a remedy that fits the cause.
+
+    needed_bytes: size of the file, for the text about a full disk; None: unknown.
+    """
     text = f"{path}: cannot be written: {error.strerror or error}"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         needed = "" if needed_bytes is None else f"{_format_size(needed_bytes)} are needed, "
@@ -63,7 +68,7 @@ def make_write_error(
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the free bytes for this user on a folder's disk.
+    """Return the number of bytes that are free for this user on a folder's disk.
 
     Raises OSError if the folder does not exist.
     """

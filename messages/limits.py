@@ -1,8 +1,8 @@
 """Define limits for numbers in scenes, launch files, parameters and calibrations.
 
-A field's name ends in its unit, and each unit has a limit.  A few names have a limit of their own.
-The limits are wide. They only exclude numbers that no hardware of this kind has, and that could
-cause overflow or other numerical faults in the nodes.
+The limit of a number follows from the unit at the end of its field's name. A few names have a limit
+of their own. The limits are wide: they only exclude numbers that no hardware of this kind has, and
+that could cause overflow or other numerical errors in the nodes.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from pydantic import BaseModel, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
 MAX_LENGTH_M = 10.0
-"""The size of a room."""
+"""The maximum length or coordinate: the size of a room."""
 
 MAX_ANGLE_RAD = 7.0
-"""A full rotation plus a margin for rounding."""
+"""The maximum angle: a full rotation plus a margin for rounding."""
 
 MAX_DURATION_S = 86_400.0
 MAX_RATE_HZ = 10_000.0
 MAX_IMAGE_PX = 16_384.0
-"""Largest OpenGL texture on common devices; larger than the image of any camera or projector."""
+"""The maximum size of an image: the largest OpenGL texture on common devices."""
 
 MAX_STRESS_PA = 1.2e12
-"""Young's modulus of diamond, the stiffest material."""
+"""The maximum stress or modulus: Young's modulus of diamond, the stiffest material."""
 
 MAX_FORCE_N = 10_000.0
 MAX_SPEED_M_PER_S = 10.0
-"""Speed of the fastest movements of a hand."""
+"""The maximum speed: the speed of the fastest movements of a hand."""
 
 MAX_TOOL_SPEED_M_PER_S = 2.2
-"""Maximum speed of the RV-1A with all joints together (its specification)."""
+"""The maximum speed of the RV-1A with all joints together, from its specification."""
 
 MAX_STRETCH_RATIO = 10.0
-"""More than the stretch at which natural rubber breaks."""
+"""The maximum stretch ratio of a sheet. Natural rubber breaks at a smaller ratio."""
 
 MAX_NUMBER = 1e9
-"""Maximum magnitude of a number without a unit."""
+"""The maximum magnitude of a number without a unit."""
 
 MAX_SEED = 2.0**63
 MAX_BYTES = 2.0**50
@@ -85,20 +85,26 @@ MAX_BY_UNIT = {
     "_ratio": 1e6,
     "_bytes": MAX_BYTES,
 }
-"""Maximum magnitude by the suffix of a field's name; longer suffixes come first."""
+"""The maximum magnitude by the suffix of a field's name. Longer suffixes come first."""
 
 MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-9, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
-"""Minimum value of positive fields by suffix; a fraction of the resolution of any device."""
+"""The minimum value of positive fields by suffix, below the resolution of any device."""
 
 MIN_POSITIVE = 1e-9
-"""Minimum value of positive fields whose unit is not in `MIN_BY_UNIT`."""
+"""The minimum value of positive fields whose unit is not in `MIN_BY_UNIT`."""
 
 MAX_ROTATION_ERROR = 1e-4
-"""Maximum error of an element of R R^T for a rotation matrix R; 0.05 mm at half a metre."""
+"""The maximum error of an element of R R^T for a rotation matrix R.
+
+It corresponds to 0.05 mm at a distance of half a metre.
+"""
 
 
 class LimitedModel(BaseModel):
-    """Base model that checks numbers against their units' limits, and transforms for rigidity."""
+    """The base class of models whose numbers are limited by their units.
+
+    Matrices of shape (4, 4) must be rigid transforms.
+    """
 
     @field_validator("*", mode="after")
     @classmethod
@@ -132,7 +138,7 @@ def _check_number(value: float, name: str) -> None:
 
 
 def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
-    """Raise ValueError unless a 4x4 matrix is a rigid transform."""
+    """Raise ValueError unless a matrix (4, 4) is a rigid transform."""
     if not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
         raise ValueError("the last row of a rigid transform must be [0, 0, 0, 1]")
     rotation = matrix[:3, :3]
@@ -144,7 +150,7 @@ def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
 
 @cache
 def find_max_magnitude(name: str) -> float:
-    """Return the maximum magnitude of the numbers in a field, from the field's name."""
+    """Return the maximum magnitude of the numbers in a field with this name."""
     if name in MAX_BY_NAME:
         return MAX_BY_NAME[name]
     return next((MAX_BY_UNIT[unit] for unit in MAX_BY_UNIT if name.endswith(unit)), MAX_NUMBER)
@@ -152,7 +158,7 @@ def find_max_magnitude(name: str) -> float:
 
 @cache
 def find_min_positive(name: str) -> float:
-    """Return the minimum value of a positive field, from the field's name."""
+    """Return the minimum value of a positive field with this name."""
     unit = next((unit for unit in MAX_BY_UNIT if name.endswith(unit)), "")
     return MIN_BY_UNIT.get(unit, MIN_POSITIVE)
 

@@ -1,12 +1,12 @@
 """Deliver messages between the nodes of one process without serialization.
 
-A publisher passes each message to the readers (subscribers) in its process, and sends it on its
-socket only while another process has subscribed.  Readers apply the same checks as to messages from
-sockets: writer, plan, order, types, shapes and ranges.  Arrays of at most `INLINE_BYTES` are copied
-as for a socket, because a sender may reuse them.  Larger arrays are shared.  All arrays are
-read-only for the readers.
+A publisher passes each message to the subscribers in its process. It sends the message on its
+    socket only while another process has subscribed. A subscriber applies the same checks as to
+    messages from sockets: writer, plan, order, types, shapes and ranges. Arrays of at most
+    `INLINE_BYTES` are copied, as for a socket, because a sender may reuse them. Larger arrays are
+    shared. All arrays are read-only for the subscribers.
 
-A handler runs in a callback of the loop after that of the sender, never inside `send`.
+A handler runs in a callback of the loop after the sender's callback, never inside `send`.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _SCALARS = frozenset((bool, int, float, str, type(None)))
 
 
 class LocalEnvelope(Envelope):
-    """Message for the readers in the sender's process; it is copied and validated at most once.
+    """A message for the subscribers in the sender's process, copied and validated at most once.
 
-    array_bytes: size of the message's arrays.
+    array_bytes: total size of the message's arrays.
     """
 
     __slots__ = ("_error", "_message", "array_bytes")
@@ -42,7 +42,10 @@ class LocalEnvelope(Envelope):
         self.fields = self._share_fields(original.__dict__)
 
     def open(self) -> Message:
-        """Return the validated message, the same object for every reader; raises WireError."""
+        """Return the validated message, which is the same object for every subscriber.
+
+        Raises WireError if a field is invalid.
+        """
         if self._message is not None:
             return self._message
         if self._error is not None:
@@ -62,7 +65,7 @@ class LocalEnvelope(Envelope):
         return shared
 
     def _share(self, value: Any) -> Any:
-        """Return a value with read-only arrays, and with message parts as dictionaries."""
+        """Return a value with read-only arrays, in which message parts are dictionaries."""
         if isinstance(value, np.ndarray):
             self.array_bytes += value.nbytes
             array = value.copy() if value.nbytes <= INLINE_BYTES else value.view()
@@ -78,7 +81,7 @@ class LocalEnvelope(Envelope):
 
 
 class LocalReceiver(Protocol):
-    """Interface of a subscriber: its checks and handler, which are the same as for sockets."""
+    """The interface of a subscriber, whose checks and handler are the same as for sockets."""
 
     topic: Topic
     counts: Any
@@ -89,14 +92,14 @@ class LocalReceiver(Protocol):
 
 
 class LocalChannel:
-    """Channel for the messages of one writer on one topic, inside its process."""
+    """A channel for the messages of one writer on one topic, inside its process."""
 
     def __init__(self) -> None:
         self._readers: list[LocalConnection] = []
         self._last: LocalEnvelope | None = None
 
     def send(self, topic: Topic, message: Message, header: Header) -> None:
-        """Pass a message to all readers.
+        """Pass a message to all subscribers in this process.
 
         Raises WireError if the arrays are larger than the topic allows.
         """
@@ -116,11 +119,11 @@ class LocalChannel:
             reader.put(envelope)
 
     def forget(self) -> None:
-        """Discard the message that is stored for late readers."""
+        """Discard the message that is stored for late subscribers."""
         self._last = None
 
     def interrupt(self) -> None:
-        """Report to the readers that this writer is disconnected until its next message."""
+        """Report to the subscribers that this writer is disconnected until its next message."""
         for reader in self._readers:
             reader.report_end()
 
@@ -135,22 +138,22 @@ class LocalChannel:
 
 
 class LocalBus:
-    """Channels of one process, found by the endpoints at which its publishers bind."""
+    """The channels of one process, by the endpoints to which its publishers bind."""
 
     def __init__(self, endpoints: Iterable[str]) -> None:
         self._channels = {endpoint: LocalChannel() for endpoint in endpoints}
 
     def find(self, endpoints: Sequence[str]) -> LocalChannel | None:
-        """Return the channel of the first of these endpoints that has one; None if none has."""
+        """Return the channel of the first endpoint that has a channel, or None."""
         return next((self._channels[one] for one in endpoints if one in self._channels), None)
 
 
 class LocalConnection:
-    """Connection of a subscriber to the writers in its own process.
+    """A connection of a subscriber to the writers in its own process.
 
-    writers: names that these writers may have; None: any.
-    max_waiting: length of the queue.  A full queue refuses the newest message, like a socket;
-      the subscriber counts it as a gap.
+    writers: names that these writers may have; None: any name.
+    max_waiting: maximum number of messages in the queue. A full queue drops the newest message, as
+        a socket does, and the subscriber counts it as lost.
     """
 
     def __init__(
@@ -172,13 +175,13 @@ class LocalConnection:
         return self._loop is None
 
     def open(self) -> None:
-        """Start to receive messages; needs a running loop."""
+        """Start to receive messages. This requires a running loop."""
         self._loop = asyncio.get_running_loop()
         for channel in self._channels:
             channel.add(self)
 
     def close(self) -> None:
-        """Stop receiving; messages in the queue are discarded."""
+        """Stop receiving messages, and discard those in the queue."""
         for channel in self._channels:
             channel.remove(self)
         self._waiting.clear()
@@ -198,7 +201,7 @@ class LocalConnection:
             self._loop.call_soon(self._receiver.on_disconnected)
 
     def _read(self) -> None:
-        """Deliver the messages that were queued when the callback began."""
+        """Deliver the messages that are in the queue when this callback begins."""
         self._scheduled = False
         waiting, accept = self._waiting, self._receiver.accept_header
         if len(waiting) == 1:

@@ -14,13 +14,11 @@ from flexsheet.messages.calibration_file import (
 )
 from flexsheet.messages.scene import FingerLengths, NonNegative, Part, Scene
 
-MARKER_CALIBRATION_VERSION = 1
-
 Triple = tuple[float, float, float]
 
 
 class MarkerCalibration(Part):
-    """Position of the marker on a finger, with its uncertainty, for the triangulator."""
+    """The position of the marker on a finger, with its uncertainty."""
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
@@ -48,10 +46,10 @@ class MarkerCalibration(Part):
 
 
 def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
-    """Raise CalibrationMismatchError unless the calibration was made in this scene."""
+    """Raise CalibrationMismatchError if the marker was calibrated in another scene."""
     if calibration.scene != scene.name:
         raise CalibrationMismatchError(
-            f'scene: the marker was calibrated in scene "{calibration.scene}", not in '
+            f'scene: the marker was calibrated in the scene "{calibration.scene}", not in '
             f'"{scene.name}": give the file of this scene, or run `flexsheet calibrate marker`'
         )
 
@@ -59,14 +57,11 @@ def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
 def save_marker_calibration(
     calibration: MarkerCalibration, path: Path, *, comment: str = ""
 ) -> None:
-    """Write the calibration file; raises FileWriteError if it cannot be written."""
+    """Write a marker calibration to a file. Raises FileWriteError if it cannot be written."""
     title = f"Calibration of a finger's marker, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_marker_calibration(path: Path) -> MarkerCalibration:
-    """Read the calibration file; raises CalibrationFileError if it is invalid."""
-    command = "flexsheet calibrate marker"
-    return read_calibration(
-        MarkerCalibration, path, version=MARKER_CALIBRATION_VERSION, command=command
-    )
+    """Read a marker calibration from a file. Raises CalibrationFileError if it is invalid."""
+    return read_calibration(MarkerCalibration, path, command="flexsheet calibrate marker")

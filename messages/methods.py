@@ -1,8 +1,8 @@
 """Define the method families of the nodes, and the choice of methods in a scene.
 
-A method family is a set of interchangeable methods for one task (`nodes/methods.py`).  This module
-defines their names.  `flexsheet tune SCENE` writes the `methods` of a scene.  A node's parameter
-with the value `auto` uses them; any other value overrides them.
+A method family is a set of interchangeable methods for one task (`nodes/methods.py`). This module
+defines their names. `flexsheet tune SCENE` writes the key `methods` of a scene. A node uses these
+methods if its parameter has the value `auto`. Any other value overrides the scene's choice.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ComplianceMode = Literal["force_curve", "stiffness", "constant_stretch"]
 
 
 class SoftBodyChoice(BaseModel):
-    """Method for the deformation of the soft body, and vertex spacing of its surface mesh."""
+    """The method for the soft body's deformation, and the vertex spacing of its surface mesh."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -33,7 +33,7 @@ class SoftBodyChoice(BaseModel):
 
 
 class Methods(BaseModel):
-    """Method that a scene chooses from each method family; None: the node's default."""
+    """The method that a scene chooses from each method family; None: the node's default."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -51,7 +51,11 @@ class Methods(BaseModel):
 
 
 def resolve_method(parameter: T | Literal["auto"], by_scene: T | None, default: T) -> T:
-    """Return a node's method; `auto` means the scene's choice, or the default if there is none."""
+    """Return the method that a node uses.
+
+    parameter: value of the node's parameter; "auto" means the scene's choice. by_scene: choice of
+        the scene; None means `default`.
+    """
     if parameter != "auto":
         return parameter
     return default if by_scene is None else by_scene

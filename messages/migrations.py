@@ -1,13 +1,13 @@
 """Migrate messages from bags that were recorded before a message type changed.
 
-Every bag contains the JSON Schemas of its messages.  Recorded fields remain valid if a type only
-gained fields with defaults, values of a literal, or members of a union; `is_compatible` checks this
-by comparing the two schemas.
+Every bag contains the JSON Schemas of its messages. Recorded fields remain valid if a type only
+gained fields with defaults, literal values, or members of a union. `is_compatible` checks this by
+comparing the two schemas.
 
-A renamed field or literal value needs a line in `RENAMED_FIELDS` or `RENAMED_VALUES`, a removed
-field one in `REMOVED_FIELDS`.  They apply to every recorded version of the type.  Any other change
-needs a line in `MIGRATIONS`: the type, its former fingerprint (`flexsheet bag info --json`), and a
-function that converts the recorded fields to those of the next version.
+A renamed field needs a line in `RENAMED_FIELDS`, a renamed literal value in `RENAMED_VALUES`, and a
+removed field in `REMOVED_FIELDS`. These lines apply to every recorded version of the type. Any
+other change needs a line in `MIGRATIONS`: the type, its former fingerprint (`flexsheet bag info
+--json`), and a function that converts the recorded fields to those of the next version.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Schema = Mapping[str, Any]
 
 
 RENAMED_TOPICS: dict[str, str] = {"moment": "bookmark"}
-"""Mapping from former to current names of topics."""
+"""The current names of renamed topics, by former name."""
 
 RENAMED_TYPES: dict[str, str] = {"Moment": "Bookmark"}
-"""Mapping from former to current names of message types."""
+"""The current names of renamed message types, by former name."""
 
 RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "Fingertip": {
@@ -57,7 +57,7 @@ RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "SoftBody": {"lead_s": "prediction_horizon_s"},
     "TwinEye": {"proper": "expected"},
 }
-"""Mapping from former to current field names, by message, message part or calibration."""
+"""The current names of renamed fields, by model and former name."""
 
 RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Fingertip", "reason"): {
@@ -79,7 +79,7 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     },
     ("Methods", "sheet_force"): {"cubic": "scaled", "linear": "scaled"},
 }
-"""Mapping from former to current literal values, by model and current field name."""
+"""The current names of renamed literal values, by model, current field name and former value."""
 
 SHEET_REASONS = {
     "": "ok",
@@ -94,7 +94,7 @@ SHEET_REASONS = {
     "sheet turned too far about its normal; lift the finger": "beyond_spin",
     "hollow place: the flat sheet rests on its rim": "concave_contact",
 }
-"""Mapping from former texts of `SheetTarget.reason` to current literals."""
+"""The current literals for former texts of `SheetTarget.reason`."""
 
 
 def _convert_sheet_reason(recorded: str) -> str:
@@ -110,19 +110,19 @@ def _convert_sheet_reason(recorded: str) -> str:
 TEXTS_TO_LITERALS: dict[tuple[str, str], Callable[[str], str]] = {
     ("SheetTarget", "reason"): _convert_sheet_reason,
 }
-"""Functions that convert a former text to the current literal, by model and current field name."""
+"""The functions that convert a former text to a current literal, by model and field name."""
 
 REMOVED_FIELDS: dict[str, frozenset[str]] = {
     "FingerTruth": frozenset({"hand_damping_ns_per_m"}),
     "Methods": frozenset({"kinematics"}),
 }
-"""Names of removed fields, by model."""
+"""The names of removed fields, by model."""
 
 _STROKE_LABEL = re.compile(r"stroke (\d+(?:\.\d+)?) s")
 
 
 def _add_stroke_duration(fields: Fields) -> Fields:
-    """Add the moving time of a stroke, which older messages contain only in the path's label."""
+    """Add the duration of a stroke, which old messages contain only in the path's label."""
     found = _STROKE_LABEL.fullmatch(fields["path_label"])
     return {**fields, "path_stroke_s": None if found is None else float(found[1])}
 
@@ -139,10 +139,10 @@ _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf
 def find_migration(
     message_type: type[Message], fingerprint: str, recorded_schema: Schema
 ) -> Migration | None:
-    """Return the function that converts recorded fields to the current type; None if there is none.
+    """Return the function that converts recorded fields to the current type, or None.
 
-    fingerprint: fingerprint of the recorded type, hexadecimal.  recorded_schema: JSON Schema from
-    the bag.
+    fingerprint: hexadecimal fingerprint of the recorded type.
+    recorded_schema: JSON Schema of the recorded type.
     """
     if fingerprint == compute_fingerprint(message_type).hex():
         return _unchanged
@@ -156,7 +156,7 @@ def find_migration(
 
 
 def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
-    """Replace former names in a recorded schema by current ones."""
+    """Replace former names in a recorded schema by current names."""
     parts = recorded.get("$defs", {})
     if not isinstance(parts, Mapping):
         return recorded
@@ -165,7 +165,7 @@ def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
 
 
 def _literal_schema(model: str, recorded: Schema, current: Schema) -> Schema:
-    """Replace text fields in a recorded schema by the literals that replaced their texts."""
+    """Replace text fields in a recorded schema by the literals that have replaced their texts."""
     properties = recorded.get("properties")
     if not isinstance(properties, Mapping):
         return recorded
@@ -246,7 +246,7 @@ def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the only model that an annotation allows; None if it allows none or several."""
+    """Return the only model that an annotation allows, or None if it allows none or several."""
     options = [annotation, *get_args(annotation)]
     models = [one for one in options if isinstance(one, type) and issubclass(one, BaseModel)]
     return models[0] if len(models) == 1 else None
@@ -267,7 +267,7 @@ def _unchanged(fields: Fields) -> Fields:
 
 
 class _Comparison:
-    """Comparison of a recorded JSON Schema with the current one, part by part."""
+    """A comparison of a recorded JSON Schema with the current schema."""
 
     def __init__(self, old_parts: Schema, new_parts: Schema) -> None:
         self._old_parts, self._new_parts = old_parts, new_parts
@@ -308,7 +308,7 @@ class _Comparison:
 
 
 def _resolve(schema: Any, parts: Schema) -> Any:
-    """Follow a chain of references in a schema; raises TypeError for a cycle."""
+    """Follow the references in a schema to the schema they name. Raises TypeError for a cycle."""
     for _ in range(len(parts) + 1):
         if not (isinstance(schema, Mapping) and "$ref" in schema):
             return schema
@@ -321,7 +321,7 @@ def _options(schema: Schema) -> list[Any]:
 
 
 def _allowed_values(schema: Schema) -> set[Any]:
-    """Return the literal values that a schema allows; {None} if it does not restrict them."""
+    """Return the literal values that a schema allows, or {None} if it does not restrict them."""
     if "const" in schema:
         return {schema["const"]}
     return set(schema["enum"]) if "enum" in schema else {None}

@@ -10,10 +10,9 @@ BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row 
 
 
 class NodeNote(Enum):
-    """Notes, reasons and warnings of nodes that require an action of the user.
+    """The notes, reasons and warnings of nodes that require an action of the user.
 
-    phrase: constant part of the text; nodes that report the note use it. remedy: what the user can
-    do.
+    phrase: constant part of the reported text. remedy: what the user can do.
     """
 
     COMPUTER_BUSY = (
@@ -21,7 +20,7 @@ class NodeNote(Enum):
         "Nodes wait for a processor. End other programs, or give the graph more cores.",
     )
     TARGET_OR_ARM_LATE = (
-        "sheet target or other arm late",
+        "the sheet target or the other arm is late",
         BUSY_FIRST + "Then check the network, and the rate of each topic: `flexsheet topic hz`.",
     )
     OTHER_ARM_SILENT = (
@@ -55,23 +54,23 @@ class NodeNote(Enum):
     )
     FOLLOWS_OTHER_ARM = (
         "waits for the other arm",
-        "Both arms move together. `flexsheet arms status` shows what the other one waits for.",
+        "Both arms move together. `flexsheet arms status` shows what the other arm waits for.",
     )
     OTHER_ARM_NOT_READY = (
         "the other arm is not ready",
-        "Enable both arms: `flexsheet arms enable`. It prints the reason if an arm refuses.",
+        "Run `flexsheet arms enable`, which prints the reason if an arm is not ready.",
     )
     OTHER_ARM_FAULT = (
         "other arm:",
-        "Remove the cause at the other arm, then reset: `flexsheet arms reset`.",
+        "Remove the cause at the other arm. Then run `flexsheet arms reset`.",
     )
     NOT_READY = (
         "not ready",
-        "Check that nobody is near the arms, then: `flexsheet arms enable`.",
+        "Check that nobody is near the arms. Then run `flexsheet arms enable`.",
     )
     DISABLED = (
         "disabled",
-        "Somebody has disabled the arms. Ask why, then: `flexsheet arms enable`.",
+        "An operator has disabled the arms. Ask for the reason. Then run `flexsheet arms enable`.",
     )
     RESTARTING = (
         "restarts after a reset",
@@ -83,15 +82,16 @@ class NodeNote(Enum):
     )
     CHECKING_PATH = (
         "checks the path to the target",
-        "Wait: the arms search for a path without collision. It takes at most a few seconds.",
+        "Wait: the arms search for a path without collision, which takes a few seconds at most.",
     )
     MEASURED_VIOLATION = (
         "measured:",
-        "The arm has left its limits. Move it back by hand, then: `flexsheet arms reset`.",
+        "The arm has left its limits. Move it back by hand. Then run `flexsheet arms reset`.",
     )
     COMMANDED_VIOLATION = (
         "commanded:",
-        "A command was outside a limit and was not sent. Reset, and report it with a recording.",
+        "A command was outside a limit and was not sent. Run `flexsheet arms reset`, and report "
+        "this error with a recording.",
     )
     JOINT_RANGE = (
         "joint out of range",
@@ -103,15 +103,16 @@ class NodeNote(Enum):
     )
     COMMAND_NOT_FINITE = (
         "command not finite",
-        "The controller received an invalid number. Check the network, and report it.",
+        "The controller received an invalid number. Check the network, and report this error.",
     )
     CONTROLLER_WATCHDOG = (
         "watchdog: no command",
-        BUSY_FIRST + "Then read the log of the arm's bridge, and reset: `flexsheet arms reset`.",
+        BUSY_FIRST + "Then read the log of the arm's bridge, and run `flexsheet arms reset`.",
     )
     STATUS_STALE = (
         "its joints are not used",
-        "The controller's program stands still or restarts: check it, then reset.",
+        "The controller's program has stopped or restarts. Check the program. Then run "
+        "`flexsheet arms reset`.",
     )
     NO_PATH = (
         "no path:",
@@ -119,11 +120,11 @@ class NodeNote(Enum):
     )
     NOT_RECORDING = (
         "NOT RECORDING:",
-        "Free space on the disk, or record to another one. Then the next bag starts automatically.",
+        "Free space on the disk, or record to another disk. The next bag starts automatically.",
     )
     NODE_HUNG = (
         "hung: no heartbeat",
-        "The node is restarted. The end of `logs/NODE.log` of the run shows its stack. "
+        "The node is restarted. The end of its log (`flexsheet logs`) shows its stack. The key "
         "`liveness_s` of the launch file sets the time-out.",
     )
     KEY_REFUSED = (
@@ -133,12 +134,12 @@ class NodeNote(Enum):
     )
     NO_KEYS_THERE = (
         "does not accept keys; its launch file may have none",
-        "Start that host with a launch file that has keys, the same on all hosts.",
+        "Start all hosts with the same launch file, which must contain keys.",
     )
     KEY_NOT_PROVED = (
         "did not prove that it has its key",
         "The secret key of that host does not match its public key in the launch file, or another "
-        "program uses its address: `flexsheet doctor hosts`.",
+        "program uses its address. `flexsheet doctor hosts` shows which host it is.",
     )
     READER_TOO_SLOW = (
         "a subscriber or the network is too slow",
@@ -156,15 +157,16 @@ class NodeNote(Enum):
     )
     CLOCK_UNCERTAIN = (
         "ms are allowed",
-        "Reduce the traffic of the network, set up chrony, or allow more (docs/clocks.md).",
+        "Reduce the traffic of the network, set up chrony, or increase `max_offset_uncertainty_s` "
+        "(docs/clocks.md).",
     )
     ESTOP_KEPT = (
         "latched until it is reset",
-        "Reset it when the danger is over: `flexsheet arms reset`.",
+        "Run `flexsheet arms reset` when the danger is over.",
     )
     LAST_SHEET_PLANE = (
         "keeping the last valid sheet plane",
-        "The arms are silent, or the sheet faces away. The renderer recovers automatically.",
+        "The arms send no state, or the sheet faces away. The renderer recovers automatically.",
     )
 
     def __init__(self, phrase: str, remedy: str) -> None:
@@ -173,16 +175,16 @@ class NodeNote(Enum):
 
     @property
     def code(self) -> str:
-        """Return the name for `flexsheet explain`."""
+        """Return the name of the note for `flexsheet explain`."""
         return self.name.lower().replace("_", "-")
 
 
 SHEET_REASON_TEXTS: dict[SheetReason, str] = {
     "ok": "",
     "fingertip_invalid": "the fingertip is not tracked",
-    "fingertip_not_finite": "the fingertip is not finite",
-    "fingertip_too_old": "the fingertip is too old",
-    "fingertip_in_future": "the fingertip is stamped in the future",
+    "fingertip_not_finite": "the fingertip's position is not finite",
+    "fingertip_too_old": "the measured fingertip is too old",
+    "fingertip_in_future": "the fingertip's timestamp is in the future",
     "implausible_input": "the finger is too far away or too fast",
     "ambiguous_side": "the finger is inside the object, and its side is unclear",
     "through_object": "the finger has passed through the object",
@@ -193,14 +195,14 @@ SHEET_REASON_TEXTS: dict[SheetReason, str] = {
     "past_sheet_height": "the finger is past the sheet's usable height",
     "concave_contact": "the object is concave there, and the flat sheet touches its rim",
 }
-"""Why the sheet holds its pose, by `reason` of the topic `sheet_target`; the console shows it."""
+"""The texts of the console for `reason` of the topic `sheet_target`."""
 
 SHEET_REASON_REMEDIES: dict[SheetReason, str] = {
-    "fingertip_invalid": "Find out why: `flexsheet topic echo fingertip --field reason`.",
+    "fingertip_invalid": "`flexsheet topic echo fingertip --field reason` prints the reason.",
     "fingertip_not_finite": "Report this error of the triangulator, with a recording.",
     "fingertip_too_old": BUSY_FIRST + "Then check camera and triangulator: `flexsheet status`.",
     "fingertip_in_future": "Check the clocks of the hosts: `flexsheet doctor hosts`.",
-    "implausible_input": "Move the finger into the working range, slower; cover reflections.",
+    "implausible_input": "Move the finger slowly into the working range, and cover reflections.",
     "ambiguous_side": "Lift the finger out of the object, and approach it from one side.",
     "through_object": "Lift the finger, and approach the object from the front again.",
     "past_object_edge": "Move the finger back to the object's surface.",
@@ -210,30 +212,30 @@ SHEET_REASON_REMEDIES: dict[SheetReason, str] = {
     "past_sheet_height": "Move the finger towards the middle of the sheet.",
     "concave_contact": "Touch the object beside the hollow: a flat sheet cannot enter it.",
 }
-"""Remedies by `reason` of the topic `sheet_target`, except "ok"."""
+"""The remedies for each `reason` of the topic `sheet_target`, except "ok"."""
 
 
 FINGERTIP_REMEDIES: dict[FingertipReason, str] = {
-    "no_marker": "Move the finger into the view, replace a lost marker, or expose longer.",
+    "no_marker": "Move the finger into view, replace a lost marker, or use a longer exposure.",
     "marker_in_one_view": "One camera does not see the marker: move the finger or the camera.",
     "two_markers": "Cover reflections, and use one marked finger only.",
     "merged": "Remove the bright spot that touches the marker's image.",
-    "blurred": "The finger is too fast for the exposure: expose shorter, with more light.",
-    "saturated": "The marker is overexposed: expose shorter.",
+    "blurred": "The finger is too fast: use a shorter exposure and more light.",
+    "saturated": "The marker is overexposed: use a shorter exposure.",
     "outside_volume": "Move the finger into the working range of the scene.",
-    "inconsistent": "The rays of both views do not meet: calibrate the camera again.",
+    "inconsistent": "The rays of both views do not intersect: calibrate the camera again.",
     "too_fast": "A jump faster than a finger is usually a reflection: cover it.",
     "unconfirmed": "Wait: a new marker is accepted after a few images.",
 }
-"""Remedies by `reason` of the topic `fingertip`, except "ok"."""
+"""The remedies for each `reason` of the topic `fingertip`, except "ok"."""
 
 SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
     "camera_moved": "the stereo camera is not where the scene says",
-    "cameras_misaligned": "one of the two cameras has moved against the other",
+    "cameras_misaligned": "one of the two cameras has moved relative to the other",
     "marker_offset": "the finger's marker is not at its assumed position",
     "servo_lag": "the lag of the arm differs from the configured one",
     "sheet_stiffness": "the sheet is not as stiff as the scene states",
-    "arm_not_following": "the arm does not do the commanded motion",
+    "arm_not_following": "the arm does not execute the commanded motion",
     "projector_moved": "the projector's pose or lens differs from the scene",
     "arm_base_moved": "the sheet is not where the arms' poses say: a base or a clamp has moved",
     "camera_or_projector_moved": "the stereo camera or the projector is not where the scene says",
@@ -241,7 +243,7 @@ SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
     "says",
     "display_latency": "projected images appear later than assumed",
 }
-"""Sentences for the causes that a self-check of a node suspects."""
+"""The descriptions of the causes that a self-check of a node suspects."""
 
 SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "camera_moved": "Fasten the camera, and calibrate its pose again (docs/set-up-camera.md).",
@@ -261,7 +263,7 @@ SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "apart, or calibrate both again.",
     "display_latency": "Set `display_latency_s` of the renderer to the measured latency.",
 }
-"""Remedies for the causes that a self-check of a node suspects."""
+"""The remedies for the causes that a self-check of a node suspects."""
 
 _SHOWN_UNITS = {
     "m": ("mm", 1e3),

@@ -1,8 +1,8 @@
 """Define the scene: object, devices, working range and tolerances.
 
-A scene file (`launch/scenes/*.yaml`) contains these fields; a mesh is given by its file (see
-`launch/objects/meshes.py`).  Units are metres, radians and pascals.  The world frame has its origin
-at the centre of the imaginary screen, x to the right, y up, z towards the user.
+Scene files (`launch/scenes/*.yaml`) contain these fields. Units are metres, radians and pascals.
+The world frame has its origin at the centre of the imaginary screen, x to the right, y up, and z
+towards the user.
 """
 
 from __future__ import annotations
@@ -23,35 +23,38 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Small = Annotated[float, Field(ge=-0.5, le=0.5)]
-"""Relative deviation or small angle; a value outside this range indicates a mistake in the file."""
+"""A relative deviation or a small angle. A larger magnitude indicates a mistake in the file."""
 
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 SmallSix = tuple[Small, Small, Small, Small, Small, Small]
 
 MAX_AXIS_ERROR = 1e-6
-"""Maximum deviation of the length of a joint axis vector from 1."""
+"""The maximum deviation of the length of a joint axis vector from 1."""
 
 
 class Part(MessagePart, LimitedModel):
-    """Base class of the parts of scenes and calibrations; checks each number by its unit."""
+    """The base class of the parts of scenes and calibrations. It limits each number by its unit."""
 
 
 class Pose(Part):
-    """Pose of a frame in its parent; roll, pitch, yaw: rotations about fixed x, y, z, in order."""
+    """The pose of a frame in its parent frame.
+
+    Roll, pitch and yaw are rotations about the fixed x, y and z axes, in this order.
+    """
 
     position_m: Vector3
     rpy_rad: Vector3
 
 
 class Material(Part):
-    """Linear elastic constants of the soft object."""
+    """The linear elastic constants of the soft object."""
 
     young_modulus_pa: Positive
     poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)]
 
 
 class Cylinder(Part):
-    """Solid circular cylinder whose axis is x of the object frame, centred on the origin.
+    """A solid circular cylinder about the x axis of the object frame, centred on the origin.
 
     The user touches its curved surface, not its flat ends.
     """
@@ -62,33 +65,35 @@ class Cylinder(Part):
 
 
 class Sphere(Part):
-    """Solid sphere about the object frame's origin."""
+    """A solid sphere about the origin of the object frame."""
 
     shape: Literal["sphere"] = "sphere"
     radius_m: Positive
 
 
 class Ellipsoid(Part):
-    """Solid ellipsoid about the object frame's origin."""
+    """A solid ellipsoid about the origin of the object frame."""
 
     shape: Literal["ellipsoid"] = "ellipsoid"
-    semi_axes_m: tuple[Positive, Positive, Positive] = Field(description="along x, y, z")
+    semi_axes_m: tuple[Positive, Positive, Positive] = Field(
+        description="lengths of the semi-axes along x, y and z"
+    )
 
 
 class Plane(Part):
-    """Half-space below z = 0 of the object frame; a rectangle about the origin can be touched."""
+    """A half-space below z = 0 of the object frame. A rectangle at the origin can be touched."""
 
     shape: Literal["plane"] = "plane"
-    width_m: Positive = Field(description="along x")
-    height_m: Positive = Field(description="along y")
+    width_m: Positive = Field(description="size along x")
+    height_m: Positive = Field(description="size along y")
 
 
 class RoundedBox(Part):
-    """Solid box about the object frame's origin with rounded edges and corners."""
+    """A solid box with rounded edges and corners, centred on the origin of the object frame."""
 
     shape: Literal["rounded_box"] = "rounded_box"
     size_m: tuple[Positive, Positive, Positive] = Field(
-        description="along x, y, z, including the rounded edges"
+        description="size along x, y and z, including the rounded edges"
     )
     edge_radius_m: Positive
 
@@ -103,10 +108,10 @@ class RoundedBox(Part):
 
 
 class Mesh(Part):
-    """Smooth solid that approximates a closed triangle mesh.
+    """A smooth solid that approximates a closed triangle mesh.
 
-    The scene message contains the whole mesh, so that all nodes on all hosts use the same one.  A
-    scene file names the mesh's file with `shape: mesh_file`; see `launch/objects/meshes.py`.
+    The scene message contains the whole mesh, so all nodes on all hosts use the same mesh. A scene
+    file names the mesh's file with `shape: mesh_file`.
     """
 
     shape: Literal["mesh"] = "mesh"
@@ -122,7 +127,7 @@ Geometry = Annotated[
 
 
 class StripSupport(Part):
-    """Support that fixes the surface of a soft object on the side that faces away from the user."""
+    """A support that fixes the surface of a soft object where it faces away from the user."""
 
     kind: Literal["strip"] = "strip"
     angle_rad: Positive = Field(
@@ -132,7 +137,7 @@ class StripSupport(Part):
 
 
 class BaseSupport(Part):
-    """Support that fixes the lowest part of the surface, like a table under the object."""
+    """A support that fixes the lowest part of the surface, as a table under the object does."""
 
     kind: Literal["base"] = "base"
     height_m: Positive = Field(
@@ -152,24 +157,24 @@ class BaseSupport(Part):
 
 
 class SpherePatchSupport(Part):
-    """Support that fixes the surface within a sphere, like a clamp."""
+    """A support that fixes the surface within a sphere, as a clamp does."""
 
     kind: Literal["sphere_patch"] = "sphere_patch"
-    centre_m: Vector3 = Field(description="object frame")
+    centre_m: Vector3 = Field(description="centre of the sphere in the object frame")
     radius_m: Positive
 
 
 class BoxPatchSupport(Part):
-    """Support that fixes the surface within a box along the axes of the object frame."""
+    """A support that fixes the surface within a box along the axes of the object frame."""
 
     kind: Literal["box_patch"] = "box_patch"
-    min_m: Vector3 = Field(description="object frame")
-    max_m: Vector3
+    min_m: Vector3 = Field(description="lower corner of the box in the object frame")
+    max_m: Vector3 = Field(description="upper corner of the box in the object frame")
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
         if not (self.min_m < self.max_m).all():
-            raise ValueError(f"min_m: {self.min_m} must be below max_m: {self.max_m} on every axis")
+            raise ValueError(f"min_m {self.min_m} must be below max_m {self.max_m} on every axis")
         return self
 
 
@@ -180,10 +185,10 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class Appearance(Part):
-    """Colour and texture of the object; the texture moves with the surface and so shows its strain.
+    """The colour and texture of the object. The texture moves with the surface, and so shows its
+    strain.
 
-    `texture: image` needs an image; a scene file gives its file as `image_file` (see
-    `launch/objects/textures.py`).
+    `texture: image` needs an image, whose file a scene file names as `image_file`.
     """
 
     colour: tuple[Fraction, Fraction, Fraction] = Field(
@@ -196,8 +201,8 @@ class Appearance(Part):
     )
     image: ColorImage | None = Field(
         default=None,
-        description="top row first; projected along the object frame's z and scaled to the "
-        "object's width and height",
+        description="rows from top to bottom; the image is projected along the object frame's z "
+        "and scaled to the object's width and height",
     )
 
     @model_validator(mode="after")
@@ -208,9 +213,9 @@ class Appearance(Part):
 
 
 class VirtualObject(Part):
-    """Virtual object; if it has no material, it is rigid.
+    """The virtual object, which is rigid if it has no material.
 
-    `support_angle_rad: x` in a scene file is short for `support: {kind: strip, angle_rad: x}`.
+    In a scene file, `support_angle_rad: x` is short for `support: {kind: strip, angle_rad: x}`.
     """
 
     geometry: Geometry
@@ -247,17 +252,20 @@ class VirtualObject(Part):
 
     @property
     def support_angle_rad(self) -> float:
-        """Return the angle of the fixed strip; raises UnfitGeometryError for other supports."""
+        """Return the angle (rad) of the fixed strip.
+
+        Raises UnfitGeometryError for another support.
+        """
         if not isinstance(self.support, StripSupport):
             raise UnfitGeometryError(
-                'object.support.kind: expected "strip", found '
-                f'"{None if self.support is None else self.support.kind}"'
+                "object.support.kind of the scene is "
+                f'"{None if self.support is None else self.support.kind}", expected "strip"'
             )
         return self.support.angle_rad
 
 
 class SheetSpec(Part):
-    """Rubber sheet, clamped at its left and right edges (x), free at top and bottom (y)."""
+    """The rubber sheet, clamped at its left and right edges (x) and free at top and bottom (y)."""
 
     width_m: Positive = Field(
         description="distance between the clamped edges when the sheet is unstretched"
@@ -270,8 +278,8 @@ class SheetSpec(Part):
     )
     hysteresis_ratio: Annotated[float, Field(ge=0, lt=1)] = Field(
         default=0.0,
-        description="fraction of the loading energy that the rubber loses in a cycle, by which the "
-        "rendered force is corrected; a sheet calibration replaces it",
+        description="fraction of the loading energy that the rubber loses in a cycle; the rendered "
+        "force is corrected by it; a sheet calibration replaces it",
     )
     max_stretch_ratio: Annotated[float, Field(gt=1)]
     min_stretch_ratio: Annotated[float, Field(ge=1)] = 1.0
@@ -282,7 +290,7 @@ class SheetSpec(Part):
 
 
 class ArmModel(Part):
-    """Base class of the models of a 6-axis arm: its name and the limits of its joints."""
+    """The base class of the models of a 6-axis arm: its name and the limits of its joints."""
 
     name: str
     min_rad: Six = Field(description="lower end of each joint's range")
@@ -291,8 +299,8 @@ class ArmModel(Part):
         description="maximum speed of each joint"
     )
     start_rad: Six = Field(
-        description="joints at which the arm reaches towards the sheet; they select the elbow, "
-        "shoulder and wrist with which it holds the sheet"
+        description="joint angles of a pose towards the sheet; they select the configuration of "
+        "elbow, shoulder and wrist with which the arm holds the sheet"
     )
 
     def __str__(self) -> str:
@@ -311,7 +319,7 @@ class ArmModel(Part):
 
 
 class JointChain(ArmModel):
-    """Arm as a chain of six rotary joints, as read from a URDF; its kinematics are numeric."""
+    """An arm that is a chain of six rotary joints, as read from a URDF file."""
 
     kind: Literal["joint_chain"] = "joint_chain"
     origins: tuple[Pose, Pose, Pose, Pose, Pose, Pose] = Field(
@@ -327,15 +335,15 @@ class JointChain(ArmModel):
     def _check_axes(self) -> Self:
         for number, axis in enumerate(self.axes, start=1):
             if not abs(math.hypot(*axis) - 1.0) <= MAX_AXIS_ERROR:
-                raise ValueError(f"axes: the axis of J{number} must have length 1, not {axis}")
+                raise ValueError(f"axes: the axis of J{number} is {axis}; its length must be 1")
         return self
 
 
 class ClosedFormArm(ArmModel):
-    """Arm with the axes z, y, y, z, y, z, of which the last three meet in one point.
+    """An arm with the axes z, y, y, z, y, z, of which the last three intersect in one point.
 
-    At joint angles of zero the arm is upright, and every frame is parallel to the base.  Its
-    kinematics have a closed form.
+    At joint angles of zero, the arm is upright, and every frame is parallel to the base. The
+    inverse kinematics are a formula.
     """
 
     kind: Literal["closed_form"] = "closed_form"
@@ -382,7 +390,10 @@ RV_1A = ClosedFormArm(
     speed_rad_per_s=_radians(180, 90, 135, 180, 180, 210),
     start_rad=_radians(0, 25, 119, 0, -54, 0),
 )
-"""Mitsubishi RV-1A, from two public models (Adolphus `mitsubishirv1a.yaml`, ICube `mrv1a.urdf`)."""
+"""The Mitsubishi RV-1A.
+
+Source: two public models (Adolphus `mitsubishirv1a.yaml`, ICube `mrv1a.urdf`).
+"""
 
 RV_2FR = ClosedFormArm(
     name="rv-2fr",
@@ -396,19 +407,20 @@ RV_2FR = ClosedFormArm(
     speed_rad_per_s=_radians(300, 150, 300, 450, 450, 720),
     start_rad=_radians(0, 10, 115, 0, -35, 0),
 )
-"""Mitsubishi RV-2FR, from the manufacturer's public model (`melfa_description`).
+"""The Mitsubishi RV-2FR, from the manufacturer's public model (`melfa_description`).
 
-The elbow is shifted towards the back, as in the RV-1A.  Only then does the maximum reach of the
-wrist centre equal the 504 mm of the data sheet."""
+The elbow is shifted backwards, as in the RV-1A. Only then does the maximum reach of the wrist
+centre equal the 504 mm of the data sheet.
+"""
 
 ARM_MODELS = {arm.name: arm for arm in (RV_1A, RV_2FR)}
-"""Known arm models, which a scene may select by name."""
+"""The known arm models, which a scene may select by name."""
 
 
 class ArmSpec(Part):
-    """Robot arm: its model, the pose of its base, and the pose of its sheet edge on its flange.
+    """A robot arm: its model, the pose of its base, and the pose of the sheet's edge on its flange.
 
-    Sheet frame: x from the left edge to the right edge, y along the edges, z towards the user.
+    Sheet frame: x from the left to the right edge, y along the edges, z towards the user.
     """
 
     model: Annotated[ClosedFormArm | JointChain, Field(discriminator="kind")] = Field(
@@ -418,7 +430,8 @@ class ArmSpec(Part):
     )
     world_from_base: Pose
     flange_from_edge: Pose = Field(
-        description="pose of the clamped edge's centre in the flange frame; axes as the sheet frame"
+        description="pose of the clamped edge's centre in the flange frame; its axes are those of "
+        "the sheet frame"
     )
     joint_offsets_rad: SmallSix = Field(
         default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
@@ -426,8 +439,8 @@ class ArmSpec(Part):
     )
     flange_compliance_m_per_n: Annotated[float, Field(ge=0, le=1e-2)] = Field(
         default=0.0,
-        description="displacement of the flange per newton of the sheet's tension, for which the "
-        "arm's commands are corrected",
+        description="displacement of the flange per newton of the sheet's tension; the commands to "
+        "the arm are corrected by it",
     )
 
     @field_validator("model", mode="before")
@@ -441,7 +454,7 @@ class ArmSpec(Part):
 
 
 class Arms(Part):
-    """Both robot arms and their common limits."""
+    """The two robot arms and their common limits."""
 
     left: ArmSpec
     right: ArmSpec
@@ -454,7 +467,7 @@ class Arms(Part):
 
 
 class Lens(Part):
-    """Pinhole camera with Brown's distortion (k1, k2, p1, p2, k3) as defined by OpenCV, px."""
+    """A pinhole camera with Brown's distortion (k1, k2, p1, p2, k3), as defined by OpenCV."""
 
     fx_px: Positive
     fy_px: Positive
@@ -464,7 +477,7 @@ class Lens(Part):
 
 
 class StereoCamera(Part):
-    """Stereo camera; both camera frames have x right, y down, z along the optical axis (OpenCV)."""
+    """The stereo camera. Both camera frames have x right, y down and z along the optical axis."""
 
     device: str
     width_px: Annotated[int, Field(gt=0)]
@@ -472,7 +485,8 @@ class StereoCamera(Part):
     rate_hz: Positive
     exposure_s: Positive
     gain: Finite | None = Field(
-        default=None, description="gain in units of the device; null: the device's setting"
+        default=None,
+        description="gain in units of the device; null: the present setting of the device",
     )
     read_noise_levels: Positive = Field(
         default=1.5,
@@ -489,7 +503,10 @@ class StereoCamera(Part):
 
 
 class Projector(Part):
-    """Projector with the lens model of a camera; z of its frame points along the projection."""
+    """The projector, which has the lens model of a camera.
+
+    The z axis points along the projection.
+    """
 
     width_px: Annotated[int, Field(gt=0)]
     height_px: Annotated[int, Field(gt=0)]
@@ -504,7 +521,10 @@ class Projector(Part):
 
 
 class Eyes(Part):
-    """Midpoint between the user's eyes; each eye is half the interocular distance away along x."""
+    """The midpoint between the user's eyes.
+
+    Each eye is half the interocular distance away along x.
+    """
 
     centre_world_m: Vector3
     interocular_m: NonNegative
@@ -517,8 +537,9 @@ FingerLengths = tuple[FingerLength, FingerLength, FingerLength]
 class Finger(Part):
     """The user's finger, its marker and its limits.
 
-    The finger's frame has its origin at the pad's contact point, x along `direction_world`, z out
-    of the nail, and y level. Its direction in the world is constant.
+    The finger's frame has its origin at the contact point of the fingertip's pad, x along
+    `direction_world`, z out of the nail, and a horizontal y. Its direction in the world is
+    constant.
     """
 
     radius_m: Positive
@@ -548,7 +569,7 @@ class Finger(Part):
 
 
 class WorkingRange(Part):
-    """Range of the user's finger motion for which limits and charts are computed."""
+    """The range of the user's finger motion for which limits and charts are computed."""
 
     push_depth_m: Positive
     tilt_rad: Positive
@@ -556,7 +577,7 @@ class WorkingRange(Part):
 
 
 class Tolerances(Part):
-    """Tolerances of the errors; each family of methods is tuned to meet one of them."""
+    """The maximum permitted errors. Each method family is tuned to meet one of these errors."""
 
     image_m: Positive = Field(description="displacement of the image as seen from the eye")
     fingertip_m: Positive
@@ -571,12 +592,12 @@ class Tolerances(Part):
     light_latency_s: Positive = Field(
         default=0.06,
         description="time from exposure to display of the image, 95th percentile; people notice an "
-        "image 45 ms after the touch (Vogels 2004), which is itself up to 15 ms late",
+        "image that is 45 ms later than the touch (Vogels 2004), and the touch is up to 15 ms late",
     )
 
 
 class Scene(Message):
-    """Scene that all nodes of a graph share: object, devices, working range and tolerances."""
+    """The scene that all nodes of a graph share: object, devices, working range and tolerances."""
 
     name: str
     object: VirtualObject
@@ -610,43 +631,43 @@ def require_cylinder(scene: Scene) -> Cylinder:
     geometry = scene.object.geometry
     if not isinstance(geometry, Cylinder):
         raise UnfitGeometryError(
-            f'object.geometry.shape: expected "cylinder", found "{geometry.shape}"'
+            f'object.geometry.shape of the scene is "{geometry.shape}", expected "cylinder"'
         )
     return geometry
 
 
 class MissingPartError(FlexsheetError, ValueError):
-    """Raised for a scene that lacks a part that is needed."""
+    """Raised if a scene does not contain a required part."""
 
     code = "missing-part"
     remedy = "Add the part to the scene file, or leave out the node or command that needs it."
 
 
 def require_projector(scene: Scene) -> Projector:
-    """Return the scene's projector; raises MissingPartError if the scene has none."""
+    """Return the scene's projector. Raises MissingPartError if the scene has none."""
     if scene.projector is None:
-        raise MissingPartError(f'scene "{scene.name}": projector is missing, so it has no image')
+        raise MissingPartError(f'scene "{scene.name}": the key `projector` is missing')
     return scene.projector
 
 
 def shows_check_marks(scene: Scene) -> bool:
-    """Return whether marks are projected with which the stereo camera checks the calibrations."""
+    """Return whether the projector shows marks with which the stereo camera checks calibrations."""
     return scene.projector is not None and bool(scene.projector.check_marks_sheet_m)
 
 
 def require_material(scene: Scene) -> Material:
-    """Return the object's material; raises MissingPartError for a rigid object."""
+    """Return the object's material. Raises MissingPartError for a rigid object."""
     if scene.object.material is None:
         raise MissingPartError(
-            f'scene "{scene.name}": object.material is missing, so the object is rigid'
+            f'scene "{scene.name}": the key `object.material` is missing, so the object is rigid'
         )
     return scene.object.material
 
 
 def require_support(scene: Scene) -> Support:
-    """Return the fixed part of the object's skin; raises MissingPartError if there is none."""
+    """Return the fixed part of the object's surface. Raises MissingPartError if there is none."""
     if scene.object.support is None:
         raise MissingPartError(
-            f'scene "{scene.name}": object.support is missing; a soft object needs it'
+            f'scene "{scene.name}": the key `object.support` is missing; a soft object needs it'
         )
     return scene.object.support

@@ -1,12 +1,12 @@
 """Authenticate hosts by CURVE keys.
 
-Every host has one CURVE key pair.  The secret key is in a file that only its owner may read; the
-public keys of all hosts are in the launch file.  A bound socket accepts only the keys of hosts of
-the plan.  ZeroMQ asks for that decision by its authentication protocol (ZAP), in the event loop.  A
-connecting socket requires the key of one host.  Each end of a connection can therefore identify the
-host of the other end.
+Every host has one CURVE key pair. The secret key is in a file that only its owner may read. The
+    public keys of all hosts are in the launch file. A bound socket accepts only hosts of the plan:
+    ZeroMQ asks for this decision by its authentication protocol (ZAP), in the event loop. A
+    connecting socket requires the key of one host. Each end of a connection therefore knows the
+    host of the other end.
 
-Keys are written in Z85, 40 characters.
+Keys are written as 40 characters in Z85.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ ZAP_VERSION = b"1.0"
 CURVE_KEY_BYTES = 32
 
 RefusalHandler = Callable[[str], None]
-"""Function that is called with a text for each refused connection."""
+"""A function that is called with a text for each refused connection."""
 
 
 class SecurityError(FlexsheetError, RuntimeError):
-    """Raised for an invalid or missing key; the text names the file or host, and the remedy."""
+    """Raised for an invalid or missing key. The text names the file or host, and the remedy."""
 
     code = "keys"
     remedy = (
@@ -72,7 +72,7 @@ def is_key(text: str) -> bool:
 def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
     """Write a secret key to a file that only its owner can read.
 
-    replace: whether to replace an existing file; otherwise SecurityError is raised for it.
+    replace: whether an existing file is replaced. If it is false, SecurityError is raised instead.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     part = path.with_suffix(".part")
@@ -98,13 +98,17 @@ def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
 
 
 def read_secret(path: Path) -> str:
-    """Read a secret key; raises SecurityError unless its file is valid and private to this user."""
+    """Read a secret key.
+
+    Raises SecurityError if the file is missing, invalid, or readable by other users.
+    """
     try:
         with path.open() as file:
             status = os.fstat(file.fileno())
             if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
                 raise SecurityError(
-                    f"{path}: belongs to another user; create your own key: flexsheet keys new"
+                    f"{path}: the file belongs to another user; create your own key: "
+                    f"flexsheet keys new {path.stem}"
                 )
             if status.st_mode & 0o077:
                 raise SecurityError(
@@ -117,24 +121,35 @@ def read_secret(path: Path) -> str:
             f"{path}: does not exist; create a key: flexsheet keys new {path.stem}"
         ) from error
     except (OSError, UnicodeDecodeError) as error:
-        raise SecurityError(f"{path}: cannot be read: {error}") from error
+        raise SecurityError(
+            f"{path}: cannot be read: {error}; create a key: flexsheet keys new {path.stem}"
+        ) from error
     if not is_key(text):
-        raise SecurityError(f"{path}: does not contain a key of {KEY_LENGTH} characters")
+        raise SecurityError(
+            f"{path}: does not contain a key of {KEY_LENGTH} characters; create a key: "
+            f"flexsheet keys new {path.stem} --replace"
+        )
     return text
 
 
 @dataclass(frozen=True, slots=True)
 class KeyChange:
-    """Keys that a reload changed: whether this host's own key, and which other hosts' keys."""
+    """The hosts whose keys a reload of the key ring has changed.
+
+    own: whether the key of this host has changed. hosts: names of the other hosts with changed
+        keys.
+    """
 
     own: bool
     hosts: frozenset[str]
 
 
 class KeyRing:
-    """Key pair of one host, and the public keys of all hosts.
+    """The key pair of this host, and the public keys of all hosts.
 
     file: JSON file with {"host", "secret_file", "public": {host: key}}, written by `write_ring`.
+
+    Raises SecurityError if the files are invalid.
     """
 
     def __init__(self, file: Path) -> None:
@@ -146,18 +161,20 @@ class KeyRing:
         self.reload()
 
     def get_public_key(self, host: str) -> str:
-        """Return the public key of a host; raises SecurityError if it has none."""
+        """Return the public key of a host. Raises SecurityError if the host has no key."""
         key = self.public.get(host)
         if key is None:
-            raise SecurityError(f'host "{host}" has no key in the launch file')
+            raise SecurityError(
+                f'host "{host}" has no key in the launch file; add its key to `hosts`'
+            )
         return key
 
     def find_host(self, key: str) -> str | None:
-        """Return the host of a public key; None for an unknown key."""
+        """Return the host that has a public key, or None if no host has this key."""
         return self._host_by_key.get(key)
 
     def reload(self) -> KeyChange | None:
-        """Read the files again if they have changed; return the changed keys, if any.
+        """Read the files again if they have changed. Return the changes, or None if there are none.
 
         Raises SecurityError for invalid files; the keys then remain unchanged.
         """
@@ -166,7 +183,9 @@ class KeyRing:
             host, secret_file, public = ring["host"], Path(ring["secret_file"]), ring["public"]
             stamps = (_stamp(self._file), _stamp(secret_file))
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise SecurityError(f"{self._file}: does not contain valid keys: {error}") from error
+            raise SecurityError(
+                f"{self._file}: does not contain valid keys: {error}; start the graph again"
+            ) from error
         if stamps == self._stamps:
             return None
         secret = read_secret(secret_file)
@@ -188,7 +207,11 @@ class KeyRing:
         return change
 
     def set_server_keys(self, opened: zmq.Socket[bytes], domain: bytes) -> None:
-        """Require authentication: endpoints bound after this call accept this ring's hosts only."""
+        """Require that peers of a socket have a key of this ring, for endpoints that are bound
+        later.
+
+        domain: ZAP domain of the socket, from `ZapAuthenticator.register`.
+        """
         opened.setsockopt(zmq.CURVE_SERVER, 1)
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
         opened.setsockopt(zmq.ZAP_DOMAIN, domain)
@@ -196,22 +219,22 @@ class KeyRing:
         opened.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
     def set_client_keys(self, opened: zmq.Socket[bytes], host: str) -> None:
-        """Require authentication: endpoints connected after this call must belong to a host."""
+        """Require that endpoints that are connected later have the key of a host."""
         opened.setsockopt(zmq.CURVE_SERVERKEY, self.get_public_key(host).encode())
         opened.setsockopt(zmq.CURVE_PUBLICKEY, self.public_key.encode())
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
 
 
 def write_ring(file: Path, *, host: str, secret_file: Path, public: dict[str, str]) -> None:
-    """Write, atomically, the file that `KeyRing` reads."""
+    """Write the JSON file that `KeyRing` reads. The file is replaced atomically."""
     text = json.dumps({"host": host, "secret_file": str(secret_file), "public": public})
     write_file(file, text)
 
 
 class ZapAuthenticator:
-    """Handler of ZeroMQ's authentication requests (ZAP); one per process while it is needed.
+    """A handler of ZeroMQ's authentication requests (ZAP), which all sockets of a process share.
 
-    Each bound socket has its own ZAP domain, with a key ring and a handler of refusals.
+    Each bound socket has its own ZAP domain, with a key ring and a function that reports refusals.
     """
 
     _present: ClassVar[ZapAuthenticator | None] = None
@@ -228,7 +251,7 @@ class ZapAuthenticator:
 
     @classmethod
     def register(cls, keys: KeyRing, on_refused: RefusalHandler) -> bytes:
-        """Register a socket; return its domain for `KeyRing.set_server_keys` and `unregister`."""
+        """Register a key ring, and return a new ZAP domain for the socket that uses it."""
         if cls._present is None:
             cls._present = ZapAuthenticator()
         domain = f"flexsheet-{next(cls._numbers)}".encode()
@@ -237,7 +260,7 @@ class ZapAuthenticator:
 
     @classmethod
     def unregister(cls, domain: bytes) -> None:
-        """Remove a ZAP domain; close the handler after the last one."""
+        """Remove a ZAP domain. Close the authenticator when no domain is left."""
         if cls._present is None:
             return
         cls._present._domains.pop(domain, None)
@@ -253,7 +276,7 @@ class ZapAuthenticator:
         self._socket.close(linger=0)
 
     def _answer(self) -> None:
-        """Answer all pending requests; a loop callback."""
+        """Answer all pending requests. This is a callback of the loop."""
         while not self._socket.closed:
             try:
                 request = self._socket.recv_multipart(zmq.NOBLOCK)
@@ -262,10 +285,10 @@ class ZapAuthenticator:
             self._socket.send_multipart(self.reply(request))
 
     def reply(self, request: list[bytes]) -> list[bytes]:
-        """Return the answer to a ZAP request: 200 and the host's name, or 400."""
+        """Return the reply to a ZAP request: status 200 and the host's name, or status 400."""
         version, number, domain, address, _, mechanism, *credentials = request
         keys, on_refused = self._domains.get(domain, (None, lambda _: None))
-        host, reason = None, "it uses no key"
+        host, reason = None, "the peer uses no key"
         if keys is not None and version == ZAP_VERSION and mechanism == b"CURVE":
             key = z85.encode(credentials[0]).decode()
             host, reason = keys.find_host(key), f"no host of the plan has its key {key}"
@@ -278,7 +301,7 @@ class ZapAuthenticator:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return mtime (ns), inode and size of a file, to detect changes; None if it is missing."""
+    """Return mtime (ns), inode and size (bytes) of a file, or None if the file does not exist."""
     try:
         status = path.stat()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Define the sheet's calibration file, which `flexsheet calibrate sheet` writes for the planner."""
+"""Define the sheet's calibration file, which `flexsheet calibrate sheet` writes."""
 
 from __future__ import annotations
 
@@ -17,31 +17,32 @@ from flexsheet.messages.calibration_file import (
 )
 from flexsheet.messages.scene import NonNegative, Part, Positive, SheetSpec
 
-SHEET_CALIBRATION_VERSION = 1
-
 Axis = Annotated[NDArray[np.float64], ArraySpec("<f8", ("entries",))]
 Entries = Annotated[NDArray[np.float64], ArraySpec("<f8", ("stretches", "depths", "xs", "ys"))]
 
 NOMINAL_RATIO = 0.02
-"""Maximum relative difference between the nominal sizes of a calibration and of the scene."""
+"""The maximum relative difference between the nominal sizes of a calibration and of the scene."""
 
 
 class Fitted(Part):
-    """Fitted value with its standard deviation (normally distributed errors)."""
+    """A fitted value with the standard deviation of its normally distributed error."""
 
     value: NonNegative
     standard_deviation: NonNegative
 
 
 class LeftOutRow(Part):
-    """Measured row that was excluded as an outlier; `line` is its line in the file, from 1."""
+    """A measured row that was excluded as an outlier; `line` is its line in the file, from 1."""
 
     line: Annotated[int, Field(ge=1)]
     residual_ratio: float = Field(description="measured force divided by fitted force, minus one")
 
 
 class SheetTable(Part):
-    """Measured force divided by fitted force; linear in stretch and position, cubic in depth."""
+    """A table of the ratio of measured to fitted force.
+
+    It is interpolated linearly over stretch and position, and by cubics over depth.
+    """
 
     stretch_ratios: Axis = Field(description="edge distance divided by the nominal width")
     depths_m: Axis
@@ -51,7 +52,7 @@ class SheetTable(Part):
 
 
 class SheetCalibration(Part):
-    """Calibration of a sheet: fitted parameters of the force model, and the measured range."""
+    """The calibration of a sheet: fitted parameters of the force model, and the measured range."""
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
@@ -94,20 +95,17 @@ def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
     for key, measured, expected in sizes:
         if abs(measured - expected) > NOMINAL_RATIO * expected:
             raise CalibrationMismatchError(
-                f"calibration is of a sheet with {key} {measured:g}, the scene's sheet.{key} is "
-                f"{expected:g}: give the file of this sheet, or calibrate it"
+                f"the calibrated sheet has {key} {measured:g}, but the scene's sheet.{key} is "
+                f"{expected:g}: give the file of this sheet, or calibrate this sheet"
             )
 
 
 def save_sheet_calibration(calibration: SheetCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the calibration file; raises FileWriteError if it cannot be written."""
+    """Write a sheet calibration to a file. Raises FileWriteError if it cannot be written."""
     title = f"Calibration of a sheet, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_sheet_calibration(path: Path) -> SheetCalibration:
-    """Read the calibration file; raises CalibrationFileError if it is invalid."""
-    command = "flexsheet calibrate sheet"
-    return read_calibration(
-        SheetCalibration, path, version=SHEET_CALIBRATION_VERSION, command=command
-    )
+    """Read a sheet calibration from a file. Raises CalibrationFileError if it is invalid."""
+    return read_calibration(SheetCalibration, path, command="flexsheet calibrate sheet")

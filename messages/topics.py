@@ -1,7 +1,6 @@
 """Define the table of topics: names, message types, delivery, rates and access.
 
-Ports, recorder, health checks, command line and documentation use this table.  A new topic needs
-one new row.
+Ports, recorder, health checks, command line and documentation use this table.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from flexsheet.messages.migrations import RENAMED_TOPICS
 
 
 class Delivery(StrEnum):
-    """Kind of delivery of messages to a slow or late subscriber.
+    """The kind of delivery of messages to a slow or late subscriber.
 
-    latest: only the newest message; older ones are dropped and counted.
+    latest: only the newest message; older messages are dropped and counted.
     every: all messages in order through a bounded queue; an overflow is counted as an error.
-    latched: like `every`, and a late subscriber first receives the last message sent.
+    latched: like `every`, and a late subscriber first receives the last message that was sent.
     """
 
     LATEST = "latest"
@@ -31,13 +30,13 @@ class Delivery(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """Topic, one row of the table.
+    """A topic, which is one row of the table of topics.
 
-    rate_hz: expected range, for health checks; None: the topic is published when its value changes.
-    logged: whether it is recorded by default.
-    many_writers: whether any number of nodes may publish it; otherwise exactly one.
-    max_bytes: maximum size of a message, checked at both ends.
-    open_to_tools: whether command-line tools may publish it, if it has many writers.
+    rate_hz: expected range of the rate, for health checks; None: the topic has no expected rate.
+    logged: whether the topic is recorded by default.
+    many_writers: whether any number of nodes may publish the topic; otherwise exactly one node.
+    max_bytes: maximum size of a message, checked by writer and reader.
+    open_to_tools: whether command-line tools may publish the topic, if it has many writers.
     """
 
     name: str
@@ -86,7 +85,7 @@ _ROWS = (
     Topic("bookmark", types.Bookmark, _EVERY, None, True, "marked times in a bag",
           many_writers=True),
     Topic("arming", types.Arming, _EVERY, None, True,
-          "permission of motion for the arms", many_writers=True),
+          "commands to arm or stop the arms", many_writers=True),
     Topic("status", types.Status, _EVERY, (0.5, 3), True, "state of each node", many_writers=True),
     Topic("clock_ping", types.ClockPing, _EVERY, (1, 100), True,
           "exchange between the hosts' clock nodes",
@@ -118,7 +117,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ROWS}
 
 
 class UnknownTopicError(FlexsheetError, KeyError):
-    """Raised for an unknown topic name; the text suggests a similar one."""
+    """Raised for an unknown topic name. The text suggests a similar name."""
 
     code = "unknown-topic"
     exit_code = 2
@@ -126,7 +125,10 @@ class UnknownTopicError(FlexsheetError, KeyError):
 
 
 def find_topic(name: str) -> Topic:
-    """Return the topic of this name; raises UnknownTopicError with the most similar name."""
+    """Return the topic of this name.
+
+    Raises UnknownTopicError, which names the most similar topic.
+    """
     try:
         return TOPICS[name]
     except KeyError:

@@ -1,9 +1,9 @@
-"""Define the messages of all topics except the scene (`flexsheet.messages.scene`).
+"""Define the messages of all topics except the scene, which `flexsheet.messages.scene` defines.
 
-Positions and directions are in the world frame unless the name contains another frame.  A quantity
-that may be unknown has a field that says so; arrays never contain NaN.
+Positions and directions are in the world frame, unless the name contains another frame. Arrays
+never contain NaN; a field such as `valid` states whether a quantity is known.
 
-"Sheet" is the rubber sheet that two robot arms hold in front of the user.  Its target pose follows
+The sheet is the rubber sheet that two robot arms hold in front of the user. Its target pose follows
 the user's fingertip over the virtual object.
 """
 
@@ -42,9 +42,9 @@ StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "
 
 
 class StereoPair(Message):
-    """Stereo image pair; the header's source timestamp is the midpoint of the exposure.
+    """A stereo image pair. The header's source timestamp is the midpoint of the exposure.
 
-    For cameras without a common trigger, it is midway between the midpoints of both exposures.
+    If the cameras have no common trigger, it is midway between the midpoints of both exposures.
     """
 
     device: str
@@ -77,23 +77,28 @@ FingertipReason = Literal[
     "too_fast",
     "unconfirmed",
 ]
-"""Reason why an image pair gave no fingertip, in the order of the values.
+"""The reason why an image pair gave no fingertip, in the order of the values.
 
-No marker; a marker in one view only; several candidates; a marker merged with another light source;
-blurred; overexposed; outside the finger's volume; rays of the two views do not intersect; faster
-than a finger; too few detections for a track.
+No marker was found; the marker is in one view only; there are several candidates; the marker is
+merged with another light source; it is blurred; it is overexposed; it is outside the finger's
+volume; the rays of the two views do not intersect; it is faster than a finger; there are too few
+detections for a track.
 """
 
 FingertipState = Literal["lost", "acquiring", "tracking", "coasting"]
-"""State of the tracking: no track; tentative; confirmed by this image pair; predicted only."""
+"""The state of the fingertip's track.
+
+lost: there is no track. acquiring: the track is tentative. tracking: this image pair confirms the
+    track. coasting: the position is only predicted.
+"""
 
 
 class Fingertip(Message):
-    """Fingertip position at the camera's exposure, and its predicted path.
+    """The position of the fingertip at the exposure of an image pair, and its predicted path.
 
-    If `valid` is false, `reason` gives the cause.  While `state` is "coasting", the tracked
-    position and velocity are predicted from the last valid ones.  `measured_world_m` is the
-    unfiltered triangulated point of this image pair.
+    If `valid` is false, `reason` gives the cause. While `state` is "coasting", position and
+    velocity are predicted from the last valid measurement. `measured_world_m` is the unfiltered
+    triangulated point of this image pair.
     """
 
     valid: bool
@@ -128,13 +133,17 @@ SheetReason = Literal[
     "past_sheet_height",
     "concave_contact",
 ]
-"""Reason why the sheet does not follow the finger; "concave_contact": it follows at a distance."""
+"""The reason why the sheet does not follow the finger.
+
+With "concave_contact", the sheet follows the finger at a distance.
+"""
 
 
 class SheetTrajectory(MessagePart):
-    """Motion of the sheet after the time of its target, for as long as no newer target arrives.
+    """The motion of the sheet after the time of its target, until a newer target arrives.
 
-    The sheet keeps the target's velocity (twist) for `keep_s`, then decelerates uniformly to rest.
+    The sheet keeps the target's velocity (twist) for `keep_s`, and then decelerates uniformly to
+    rest.
     """
 
     keep_s: float = Field(
@@ -146,11 +155,11 @@ class SheetTrajectory(MessagePart):
 
 
 class SheetTarget(Message):
-    """Target pose and velocity of the sheet at the time `valid_at_ns`.
+    """The target pose and velocity of the sheet at the time `valid_at_ns`.
 
-    The origin of the sheet frame is the sheet's centre; x points from the left edge to the right, z
-    towards the user.  For another time, a consumer extrapolates with the velocity (twist), or
-    follows `trajectory`.
+    The origin of the sheet frame is the sheet's centre. Its x axis points from the left to the
+    right edge, and z towards the user. For another time, a node extrapolates with the velocity
+    (twist), or follows `trajectory`.
     """
 
     phase: Phase
@@ -186,11 +195,11 @@ class SheetTarget(Message):
 ArmMode = Literal[
     "disconnected", "idle", "follow", "hold", "stopping", "fault", "relax", "estop", "starting"
 ]
-"""Operating mode of an arm; "starting": the arm has not answered since its bridge started."""
+"""The operating mode of an arm; "starting": the arm has not answered since its bridge started."""
 
 
 class ArmState(Message):
-    """State of one arm; the source timestamp is the time of the joint measurement."""
+    """The state of one arm. The source timestamp is the time of the joint measurement."""
 
     side: Side
     mode: ArmMode
@@ -219,14 +228,14 @@ class ArmState(Message):
     world_from_flange: Transform
     world_from_flange_commanded: Transform
     command_age_s: NonNegative | None = Field(
-        description="age of the sheet target in use; None: no target"
+        description="age of the sheet target that the arm follows, s; None: no target"
     )
     target_source_ns: Stamp = Field(
-        description="exposure of the image from which that target was computed; 0: none"
+        description="exposure of the image from which this sheet target was computed; 0: none"
     )
     trajectory_ends_ns: Stamp = Field(
         default=0,
-        description="time until which the arm may follow that target's trajectory; 0: not at all",
+        description="end of the target's trajectory that the arm may follow; 0: not at all",
     )
     command_sent_ns: Stamp = Field(description="time of the newest command to the arm; 0: none")
     edge_distance_m: NonNegative | None = Field(
@@ -247,7 +256,7 @@ class ArmState(Message):
 
 
 class ArmLatency(Message):
-    """Mean latency of one arm over its most recent sheet targets, while it follows them."""
+    """The mean latency of one arm over its most recent sheet targets, while it follows them."""
 
     side: Side
     latency_s: Finite = Field(
@@ -257,7 +266,10 @@ class ArmLatency(Message):
 
 
 class Skin(Message):
-    """Surface mesh of the soft body at rest, published once per object; normals point outwards."""
+    """The surface mesh of the soft body at rest, published once per object.
+
+    Its normals point outwards.
+    """
 
     mesh_id: str
     vertices_world_m: Points3
@@ -268,7 +280,7 @@ ForceCurve = Annotated[NDArray[np.float64], ArraySpec("<f8", ("depths", 2))]
 
 
 class SoftBody(Message):
-    """Deformation and force by which the soft body responds to the finger."""
+    """The deformation and force by which the soft body responds to the finger."""
 
     mesh_id: str
     method: str
@@ -287,45 +299,48 @@ class SoftBody(Message):
     )
     force_error_ratio: NonNegative = Field(
         default=0.0,
-        description="stated relative error of the force at depths above 1 mm, the larger one while "
-        "a method replaces another; 0: unknown",
+        description="relative error of the force at depths above 1 mm, as stated by the method; "
+        "the larger error while one method replaces another; 0: unknown",
     )
     displacement_world_m: Points3
 
 
 ForceSource = Literal["gauge", "motor_currents"]
 ForceAxis = Literal["sheet_normal", "left_edge", "right_edge"]
-"""Measured component of a force, in the frame of the sheet.
+"""The measured component of a force, in the frame of the sheet.
 
 sheet_normal: force of the finger on the sheet, positive away from the user. left_edge, right_edge:
-pull of the sheet on an arm's clamped edge, positive towards the other edge.
+    pull of the sheet on an arm's clamped edge, positive towards the other edge.
 """
 
 ForceReason = Literal["ok", "no_reading", "overload", "in_motion"]
-"""Reason why a force is not valid, in the order of the values.
+"""The reason why a measured force is not valid.
 
-The device has sent no readable number for some time; the force exceeds the device's range; the arm
-moves, so that its motor currents contain friction and acceleration.
+no_reading: the device has sent no readable number for some time. overload: the force exceeds the
+    device's range. in_motion: the arm moves, so its motor currents also depend on friction and
+    acceleration.
 """
 
 
 class Force(Message):
-    """Measured force; the source timestamp is the time of the measurement."""
+    """A measured force. The source timestamp is the time of the measurement."""
 
     source: ForceSource
     axis: ForceAxis
     valid: bool
     reason: ForceReason
-    force_n: Finite = Field(description="measured force, N; the last one if `valid` is false")
+    force_n: Finite = Field(
+        description="measured force, N; the last valid force if `valid` is false"
+    )
     standard_deviation_n: NonNegative = Field(
         description="standard deviation of noise and calibration error, N"
     )
 
 
 class Eye(Message):
-    """Position of the user's eyes from a head tracker.
+    """The position of the user's eyes, measured by a head tracker.
 
-    If there is no tracker, the scene's `eyes` are used.
+    Without a tracker, nodes use the scene's `eyes`.
     """
 
     valid: bool = Field(
@@ -339,7 +354,7 @@ class Eye(Message):
 
 
 class Display(Message):
-    """Display settings for the renderer, published by the console or an experiment; latched."""
+    """The display settings for the renderer, published by the console or an experiment."""
 
     correction: Correction
     stereo: StereoMode
@@ -361,7 +376,10 @@ class Display(Message):
 
 
 class Frame(Message):
-    """Image for the projector; the source timestamp is that of the camera image it is based on."""
+    """An image for the projector.
+
+    Its source timestamp is that of the camera image it is based on.
+    """
 
     number: int
     correction: Correction
@@ -422,28 +440,29 @@ class Frame(Message):
 
 
 class EStop(Message):
-    """Emergency stop by software, which the arm bridges latch; `engaged` false resets it."""
+    """An emergency stop by software, which the arm bridges store. `engaged` false resets it."""
 
     engaged: bool
     reason: str
 
 
 class Recording(Message):
-    """Command to start or stop recording, for recorders with `start_paused`."""
+    """A command to start or stop recording, for recorders with the parameter `start_paused`."""
 
     running: bool
 
 
 class Bookmark(Message):
-    """Label for a time in a bag; that time is the source timestamp."""
+    """A label for a time in a bag, which is the source timestamp of this message."""
 
     label: str = Field(max_length=200)
 
 
 class Arming(Message):
-    """Operator's command to arm the robot arms or (`ready` false) to stop and relax the sheet.
+    """A command of the operator to arm the robot arms, or to stop and relax the sheet (`ready`
+    false).
 
-    After any stop the arms rest until the next command.
+    After any stop, the arms rest until the next command.
     """
 
     ready: bool
@@ -451,7 +470,10 @@ class Arming(Message):
 
 
 class PortStatus(MessagePart):
-    """Statistics of one port of a node: rate over the last second, counts since the start."""
+    """The statistics of one port of a node.
+
+    The rate is that of the last second. Messages are counted from the start of the node.
+    """
 
     topic: str
     rate_hz: NonNegative
@@ -469,7 +491,7 @@ class PortStatus(MessagePart):
 
 
 class ClockEcho(MessagePart):
-    """Reply to the newest ping that a clock node received from another clock."""
+    """A reply to the newest ping that a clock node received from the clock node of another host."""
 
     clock_id: str
     sent_ns: int = Field(ge=0, description="publish timestamp of the ping, on its own clock")
@@ -479,17 +501,17 @@ class ClockEcho(MessagePart):
 
 
 class ClockPing(Message):
-    """Ping between the clock nodes of two hosts, to measure the offset of their clocks.
+    """A ping between the clock nodes of two hosts, which measures the offset of their clocks.
 
-    The two times in an echo, the header's publish timestamp and the time of arrival are the four
-    timestamps of a round trip.
+    A round trip has four timestamps: the two times in an echo, the header's publish timestamp, and
+        the time of arrival.
     """
 
     echoes: tuple[ClockEcho, ...]
 
 
 class ClockOffset(MessagePart):
-    """Time of another clock minus time of the header's clock, at the time `at_ns` of the latter."""
+    """The time of another clock minus the time of the header's clock, measured at `at_ns`."""
 
     clock_id: str
     at_ns: int = Field(ge=0)
@@ -502,7 +524,7 @@ class ClockOffset(MessagePart):
 
 
 class Clocks(Message):
-    """Offsets of the other clocks, from a host's clock node for the nodes of that host."""
+    """The offsets of other hosts' clocks, sent by a host's clock node to the nodes of that host."""
 
     max_offset_uncertainty_s: Positive = Field(
         description="uncertainty of an offset (s) above which no arm moves"
@@ -526,19 +548,20 @@ SuspectedCause = Literal[
     "camera_or_arm_base_moved",
     "display_latency",
 ]
-"""Suspected cause of a deviation, in the order of the values.
+"""The suspected cause of a deviation between a measured and an expected value.
 
-The stereo camera is not where the scene says; one of its two cameras has moved against the other;
-the marker is not at the assumed offset from the finger's pad; an arm lags more or less than
-configured; an arm does not execute the commanded motion; the sheet's calibrated stiffness differs
-from the scene's; the projector is not where the scene says; an arm's base or clamp is not where the
-scene says; one of two devices, which the data cannot tell apart; projected images appear later than
-assumed.
+camera_moved: the stereo camera is not where the scene says. cameras_misaligned: one camera has
+    moved relative to the other. marker_offset: the marker is not at the assumed offset from the
+    finger's pad. servo_lag: an arm's lag differs from the configured lag. arm_not_following: an arm
+    does not execute the commanded motion. sheet_stiffness: the sheet's calibrated stiffness differs
+    from the scene's. projector_moved: the projector is not where the scene says. arm_base_moved: an
+    arm's base or clamp is not where the scene says. A cause with "or": the data cannot distinguish
+    the two devices. display_latency: projected images appear later than assumed.
 """
 
 
 class SelfCheck(MessagePart):
-    """Check of one assumption of a node: a measured value is compared with the expected one."""
+    """A comparison of a measured value with the value that a node assumes."""
 
     cause: SuspectedCause
     subject: str = Field(default="", description="device concerned, if there are several")
@@ -552,7 +575,7 @@ class SelfCheck(MessagePart):
 
 
 class Status(Message):
-    """State of a node, published once per second."""
+    """The state of a node, published once per second."""
 
     node: str
     state: Literal["starting", "running", "degraded", "stopping"]
@@ -585,7 +608,7 @@ class Status(Message):
 
 
 class ParameterChange(Message):
-    """Change of a parameter of a running node, from `flexsheet param set`."""
+    """A change of a parameter of a running node, requested by `flexsheet param set`."""
 
     node: str
     parameter: str
@@ -593,7 +616,7 @@ class ParameterChange(Message):
 
 
 class NodeProcess(MessagePart):
-    """State of a node's process, as seen by the launcher that started it."""
+    """The state of a node's process, reported by the launcher that started it."""
 
     name: str
     state: Literal["starting", "ready", "exited"] = Field(
@@ -604,7 +627,7 @@ class NodeProcess(MessagePart):
 
 
 class NodeOmission(MessagePart):
-    """Node of the launch file that is not started, with the reason."""
+    """A node of the launch file that is not started, with the reason."""
 
     name: str
     reason: Literal["rigid_object", "no_image", "no_reader", "no_writer"] = Field(
@@ -614,23 +637,23 @@ class NodeOmission(MessagePart):
 
 
 class HostKey(MessagePart):
-    """Public key of a host that the reporting host stores."""
+    """The public key of a host, as stored on the host that sends the message."""
 
     host: str
     key: str
 
 
 class ProgramCpu(MessagePart):
-    """Processor time of all processes with one name."""
+    """The processor time of all processes that have the same name."""
 
     name: str = Field(description="name of the node, or of another program")
     cores: NonNegative = Field(description="processor time divided by elapsed time")
 
 
 class CpuPressure(MessagePart):
-    """Time for which the nodes of a computer wait for a free processor, over the last seconds.
+    """The time for which the nodes of a computer wait for a free processor, over the last seconds.
 
-    It covers nodes with a `nice` value below 10.
+    Nodes with a `nice` value of 10 or more are not included.
     """
 
     busy: bool = Field(description="`wait_ratio` is above a quarter")
@@ -640,12 +663,12 @@ class CpuPressure(MessagePart):
     node: str = Field(description="node with this waiting time")
     programs: tuple[ProgramCpu, ...] = Field(
         default=(),
-        description="programs with most processor time, the largest first; only while busy",
+        description="programs that use most processor time, in descending order; only if `busy`",
     )
 
 
 class HostStatus(Message):
-    """State of a computer, published by its launcher once per second."""
+    """The state of a computer, published by its launcher once per second."""
 
     host: str
     run: str = Field(description="identifier of the run")
@@ -663,12 +686,14 @@ class HostStatus(Message):
         default=(), description="nodes of the launch file that are not started"
     )
     missing_devices: tuple[str, ...] = Field(
-        description="devices that its nodes need and that are missing"
+        description="devices that the nodes of the host need and that are missing"
     )
     software: str = Field(
         default="", description="versions of software that must agree between hosts"
     )
-    keys: tuple[HostKey, ...] = Field(default=(), description="keys of the hosts that it accepts")
+    keys: tuple[HostKey, ...] = Field(
+        default=(), description="keys of the hosts that this host accepts"
+    )
     estop: str | None = Field(default=None, description="reason of the latched e-stop; None: none")
     cpu: CpuPressure | None = Field(
         default=None, description="None: the system does not measure it, or no node runs yet"
@@ -679,7 +704,7 @@ PathJoin = Literal["rounded_lines", "spline"]
 
 
 class FingerPath(Message):
-    """Path for the simulated finger, which first moves smoothly to the first point."""
+    """A path for the simulated finger, which first moves smoothly to the first point."""
 
     label: str
     times_s: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points",))]
@@ -688,7 +713,7 @@ class FingerPath(Message):
         description="standard deviation of slow random position errors of the hand, m"
     )
     tremor_m: NonNegative = Field(
-        description="amplitude of the simulated hand tremor at 8-12 Hz, m"
+        description="amplitude of the simulated hand tremor from 8 to 12 Hz, m"
     )
     joined_by: PathJoin = Field(
         default="rounded_lines",
@@ -701,7 +726,7 @@ class FingerPath(Message):
 
 
 class TwinFinger(Message):
-    """True position of the simulated fingertip at the source timestamp."""
+    """The true position of the simulated fingertip at the source timestamp."""
 
     path_label: str
     path_done: bool
@@ -719,7 +744,7 @@ class TwinFinger(Message):
 
 
 class TwinArms(Message):
-    """True joint angles and flange poses of both simulated arms at the source timestamp."""
+    """The true joint angles and flange poses of both simulated arms at the source timestamp."""
 
     joints_left_rad: Vector6
     joints_right_rad: Vector6
@@ -731,7 +756,7 @@ Viewpoint = Literal["centre", "left", "right"]
 
 
 class TwinEye(Message):
-    """Image that a simulated camera sees from an eye's viewpoint, and the expected image."""
+    """An image that a simulated camera sees from an eye's viewpoint, and the expected image."""
 
     label: str
     correction: Correction

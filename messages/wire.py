@@ -1,4 +1,4 @@
-"""Encode and decode messages: a header frame, then large arrays as raw frames.
+"""Encode and decode messages as a header frame, followed by large arrays as separate frames.
 
 The header frame is one msgpack array of eleven elements:
 
@@ -6,19 +6,20 @@ The header frame is one msgpack array of eleven elements:
   type         name of the message's class
   fingerprint  8 bytes of the hash of its JSON Schema, see `messages.base.compute_fingerprint`
   sequence, source_ns, publish_ns, clock_id, writer, epoch, plan      see `messages.base.Header`
-  fields       a map; nested parts are maps, tuples arrays, numpy arrays extension types:
-  type 1  dtype and shape, then the elements (an array of at most 1 KiB)
-  type 2  dtype and shape only; the elements are the next frame
+  fields       a map; a nested part is a map, a tuple is an array, and a numpy array is one of
+               two extension types:
+  type 1       dtype and shape, then the elements (for an array of at most 1 KiB)
+  type 2       dtype and shape only; the elements are in the next frame
 
-The encoding of dtype and shape is: one byte with the index in `DTYPES`, one byte for the number of
-axes, two zero bytes, a little-endian uint32 per axis, and zeros up to a multiple of eight bytes,
-which aligns the elements.  Elements are little-endian and in C order.
+Dtype and shape are encoded as one byte with the index in `DTYPES`, one byte with the number of
+axes, two zero bytes, and a little-endian uint32 per axis. Zeros up to a multiple of eight bytes
+align the elements. Elements are little-endian and in C order.
 
-`encode` and `decode` do not copy large arrays.  A sender must not change an array that is in a
-message, and a receiver gets read-only views of the memory from the socket.  Small arrays are
-copied, because that is faster than sending them separately (`benchmarks/messaging.py`).  Equal
-messages with equal headers have equal bytes.  The protocol "flexsheet/1" of old bags is the same
-without `plan`.
+`encode` and `decode` do not copy large arrays. A sender must not change an array that is in a
+message, and a receiver gets read-only views of the memory from the socket. Small arrays are copied,
+because that is faster than sending them separately (`benchmarks/messaging.py`). Equal messages with
+equal headers have equal bytes. The protocol "flexsheet/1" of old bags differs only in that `plan`
+is missing.
 """
 
 from __future__ import annotations
@@ -51,12 +52,12 @@ DTYPES = tuple(
 INLINE_BYTES = 1024
 NAME_LENGTH = 200
 MAX_HEADER_BYTES = 1 << 20
-"""Maximum size of the header frame; its decoded values can need up to 64 times as much memory."""
+"""The maximum size of the header frame. Its decoded values need up to 64 times as much memory."""
 
 MAX_ELEMENTS = 4096
-"""Maximum number of elements of an array or a map in the header frame.
+"""The maximum number of elements of an array or a map in the header frame.
 
-A decoder allocates the stated length before it reads the elements, and arrays can be nested.
+The decoder allocates the stated length before it reads the elements, and arrays can be nested.
 """
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
@@ -68,10 +69,10 @@ _extension = tuple.__new__
 
 
 class WireError(FlexsheetError, ValueError):
-    """Raised for an invalid or unexpected message, or one that cannot be encoded.
+    """Raised for an invalid or unexpected message, or for a message that cannot be encoded.
 
-    cause: "malformed", "type", "fingerprint", "frames", "size" or "field"; from a subscriber also
-      "writer", "plan", "replayed" or "forbidden".
+    cause: "malformed", "type", "fingerprint", "frames", "size" or "field". A subscriber also uses
+        "writer", "plan", "replayed" and "forbidden".
     """
 
     code = "wire"
@@ -83,7 +84,7 @@ class WireError(FlexsheetError, ValueError):
 
 
 class Codec:
-    """Name, fingerprint and validator of one message type."""
+    """The name, fingerprint and validator of one message type."""
 
     __slots__ = ("fingerprint", "name", "type", "validate")
 
@@ -104,9 +105,11 @@ def encode(
     max_bytes: int | None = None,
     inline_bytes: int = INLINE_BYTES,
 ) -> list[Buffer]:
-    """Encode a message as frames; raises WireError if it is larger than `max_bytes`.
+    """Encode a message as frames.
 
-    inline_bytes: maximum size of arrays in the header frame; decoders accept any size.
+    inline_bytes: maximum size of the arrays that are in the header frame.
+
+    Raises WireError if a field cannot be encoded, or the message is larger than `max_bytes`.
     """
     frames: list[Buffer] = [b""]
 
@@ -149,7 +152,7 @@ def encode(
 
 
 class Envelope:
-    """Message whose header is checked, but whose fields are not yet validated."""
+    """A message with a checked header, whose fields are not yet validated."""
 
     __slots__ = ("codec", "fields", "header")
 
@@ -157,7 +160,7 @@ class Envelope:
         self.codec, self.header, self.fields = codec, header, fields
 
     def open(self) -> Message:
-        """Validate the message's fields; raises WireError that names the first invalid one."""
+        """Validate the message's fields. Raises WireError, which names the first invalid field."""
         try:
             return self.codec.validate(self.fields)  # type: ignore[no-any-return]  # pydantic's validator is untyped
         except ValidationError as error:
@@ -171,11 +174,13 @@ def read_envelope(
     fingerprint: bytes | None = None,
     type_name: str | None = None,
 ) -> Envelope:
-    """Check and decode a message, without validating its fields; raises WireError.
+    """Decode a message and check its header, without validating its fields.
 
-    frames: buffers (bytes, memoryview, zmq.Frame), header first.
-    expected: the topic, whose size limit applies, or only the message type.
-    fingerprint, type_name: values of a recorded type; None: those of the current type.
+    frames: buffers (bytes, memoryview or zmq.Frame), of which the first is the header.
+    expected: topic, whose size limit applies, or message type.
+    fingerprint, type_name: values of a recorded message type; None: those of the current type.
+
+    Raises WireError for an invalid or unexpected message.
     """
     if isinstance(expected, Topic):
         codec = get_codec(expected.message)
@@ -187,24 +192,26 @@ def read_envelope(
     unpacked = _unpack(frames)
     if type(unpacked) is not tuple or len(unpacked) not in (10, 11):
         raise WireError(
-            "malformed", "not a flexsheet message: its header does not have eleven elements"
+            "malformed", "this is no flexsheet message: its header does not have eleven elements"
         )
     protocol, name, found, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
     if type(protocol) is not str or ELEMENTS.get(protocol) != len(unpacked):
         raise WireError(
             "malformed",
-            f"the message's protocol differs: expected {PROTOCOL}, found {_format_value(protocol)}",
+            f"the message has the protocol {_format_value(protocol)}, expected {PROTOCOL}",
         )
     plan = unpacked[9] if len(unpacked) == 11 else ""
     fields = unpacked[-1]
     # The name may be an array, and comparing an array does not give a bool.
     if type(name) is not str or name != (type_name or codec.name):
-        raise WireError("type", f"expected type {codec.name}, found {_format_value(name)}")
+        raise WireError(
+            "type", f"the message has the type {_format_value(name)}, expected {codec.name}"
+        )
     if type(found) is not bytes or found != expected_fingerprint:
         raise WireError(
             "fingerprint",
-            f"{codec.name}: expected fingerprint {expected_fingerprint.hex()}, "
-            f"found {_format_value(found)}; run the same version of flexsheet on both hosts",
+            f"{codec.name}: the message has the fingerprint {_format_value(found)}, expected "
+            f"{expected_fingerprint.hex()}; run the same version of flexsheet on both hosts",
         )
     for number in (sequence, source, publish, epoch):
         if type(number) is not int or not 0 <= number <= _MAX_INTEGER:
@@ -230,18 +237,18 @@ def decode(frames: Sequence[Any], expected: type[M]) -> tuple[M, Header]: ...
 @overload
 def decode(frames: Sequence[Any], expected: Topic) -> tuple[Message, Header]: ...
 def decode(frames: Sequence[Any], expected: Topic | type[Message]) -> tuple[Message, Header]:
-    """Decode and validate a message and its header; raises WireError for any invalid bytes."""
+    """Decode and validate a message and its header. Raises WireError for invalid data."""
     envelope = read_envelope(frames, expected)
     return envelope.open(), envelope.header
 
 
 def count_bytes(frames: Sequence[Any]) -> int:
-    """Return the size of all frames together."""
+    """Return the total size of all frames, bytes."""
     return sum(map(len, frames))
 
 
 def _unpack(frames: Sequence[Any]) -> Any:
-    """Decode the header frame with its arrays; each further frame must belong to one array."""
+    """Decode the header frame and its arrays. Each further frame must belong to one array."""
     used = 0
 
     def unpack(code: int, data: bytes) -> NDArray[Any]:
@@ -259,7 +266,7 @@ def _unpack(frames: Sequence[Any]) -> Any:
         if len(data) != offset or used >= len(frames):
             raise WireError(
                 "frames",
-                f"a frame with the elements of an array is missing; found {len(frames)} frames",
+                f"the frame with the elements of an array is missing from {len(frames)} frames",
             )
         view = _read_only(frames[used])
         if len(view) != size:
@@ -288,15 +295,17 @@ def _unpack(frames: Sequence[Any]) -> Any:
     # others.
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"[:200]
-        raise WireError("malformed", f"not a flexsheet message: {reason}") from error
+        raise WireError("malformed", f"this is no flexsheet message: {reason}") from error
     if used != len(frames) - 1:
-        raise WireError("frames", f"the header describes {used + 1} frames, found {len(frames)}")
+        raise WireError(
+            "frames", f"the message has {len(frames)} frames, but its header describes {used + 1}"
+        )
     return unpacked
 
 
 def _header_size_error(frames: Sequence[Any]) -> WireError:
     return WireError(
-        "size", f"header of {len(frames[0])} bytes, at most {MAX_HEADER_BYTES} are allowed"
+        "size", f"the header has {len(frames[0])} bytes; at most {MAX_HEADER_BYTES} are allowed"
     )
 
 
@@ -304,7 +313,7 @@ def _array_size_error(
     found: int, expected: int, dtype: np.dtype[Any], shape: tuple[int, ...]
 ) -> WireError:
     return WireError(
-        "frames", f"an array of {dtype} and shape {shape} needs {expected} bytes, found {found}"
+        "frames", f"an array of {dtype} and shape {shape} has {found} bytes, expected {expected}"
     )
 
 
@@ -325,7 +334,7 @@ def _dtype_and_shape(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 @lru_cache(maxsize=1024)
 def _read_dtype_and_shape(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], int, int]:
-    """Return dtype, shape, length of `head`, and total size of the elements in bytes."""
+    """Return dtype, shape, length of `head` (bytes), and total size of the elements (bytes)."""
     code, axes = head[0], head[1]
     if code >= len(DTYPES) or axes > 8 or len(head) != (4 * axes + 11) & ~7:
         raise WireError("malformed", f"an array has an invalid dtype or shape: {head[:16].hex()}")
@@ -336,12 +345,11 @@ def _read_dtype_and_shape(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], 
 def _message_size_error(frames: Sequence[Any], max_bytes: int, what: str) -> WireError:
     return WireError(
         "size",
-        f"{what}: message of {count_bytes(frames)} bytes, at most {max_bytes} are allowed",
+        f"{what}: the message has {count_bytes(frames)} bytes; at most {max_bytes} are allowed",
     )
 
 
 def _describe(error: ValidationError, name: str) -> str:
-    """Describe the first invalid field, without its value."""
     details = error.errors(include_url=False, include_input=False, include_context=False)
     where = ".".join(str(step) for step in details[0]["loc"]) or "message"
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
@@ -349,9 +357,9 @@ def _describe(error: ValidationError, name: str) -> str:
 
 
 def _format_value(value: object) -> str:
-    """Describe a received value for an error text, truncated; for a container give only its type.
+    """Describe a received value for an error text. Only the type of a container is given.
 
-    Deeply nested values would make `repr` fail.
+    The `repr` of deeply nested values would fail.
     """
     if isinstance(value, bytes):
         return repr(value[:60].hex())[:60]

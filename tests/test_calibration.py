@@ -252,14 +252,14 @@ def without(key: str) -> Callable[[str], str]:
     [
         (
             lambda text: text.replace("version: 2", "version: 1", 1),
-            "version: expected 2, found 1; calibrate again",
+            "the key `version` is 1, expected 2; calibrate again",
         ),
-        (without("version"), 'does not contain the key "version"'),
+        (without("version"), "this is not a calibration, because it has no key `version`"),
         (without("device"), "device: Field required"),
         (lambda text: text + "\nflavour: salt\n", "flavour: Extra inputs"),
         (lambda text: text.replace("width_px: 480", "width_px: wide"), "width_px: .*valid integer"),
         (lambda text: text[: len(text) // 3] + "\n{", "not a valid calibration file"),
-        (lambda text: "", 'does not contain the key "version"'),
+        (lambda text: "", "this is not a calibration, because it has no key `version`"),
     ],
     ids=["version", "no version", "missing", "foreign", "type", "cut", "empty"],
 )

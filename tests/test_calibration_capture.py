@@ -458,9 +458,13 @@ def test_a_plan_refuses_a_calibration_that_does_not_belong(tmp_path: Path) -> No
     plan = load_graph(launch_file(tmp_path, Path("own.yaml")))
     assert plan.nodes["triangulator"].parameters["calibration"] == str(tmp_path / "own.yaml")
     for old, new, printed in (
-        ("device: twin-bumblebee", "device: other", 'is of device "other", the scene\'s camera'),
+        (
+            "device: twin-bumblebee",
+            "device: other",
+            'is of the camera "other", but the scene',
+        ),
         ("width_px: 640", "width_px: 320", "is for 320x480 px"),
-        ("version: 2", "version: 1", "version: expected 2, found 1; calibrate again"),
+        ("version: 2", "version: 1", "the key `version` is 1, expected 2; calibrate again"),
     ):
         (tmp_path / "foreign.yaml").write_text(shipped.replace(old, new))
         with pytest.raises(BadInputError, match=printed) as refused:

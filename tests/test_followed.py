@@ -142,7 +142,7 @@ def test_the_report_agrees(tmp_path: Path) -> None:
     assert row.pop("start_s") == pytest.approx(0.2, abs=0.01)
     assert [row] == read_followed(bag)
     page = render_page(session)
-    assert "The true finger along each path" in page
+    assert "The true finger on each path" in page
     assert "drop-outs" in page
     assert any(
         'path "hand" the arms stopped following in contact once' in one.text

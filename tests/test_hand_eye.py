@@ -503,8 +503,8 @@ def test_images_of_another_size_or_without_a_board(tmp_path: Path) -> None:
     ("text", "words"),
     [
         (None, "cannot be read"),
-        ("[1]", 'does not contain the key "version"'),
-        ("version: 99", "version: expected 1, found 99"),
+        ("[1]", "this is not a calibration, because it has no key `version`"),
+        ("version: 99", "the key `version` is 99, expected 1"),
         ("version: 1", "date"),
         ("a: [", "not a valid calibration file"),
     ],

@@ -77,7 +77,7 @@ def test_a_node_that_throws_dice_is_found_out(tmp_path: Path) -> None:
 
 def test_inputs_that_were_not_recorded_are_named(tmp_path: Path) -> None:
     bag = bag_of(tmp_path, log_ms=[])
-    with pytest.raises(BagError, match="relay reads twin/finger, which was not recorded"):
+    with pytest.raises(BagError, match="does not contain twin/finger, which relay reads"):
         verify(bag, "relay")
 
 

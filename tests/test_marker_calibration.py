@@ -242,7 +242,7 @@ def test_a_marker_of_another_scene_is_refused(tmp_path: Path) -> None:
              "orientations": 9}  # fmt: skip
     file.write_text(json.dumps(found))
     setting = f"triangulator.marker_calibration={file}"
-    with pytest.raises(BadInputError, match='scene: the marker was calibrated in scene "box"'):
+    with pytest.raises(BadInputError, match='scene: the marker was calibrated in the scene "box"'):
         load_graph(ROOT / "launch" / "demo.yaml", settings=[setting])
     file.write_text(json.dumps(found).replace("0.012", "NaN"))
     with pytest.raises(CalibrationFileError, match="marker_from_pad_m"):

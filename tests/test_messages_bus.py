@@ -183,7 +183,7 @@ async def test_every_counts_and_reports_an_overflow(connections: Connections) ->
     assert first_loss > 0
     assert len(receiver.inbox) + receiver.counts.gaps == receiver.sequences[-1] - start + 1
     assert receiver.sequences == sorted(receiver.sequences)
-    assert "messages of writer lost" in receiver.problems[0]
+    assert "messages of writer were lost" in receiver.problems[0]
 
 
 async def test_what_has_just_left_its_writer_waits_for_no_newer(
@@ -370,7 +370,7 @@ async def test_bad_messages_are_rejected_and_good_ones_pass(connections: Connect
     await until(lambda: receiver.inbox[-1][0].reason == "still fine")
     assert receiver.counts.rejected == len(bad)
     assert len(receiver.problems) == 4  # malformed, frames, type, size: each once
-    assert all('topic "estop": message refused' in problem for problem in receiver.problems)
+    assert all('topic "estop": a message was refused' in problem for problem in receiver.problems)
 
 
 async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(
@@ -419,10 +419,10 @@ async def test_stale_ipc_file_of_a_killed_writer_is_replaced(connections: Connec
 @pytest.mark.parametrize(
     ("endpoint", "words"),
     [
-        ("ipc:///" + "x" * 200, "has 201 bytes, the system allows 107"),
+        ("ipc:///" + "x" * 200, "has 201 bytes, but the system allows only 107"),
         ("ipc:///no/such/folder/a", "cannot be bound"),
-        ("tcp://127.0.0.1:99999", "the port must be in 1..65535"),
-        ("tcp://192.0.2.1:7777", "beyond loopback"),
+        ("tcp://127.0.0.1:99999", "the port must be a number from 1 to 65535"),
+        ("tcp://192.0.2.1:7777", "there are no keys"),
         ("nonsense", "expected ipc"),
     ],
 )
@@ -464,7 +464,7 @@ def test_queue_lengths_are_bounded_for_every_topic() -> None:
 
 async def test_twice_started(connections: Connections) -> None:
     receiver = connections.receiver(TOPICS["estop"])
-    with pytest.raises(BusError, match="is started already"):
+    with pytest.raises(BusError, match="was called twice; call it once"):
         receiver.subscriber.start()
 
 

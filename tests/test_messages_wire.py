@@ -276,7 +276,7 @@ def test_causes_are_distinguished() -> None:
     assert refused([*good, b"more"], EStop).cause == "frames"
     other = refused(good, Fingertip)
     assert other.cause == "type"
-    assert str(other) == "expected type Fingertip, found 'EStop'"
+    assert str(other) == "the message has the type 'EStop', expected Fingertip"
     head = msgpack.unpackb(good[0])
     head[2] = bytes(8)
     assert refused([msgpack.packb(head)], EStop).cause == "fingerprint"
@@ -349,7 +349,7 @@ def test_size_limit_holds_at_both_ends() -> None:
     stop = EStop(engaged=True, reason="x" * 100)
     size = count_bytes(encode(stop, HEADER))
     assert encode(stop, HEADER, max_bytes=size)
-    with pytest.raises(WireError, match=f"message of {size} bytes, at most {size - 1}"):
+    with pytest.raises(WireError, match=f"the message has {size} bytes; at most {size - 1}"):
         encode(stop, HEADER, max_bytes=size - 1)
 
 

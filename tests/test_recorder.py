@@ -145,7 +145,7 @@ async def test_a_bag_is_named_after_its_start(tmp_path: Path) -> None:
 async def test_a_path_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     node = recorder(VirtualClock(), bag=tmp_path / "file" / "a.mcap")
-    with pytest.raises(BagError, match="file: cannot be created"):
+    with pytest.raises(BagError, match="file: the folder cannot be created"):
         await node.setup()
     await node.close()
     node = recorder(VirtualClock(), bag=tmp_path / "a.mcap", attach=(tmp_path / "no.yaml",))

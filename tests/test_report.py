@@ -126,9 +126,9 @@ def test_of_many_moments_the_first_are_shown_and_the_rest_counted() -> None:
 def test_states_last_until_another_and_gaps_stay_white() -> None:
     grid = Grid(0, 10.0, 10)
     states = States(grid, ("wait", "contact"))
-    for second, state in ((0, "wait"), (1, "wait"), (2, "contact"), (7, "contact")):
-        states.add(second, second * 10**9, state)
-    assert states.changes == 1
+    reported = ((0, "wait"), (1, "wait"), (2, "contact"), (7, "contact"))
+    changed = [states.add(second, second * 10**9, state) for second, state in reported]
+    assert changed == [False, False, True, False]
     assert list(find_intervals(states, grid)) == [
         ("wait", 0.0, 2.0),
         ("contact", 2.0, 3.0),
@@ -295,14 +295,15 @@ def test_errors_are_listed_with_the_worst_first(numbers: dict[str, Any]) -> None
     printed = " ".join(one.text for one in found)
     for part in (
         "has changes after its commit",
-        "E-stop, once; first at 2.10 s: e-stop engaged by console: a person.",
+        "An e-stop was engaged or released once, first at 2.10 s: e-stop engaged by console: "
+        "a person.",
         "left arm: joint 3 is hot",
         "right arm: joint 2 reached 210% of its maximum speed.",
-        "left arm: edge force 25 N, limit 20 N.",
+        "left arm: the edge force reached 25 N; the scene allows 20 N.",
         "planner had 3 errors; the last: on_fingertip: bang.",
         "fingertip: 1 messages were refused",
         "fingertip stopped once",
-        "outside its valid range in 10.0% of its results",
+        "outside its valid range in 10.0% of the results",
     ):
         assert part in printed, part
     gravities = [one.gravity for one in found]
@@ -384,6 +385,17 @@ def test_images_are_those_of_the_session(page: str) -> None:
     assert sum("projector" in text for text, _ in images) == 3
     # The first shot after the moment at 1.5 s is the one of 2.2 s.
     assert re.search(r"2\.21 s\.[^<]*<strong>Bookmark: &lt;b&gt;first touch", page)
+
+
+def test_the_page_states_how_many_images_it_omits(
+    bag: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flexsheet.launch.bags.report.page.draw_charts", lambda session: {})
+    monkeypatch.setattr("flexsheet.launch.bags.report.session.STEREO_SHOTS", 1)
+    session = read_session(bag)
+    shown = len(session.stereo.shots())
+    assert shown < session.stereo.count
+    assert f"<p>{shown} of {session.stereo.count} are shown" in render_page(session)
 
 
 @pytest.mark.parametrize("scheme", COLOURS)

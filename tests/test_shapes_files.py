@@ -211,7 +211,8 @@ def test_the_real_mesh_is_used_unchanged() -> None:
 
 def test_an_object_that_is_not_a_cylinder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        UnfitGeometryError, match=r'object.geometry.shape: expected "cylinder", found "mesh"'
+        UnfitGeometryError,
+        match=r'object.geometry.shape of the scene is "mesh", expected "cylinder"',
     ):
         require_cylinder(mesh_scene(tmp_path))
 

@@ -291,7 +291,7 @@ def test_file_round_trip_keeps_the_law(twin_calibration: SheetCalibration, tmp_p
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"version": 9}, "version: expected 1, found 9"),
+        ({"version": 9}, "the key `version` is 9, expected 1"),
         ({"slack_width_m": None}, "slack_width_m"),
         ({"left_oot": []}, "left_oot"),
     ],
@@ -319,7 +319,7 @@ def test_a_foreign_file_is_rejected(tmp_path: Path, content: str) -> None:
 
 def test_another_sheets_calibration_is_rejected(twin_calibration: SheetCalibration) -> None:
     other = SCENE.sheet.model_copy(update={"width_m": 0.3})
-    with pytest.raises(CalibrationMismatchError, match=r"width_m 0\.24, the scene"):
+    with pytest.raises(CalibrationMismatchError, match=r"width_m 0\.24, but the scene"):
         make_force_model(other, twin_calibration)
 
 

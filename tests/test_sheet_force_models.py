@@ -243,7 +243,7 @@ def test_a_table_of_one_entry_is_a_factor() -> None:
     ("stretches", "ratios", "words"),
     [
         ([1.05, 1.02], np.ones((2, 1, 1, 1)), "ascend"),
-        ([1.02, 1.05], np.ones((3, 1, 1, 1)), "expected ratios"),
+        ([1.02, 1.05], np.ones((3, 1, 1, 1)), "force table has ratios of shape"),
         ([1.02, 1.05], np.zeros((2, 1, 1, 1)), "above 0"),
         ([1.02, 1.05], np.full((2, 1, 1, 1), np.nan), "finite"),
     ],

@@ -114,7 +114,7 @@ def test_triangles_face_the_user(shapes: IndentationBasis) -> None:
 
 def test_what_is_out_of_range_is_named(shapes: IndentationBasis) -> None:
     assert shapes.invalid_reason(1.05, (0.0, 0.0), 0.02) == ""
-    assert "stretch 1.100" in shapes.invalid_reason(1.1, (0.0, 0.0), 0.02)
+    assert "the stretch ratio 1.100" in shapes.invalid_reason(1.1, (0.0, 0.0), 0.02)
     assert "deeper than 30 mm" in shapes.invalid_reason(1.05, (0.0, 0.0), 0.04)
     assert "too close to the sheet's edge" in shapes.invalid_reason(1.05, (0.11, 0.0), 0.02)
 

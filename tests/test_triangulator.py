@@ -295,7 +295,7 @@ async def test_a_calibration_file_is_used_and_a_foreign_one_rejected(
     assert np.array_equal(found.position_world_m, expected.position_world_m)
 
     refused = await Bench(camera, calibration=tmp_path / "other.yaml").start(scene)
-    assert 'calibration is of device "other"' in refused.node.last_error
+    assert 'calibration is of the camera "other"' in refused.node.last_error
     assert refused.node.geometry is None
     with pytest.raises(CalibrationFileError, match=r"absent\.yaml: cannot be read"):
         await Bench(camera, calibration=tmp_path / "absent.yaml").start(scene)

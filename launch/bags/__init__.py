@@ -1,1 +1,1 @@
-"""Play, replay, report and export bags (files of recorded topics)."""
+"""Play, replay, report and export bags, which are files of recorded topics."""

@@ -1,7 +1,7 @@
-"""Export bags as MCAP files with standard schemas, which Foxglove and rerun open.
+"""Export bags as MCAP files with standard schemas, which Foxglove and rerun can open.
 
-Each topic becomes a JSON channel of the same name that contains its fields, without arrays of more
-than `json_channel.MAX_ARRAY` values. Images and 3D data become separate channels:
+Each topic becomes a JSON channel of the same name. It contains the fields of the topic, without
+arrays of more than `json_channel.MAX_ARRAY` values. Images and 3D data become separate channels:
 
     stereo/left, stereo/right, frame/image, twin/eye/seen, twin/eye/expected     foxglove.RawImage
     tf          the sheet and both flanges                                foxglove.FrameTransforms
@@ -9,9 +9,9 @@ than `json_channel.MAX_ARRAY` values. Images and 3D data become separate channel
     sheet       the sheet between the flanges                             foxglove.SceneUpdate
     object      the deformed skin of the soft body                        foxglove.SceneUpdate
 
-The world frame is that of flexsheet (x right, y up, z towards the user). Times are those at which
-messages were recorded. They count from 1970 if the bag contains the wall-clock time of its start,
-else from the start of the recording computer.
+The world frame is that of flexsheet (x right, y up, z towards the user). The time of a message is
+when it was recorded. Times count from 1970 if the bag contains the wall-clock time of its start.
+Otherwise they count from the start of the recording computer.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ from flexsheet.messages.types import (
     StereoPair,
     TwinEye,
 )
+from flexsheet.nodes.arrays import Floats, Image
 
 try:
     import foxglove
@@ -69,16 +70,16 @@ else:
 
 FINGER_RADIUS_M = 0.007
 
-NamedImage = tuple[str, NDArray[np.uint8]]
+NamedImage = tuple[str, Image]
 Output = tuple[str, Any]
 
 
 MIN_FREE_BYTES = 4 << 20
-"""Minimum free disk space during an export. It exceeds the write buffer of the library."""
+"""The minimum free disk space during an export. It exceeds the write buffer of the library."""
 
 
 class ExportError(FlexsheetError, RuntimeError):
-    """Raised if an export cannot be made; the text gives the reason and the remedy."""
+    """Raised if an export cannot be made. The text gives the reason and the remedy."""
 
     code = "export"
     remedy = "Install the package that the text names, or choose another output file."
@@ -86,7 +87,7 @@ class ExportError(FlexsheetError, RuntimeError):
 
 @dataclass(slots=True)
 class ExportResult:
-    """Result of an export: number of messages per channel, and topics that could not be read."""
+    """The result of an export: message numbers per channel, and topics that could not be read."""
 
     output: Path
     messages: dict[str, int] = field(default_factory=dict)
@@ -102,12 +103,15 @@ def export(
 ) -> ExportResult:
     """Write a bag as an MCAP file with the schemas of Foxglove.
 
-    topics: names; default: all. Topics whose message type has changed since the recording cannot
-    be read, and are named in the result. Raises ExportError and BagError.
+    topics: names of topics to export; None: all topics.
+    progress: function that is called with the exported and the total duration, s.
+
+    Topics whose message type has changed since the recording cannot be read. The result contains
+    their names. Raises ExportError and BagError.
     """
     if not HAS_FOXGLOVE:
         raise ExportError(
-            "bag export needs the package foxglove-sdk: pip install 'flexsheet[export]'"
+            "`bag export` needs the package foxglove-sdk; run: pip install 'flexsheet[export]'"
         )
     selection = select_topics(bag, output, topics)
     offset_ns = wall_clock_offset_ns(selection.reader)
@@ -147,11 +151,11 @@ def export(
 
 @dataclass(frozen=True, slots=True)
 class TopicsToExport:
-    """Bag to export, its start and duration, and the names of the topics to export.
+    """The bag to export, its start and duration, and the names of the topics to export.
 
-    context: further topics whose messages are needed to draw the exported topics. unreadable:
-    requested topics whose message type cannot be migrated. clock_id: clock of the recorder; None if
-    it is unknown.
+    context: further topics whose messages are needed to draw the exported topics.
+    unreadable: requested topics whose message type cannot be migrated.
+    clock_id: clock of the recorder; None if it is unknown.
     """
 
     reader: BagReader
@@ -164,18 +168,22 @@ class TopicsToExport:
 
 
 def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) -> TopicsToExport:
-    """Select the topics of a bag to export; default: all readable topics.
+    """Select the topics of a bag to export.
+
+    output: file to write, which must not exist. topics: names of topics; None: all readable topics.
 
     Raises ExportError if the output exists or the bag does not contain a topic, and BagError.
     """
     if output is not None and output.exists():
-        raise ExportError(f"{output}: file exists already; give the name of a new file")
+        raise ExportError(f"{output}: the file exists already; give the name of a new file")
     reader = BagReader(bag)
     summary = reader.info()
     wanted = set(reader.topics if topics is None else topics)
     if absent := sorted(wanted - reader.topics.keys()):
         names = ", ".join(sorted(reader.topics)) or "no topic"
-        raise ExportError(f"{bag}: does not contain {', '.join(absent)}; it contains {names}")
+        raise ExportError(
+            f"{bag}: the bag does not contain the topics {', '.join(absent)}; it contains {names}"
+        )
     all_readable = {one.name for one in summary.topics if one.readable}
     readable = all_readable & wanted
     return TopicsToExport(
@@ -190,18 +198,18 @@ def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) 
 
 
 def check_free_space(output: Path) -> None:
-    """Raise OSError if the disk is nearly full."""
+    """Raise OSError if the disk of the output is nearly full."""
     if free_bytes(output.parent) < MIN_FREE_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @dataclass(slots=True)
 class ViewState:
-    """Latest scene, soft-body skin and flange poses, which are needed to draw later messages."""
+    """The latest scene, soft-body skin and flange poses, needed to draw later messages."""
 
     scene: Scene | None = None
     skin: Skin | None = None
-    flanges: dict[Side, NDArray[np.float64]] = field(default_factory=dict)
+    flanges: dict[Side, Floats] = field(default_factory=dict)
 
     def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
         """Yield the images and 3D data of a message as (channel, Foxglove message)."""
@@ -236,7 +244,7 @@ class ViewState:
         return draw_mesh("object", vertices, self.skin.triangles, stamp, SKIN_COLOUR)
 
     def _sheet(self, stamp: Any) -> Any | None:
-        """Return the sheet, drawn as a flat quadrilateral between both edges; None if unknown."""
+        """Return a drawing of the flat sheet between both edges, or None if an edge is unknown."""
         corners = find_sheet_corners(self.scene, self.flanges)
         if corners is None:
             return None
@@ -245,7 +253,7 @@ class ViewState:
 
 
 def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
-    """Yield the images in a message, each with the name of its channel."""
+    """Yield the images in a message with the names of their channels."""
     match message:
         case StereoPair():
             yield f"{topic}/left", message.left
@@ -259,7 +267,7 @@ def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
 
 
 def wall_clock_offset_ns(reader: BagReader) -> int | None:
-    """Return the time since 1970 minus the recorded time, ns; None if it is unknown."""
+    """Return the time since 1970 minus the recorded time (ns), or None if it is unknown."""
     recording = reader.metadata.get("recording", {})
     try:
         started = datetime.fromisoformat(recording["started"])
@@ -277,12 +285,12 @@ def _channel(name: str, value: Any, context: Any) -> Any:
     return channel_type(name, context=context)
 
 
-def _frames(child: str, world_from_child: NDArray[np.float64], stamp: Any) -> Any:
+def _frames(child: str, world_from_child: Floats, stamp: Any) -> Any:
     frame = make_frame("world", child, world_from_child, stamp)
     return fg.FrameTransforms(transforms=[frame])
 
 
-def _raw_image(name: str, image: NDArray[np.uint8], stamp: Any) -> Any:
+def _raw_image(name: str, image: Image, stamp: Any) -> Any:
     height, width = image.shape[:2]
     channels = 1 if image.ndim == 2 else image.shape[2]
     return fg.RawImage(

@@ -1,7 +1,8 @@
-"""Export bags as bags of ROS 2: MCAP files in CDR, which `ros2 bag play` and RViz accept.
+"""Export bags as bags of ROS 2: MCAP files in CDR, which `ros2 bag play` and RViz can read.
 
 `flexsheet.launch.ros2.mapping` defines the topics and types. Timestamps count from 1970 if the bag
-contains the wall-clock time of its start, else from the start of the recording computer.
+contains the wall-clock time of its start. Otherwise they count from the start of the recording
+computer.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.files import make_write_error
 
 METADATA_VERSION = 8
-"""Format version of metadata.yaml, which ROS 2 Humble and later releases can read."""
+"""The format version of metadata.yaml, which ROS 2 Humble and later releases can read."""
 
 MCAP_SUFFIX = ".mcap"
 
@@ -39,9 +40,11 @@ def export_ros2(
     """Convert a bag to a ROS 2 bag.
 
     output: folder to create, with metadata.yaml and an MCAP file. If its name ends with .mcap, only
-    the MCAP file is written, which contains the same metadata. topics: names of flexsheet topics;
-    default: all. progress: called with the converted and the total duration, s. Raises ExportError,
-    Ros2Error and BagError.
+        the MCAP file is written, which contains the same metadata.
+    topics: names of flexsheet topics to convert; None: all topics.
+    progress: function that is called with the converted and the total duration, s.
+
+    Raises ExportError, Ros2Error and BagError.
     """
     ros = load_ros_types()
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -92,7 +95,7 @@ def export_ros2(
 
 
 def make_qos(topic: RosTopic) -> Any:
-    """Return the offered quality of service: reliable, and transient local for a latched topic."""
+    """Return the quality of service of a topic: reliable, and if latched, also transient local."""
     from rosbags.interfaces import (
         Qos,
         QosDurability,

@@ -1,8 +1,8 @@
 """Convert bags to tables: one Parquet file per topic, or a table in memory.
 
-Each row is a message. The first columns contain recording time, timestamps, clock, writer and
-sequence number of its header. Each field becomes one or more columns named after the field, whose
-name contains the unit:
+Each row is a message. The first columns contain the recording time, and the timestamps, clock,
+writer and sequence number of its header. Each field becomes one or more columns named after the
+field, whose name contains the unit:
 
     number, text, timestamp          one column
     vector of 2 or 3                 FIELD.x, FIELD.y, FIELD.z
@@ -10,10 +10,10 @@ name contains the unit:
     rigid transform                  FIELD.x_m, .y_m, .z_m, and the quaternion .qx, .qy, .qz, .qw
     twist                            FIELD.linear_x_m_per_s, ..., FIELD.angular_x_rad_per_s, ...
     other array                      one list; the column's metadata contain the array's shape
-    group of fields                  its columns, with the group's name and a dot before
+    group of fields                  the columns of the group, named GROUP.FIELD
     sequence of groups               list of structures
     choice between several types     text that contains JSON
-    image                            left out, or bytes with FIELD.height and FIELD.width
+    image                            omitted, or bytes with FIELD.height and FIELD.width
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 MAX_VECTOR = 6
 ROWS_PER_GROUP = 2000
 MAX_GROUP_BYTES = 64 << 20
-"""Size of buffered images at which a row group is written, bytes."""
+"""The size of buffered images at which a row group is written."""
 
 TWIST = tuple(
     f"{kind}_{axis}_{unit}"
@@ -69,7 +69,7 @@ Get = Callable[[Any], Any]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Column of a table: name, Arrow type, function that reads a message's value, and metadata."""
+    """A column of a table: name, Arrow type, function that reads its value, and metadata."""
 
     name: str
     type: Any
@@ -129,7 +129,7 @@ def _columns_of_value(
         if images:  # a tuple of one image or none
             yield from _columns_of_value(arguments[0], name, _first(get), about, images)
         return
-    yield Column(name, _find_type(inner), _converted(get, inner), about)
+    yield Column(name, _find_type(inner), _applied(get, _make_conversion(inner)), about)
 
 
 def _columns_of_array(
@@ -189,13 +189,8 @@ def _find_type(annotation: Any) -> Any:
     return arrow.string()
 
 
-def _converted(get: Get, annotation: Any) -> Get:
-    """Return a function that gets a value and converts it to the Arrow type of its annotation."""
-    convert = _make_conversion(annotation)
-    return _applied(get, convert)
-
-
 def _make_conversion(annotation: Any) -> Get:
+    """Return a function that converts a value to the Arrow type of its annotation."""
     inner, spec = split_annotation(annotation)
     if spec is not None:
         return np.ravel
@@ -237,7 +232,7 @@ def _size(get: Get, axis: int) -> Get:
 
 
 class TableBuilder:
-    """Builder of an Arrow table from the messages of one topic."""
+    """A builder of an Arrow table from the messages of one topic."""
 
     def __init__(self, topic: str, selection: TopicsToExport, *, images: bool) -> None:
         arrow = _arrow()
@@ -272,7 +267,7 @@ class TableBuilder:
         return len(self._rows) >= ROWS_PER_GROUP or self._bytes >= MAX_GROUP_BYTES
 
     def add(self, message: Message, header: Header, log_ns: int) -> None:
-        """Add a row for a message; `time_s` is its source time since the start of the bag."""
+        """Add a row for a message. `time_s` is its source time since the start of the bag."""
         # The delay between publication and recording is negligible.
         same_clock = header.clock_id == self._selection.clock_id
         source_ns = header.source_ns + (0 if same_clock else log_ns - header.publish_ns)
@@ -290,7 +285,10 @@ class TableBuilder:
         self._rows.append(row)
 
     def drain(self) -> pyarrow.Table:
-        """Return the buffered rows as a table, and clear the buffer."""
+        """Return the buffered rows as a table, and clear the buffer.
+
+        Raises ExportError for a value that does not fit its column.
+        """
         arrow = _arrow()
         columns = zip(*self._rows, strict=True) if self._rows else ((),) * len(self.schema)
         try:
@@ -308,11 +306,14 @@ class TableBuilder:
 def read_table(bag: Path | str, topic: str, *, images: bool = False) -> pyarrow.Table:
     """Read a topic of a bag into an Arrow table, which `to_pandas` converts to a data frame.
 
-    Raises ExportError and BagError.
+    images: whether the table contains images. Raises ExportError and BagError.
     """
     selection = select_topics(Path(bag), None, [topic])
     if not selection.readable:
-        raise ExportError(f'{bag}: topic "{topic}" was recorded with an incompatible message type')
+        raise ExportError(
+            f'{bag}: topic "{topic}" was recorded with an incompatible message type; read it with '
+            "the version that recorded the bag"
+        )
     builder = TableBuilder(topic, selection, images=images)
     for _, message, header, log_ns in BagReader(bag, [topic]):
         builder.add(message, header, log_ns)
@@ -329,7 +330,11 @@ def write_parquet(
 ) -> ExportResult:
     """Write one Parquet file per topic of a bag into a new folder.
 
-    A slash in the topic's name becomes a dot in the file's name. Raises ExportError and BagError.
+    topics: names of topics; None: all topics. images: whether the tables contain images. progress:
+        function that is called with the converted and the total duration, s. A slash in the topic's
+        name becomes a dot in the file's name.
+
+    Raises ExportError and BagError.
     """
     _arrow()
     from pyarrow.parquet import ParquetWriter

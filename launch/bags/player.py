@@ -1,4 +1,4 @@
-"""Play a bag: publish its messages in a running graph, under the writer name "tools"."""
+"""Play a bag: publish its messages in a running graph under the writer name "tools"."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from flexsheet.messages.clock_table import shift_stamps
 from flexsheet.messages.topics import Delivery, find_topic
 
 Progress = Callable[[float, float], None]
-"""Function that is called with (played seconds of the bag, total seconds to play)."""
+"""A function that is called with the played and the total duration, s."""
 
 
 NEVER_PLAYED = {
     "status": "it describes the nodes of the recording",
-    "arming": "permission to move the arms is not repeated",
+    "arming": "commands to arm the arms are not repeated",
     "estop": "an e-stop or its reset is not repeated",
     "recording": "requests to record are not repeated",
 }
-"""Topics that are never played, with the reasons."""
+"""The topics that are never played, with the reasons."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicSelection:
-    """Topics of a bag that will be played, and topics that are left out, with the reasons."""
+    """The topics of a bag that will be played, and the omitted topics with the reasons."""
 
     topics: tuple[str, ...]
     left_out: dict[str, str]
@@ -40,9 +40,11 @@ class TopicSelection:
 def select_topics(
     recorded: Collection[str], plan: ResolvedGraph, wanted: Collection[str]
 ) -> TopicSelection:
-    """Select the topics of the bag that may be published under the writer name "tools".
+    """Select the topics of a bag that may be published under the writer name "tools".
 
-    wanted: topics to play; empty for all. Raises BagError if one of them cannot be played.
+    recorded: topics of the bag. wanted: topics to play; empty for all topics.
+
+    Raises BagError if a wanted topic cannot be played.
     """
     writable = list_tool_topics(plan)
     left_out = {}
@@ -56,11 +58,11 @@ def select_topics(
             chosen.append(name)
         else:
             owner = ", ".join(writer.name for writer in plan.writers.get(name, ()))
-            left_out[name] = f"written by {owner}" if owner else "not part of the graph"
+            left_out[name] = f"{owner} writes it" if owner else "it is not part of the graph"
     for name in wanted:
         if name not in chosen:
-            why = left_out.get(name, "not in the bag")
-            raise BagError(f'topic "{name}" cannot be played: {why}')
+            why = left_out.get(name, "it is not in the bag")
+            raise BagError(f'topic "{name}" cannot be played: {why}; leave it out')
     return TopicSelection(tuple(chosen), left_out)
 
 
@@ -74,10 +76,12 @@ async def play(
     start_s: float = 0.0,
     progress: Progress = lambda played, total: None,
 ) -> int:
-    """Play the bag once from `start_s`; return the number of sent messages.
+    """Play a bag once from `start_s`, and return the number of sent messages.
 
-    rate: speed factor. The last message of each latched topic before `start_s` is sent first.
-    Timestamps are shifted, so that a message has the same age as in the recording.
+    rate: speed factor.
+
+    First, the last message of each latched topic before `start_s` is sent. Timestamps are shifted,
+    so a message has the same age as in the recording.
     """
     summary = BagReader(bag).info()
     begin_ns = summary.start_ns + round(start_s * 1e9)
@@ -118,7 +122,7 @@ async def play(
 def latched_before(
     bag: Path, topics: Collection[str], begin_ns: int
 ) -> list[tuple[str, Message, Header, int]]:
-    """Return the last message before `begin_ns` of every latched topic, in a bag."""
+    """Return the last message of every latched topic before `begin_ns`, from a bag."""
     latched = [name for name in topics if find_topic(name).delivery is Delivery.LATCHED]
     last = {}
     for entry in BagReader(bag, latched, end_ns=begin_ns):

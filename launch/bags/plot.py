@@ -8,34 +8,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from flexsheet.launch.plans.documents import BadInputError, did_you_mean
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.topics import UnknownTopicError, find_topic
+from flexsheet.nodes.arrays import Floats
 
 MAX_COMPONENTS = 16
-"""Maximum number of lines in one chart. It excludes images and meshes."""
+"""The maximum number of lines in one chart, which excludes images and meshes."""
 
 CHART_SIZE_IN = (8.0, 2.4)
-"""Width and height of the chart of one field, inches."""
+"""The width and height of the chart of one field, inches."""
 
 
 @dataclass(frozen=True, slots=True)
 class FieldSeries:
-    """Values of a message field as a function of time.
+    """The values of a message field as a function of time.
 
-    name: "TOPIC.FIELD". times_s: (n,), source times relative to the start of the bag. values:
-    (n, components).
+    name: "TOPIC.FIELD". times_s (n,): source times since the start of the bag. values (n,
+        components): values of the field.
     """
 
     name: str
-    times_s: NDArray[np.float64]
-    values: NDArray[np.float64]
+    times_s: Floats
+    values: Floats
 
     def to_json(self) -> dict[str, Any]:
-        """Return the series converted to JSON types."""
+        """Return the series as JSON types."""
         return {
             "field": self.name,
             "times_s": self.times_s.tolist(),
@@ -46,9 +46,11 @@ class FieldSeries:
 def read_fields(
     bag: Path, names: Sequence[str], progress: Callable[[float, float], None]
 ) -> list[FieldSeries]:
-    """Read fields named "TOPIC.FIELD" from a bag; nested fields are "TOPIC.FIELD.FIELD".
+    """Read fields named "TOPIC.FIELD" or "TOPIC.FIELD.FIELD" from a bag.
 
-    Raises BadInputError if the bag does not contain the topic or field, or the field is no number.
+    progress: function that is called with the read and the total duration, s.
+
+    Raises BadInputError if the bag does not contain a topic or field, or a field is not a number.
     """
     paths = {name: _parse(name) for name in names}
     reader = BagReader(bag)
@@ -57,7 +59,7 @@ def read_fields(
         if topic not in recorded:
             raise _error(bag, f'{name}: topic "{topic}" is not in the bag', topic, recorded)
     summary = reader.info()
-    rows: dict[str, list[tuple[float, NDArray[np.float64]]]] = {name: [] for name in names}
+    rows: dict[str, list[tuple[float, Floats]]] = {name: [] for name in names}
     topics = {topic for topic, _ in paths.values()}
     for topic, message, header, log_ns in BagReader(bag, sorted(topics)):
         progress(1e-9 * (log_ns - summary.start_ns), summary.duration_s)
@@ -68,7 +70,7 @@ def read_fields(
 
 
 def _parse(name: str) -> tuple[str, list[str]]:
-    """Split "TOPIC.FIELD.FIELD" into the topic and the path of the field; check both."""
+    """Split "TOPIC.FIELD.FIELD" into the topic and the path of the field, and check both."""
     topic, _, path = name.partition(".")
     try:
         fields: Any = find_topic(topic).message.model_fields
@@ -81,10 +83,8 @@ def _parse(name: str) -> tuple[str, list[str]]:
     return topic, [first, *inner]
 
 
-def _get_number(
-    bag: Path, name: str, message: BaseModel, path: Sequence[str]
-) -> NDArray[np.float64] | None:
-    """Return the numbers (components,) of a field; None if the field is null."""
+def _get_number(bag: Path, name: str, message: BaseModel, path: Sequence[str]) -> Floats | None:
+    """Return the numbers (components,) of a field, or None if the field is null."""
     value: Any = message
     for part in path:
         fields = type(value).model_fields if isinstance(value, BaseModel) else {}
@@ -97,22 +97,24 @@ def _get_number(
         return None
     if isinstance(value, BaseModel):
         inner = list(type(value).model_fields)
-        raise _error(bag, f"{name}: is a group of fields; append one of its fields", "", inner)
+        raise _error(bag, f"{name}: this is a group of fields; append one of them", "", inner)
     try:
         numbers = np.asarray(value, dtype=np.float64).reshape(-1)
     except (TypeError, ValueError) as error:
-        raise BadInputError.single(str(bag), (), f"{name}: field is not a number") from error
+        raise BadInputError.single(
+            str(bag), (), f"{name}: the field is not a number", "choose another field"
+        ) from error
     if numbers.size > MAX_COMPONENTS:
-        what = f"{name}: field has {numbers.size} numbers; at most {MAX_COMPONENTS} can be plotted"
+        what = f"{name}: the field has {numbers.size} numbers, more than {MAX_COMPONENTS}"
         raise BadInputError.single(str(bag), (), what, "choose another field")
     return numbers
 
 
-def _make_series(
-    bag: Path, name: str, rows: list[tuple[float, NDArray[np.float64]]]
-) -> FieldSeries:
+def _make_series(bag: Path, name: str, rows: list[tuple[float, Floats]]) -> FieldSeries:
     if not rows:
-        raise BadInputError.single(str(bag), (), f"{name}: the bag contains no value of this field")
+        raise BadInputError.single(
+            str(bag), (), f"{name}: the bag contains no value of this field", "choose another field"
+        )
     width = max(values.size for _, values in rows)
     table = np.full((len(rows), width), np.nan)
     for row, (_, values) in zip(table, rows, strict=True):
@@ -125,7 +127,10 @@ def _error(bag: Path, what: str, name: str, known: list[str]) -> BadInputError:
 
 
 def draw_fields(series: Sequence[FieldSeries], image: Path, *, title: str) -> None:
-    """Draw one chart for each field, with a common time axis, into an image file."""
+    """Draw one chart for each field, with a common time axis, into an image file.
+
+    Raises BadInputError if the file cannot be written.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -2,10 +2,10 @@
 
 The node is built from the plan in the bag. Its status messages contain the order and time of the
 messages that it handled (`messages.types.Status.execution_log`). The replay follows this log, so it
-skips the same messages as the live node. Bags of earlier versions contain no log. The replay then
-passes all recorded inputs in the order in which they were recorded, and calls timers when due. Both
-replays must give the same bytes. The fields of the outputs are compared with the recorded ones,
-with a tolerance.
+skips the same messages as the live node. Bags of earlier versions contain no log. For them, the
+replay passes all recorded inputs in the order in which they were recorded, and calls timers when
+they are due. Both replays must give the same bytes. The fields of the outputs are compared with the
+recorded fields, with a tolerance.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from flexsheet.launch.plans.documents import did_you_mean
@@ -33,21 +32,22 @@ from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import Clocks, Status
 from flexsheet.messages.wire import decode, encode
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
+from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.node import Node, find_parameters_type, find_timers
 
 CLOCKS = "clocks"
 EPOCH = 0
-"""Epoch (start of a writer) in replayed messages. A live writer uses the time of its start."""
+"""The epoch (start of a writer) in replayed messages. A live writer uses the time of its start."""
 
 PROGRESS_STEPS = 100
-"""Number of replayed messages between two reports of progress."""
+"""The number of replayed messages between two reports of progress."""
 
 Progress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
 class SentMessage:
-    """Message that a replayed node published, as bytes."""
+    """A message that a replayed node published, as bytes."""
 
     topic: str
     data: tuple[bytes, ...]
@@ -55,11 +55,13 @@ class SentMessage:
 
 @dataclass(slots=True)
 class ReplayResult:
-    """Result of one replay of the bag.
+    """The result of one replay of the bag.
 
-    messages_in: number of input messages. missing: number of logged messages that the bag does not
-    contain. by_execution_log: whether the replay followed the node's execution log, instead of the
-    recorded order. logged_until_ns: end of the execution log, on the clock of the node's host.
+    messages_in: number of input messages.
+    missing: number of logged messages that the bag does not contain.
+    by_execution_log: whether the replay followed the node's execution log, instead of the recorded
+        order.
+    logged_until_ns: end of the execution log, on the clock of the node's host.
     """
 
     messages_in: int = 0
@@ -83,10 +85,10 @@ class ReplayResult:
 
 @dataclass(slots=True)
 class Comparison:
-    """Comparison of replayed and recorded messages of one topic, paired by source timestamp.
+    """A comparison of replayed and recorded messages of one topic, paired by source timestamp.
 
-    recorded, replayed, compared, beyond_tolerance: numbers of messages. worst: maximum difference
-    of each field that differs; 1 for values other than numbers.
+    recorded, replayed, compared, beyond_tolerance: numbers of messages.
+    worst: maximum difference of each field that differs; 1 for values other than numbers.
     """
 
     recorded: int = 0
@@ -98,7 +100,10 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """Result of `flexsheet bag verify`. For by_execution_log and missing, see `ReplayResult`."""
+    """The result of `flexsheet bag verify`.
+
+    `ReplayResult` explains `by_execution_log` and `missing`.
+    """
 
     node: str
     bag: str
@@ -120,7 +125,7 @@ class Verification:
 
     @property
     def as_live(self) -> bool:
-        """Return whether the replayed outputs equal the recorded ones within the tolerance."""
+        """Return whether the replayed outputs equal the recorded outputs within the tolerance."""
         return all(
             one.beyond_tolerance == 0 and (one.compared > 0 or one.recorded == 0)
             for one in self.topics.values()
@@ -131,17 +136,20 @@ class Verification:
         return self.repeatable and self.as_live
 
 
-def _ignore_progress(done: float, total: float) -> None:
-    """Do nothing; used where the caller needs no progress reports."""
-
-
 def verify(
-    bag: Path, name: str, *, tolerance: float = 1e-6, progress: Progress = _ignore_progress
+    bag: Path,
+    name: str,
+    *,
+    tolerance: float = 1e-6,
+    progress: Progress = lambda done, total: None,
 ) -> Verification:
     """Replay the node `name` of the bag's plan twice, and compare the outputs.
 
-    tolerance: maximum difference of a field. Raises BagError if the bag lacks the node, its inputs
-    or a valid plan, or if the node cannot be replayed.
+    tolerance: maximum difference of a field.
+    progress: function that is called with the numbers of replayed and of all messages.
+
+    Raises BagError if the bag lacks the node, its inputs or a valid plan, or if the node cannot be
+    replayed.
     """
     reader = BagReader(bag)
     plan = _read_plan(reader)
@@ -158,7 +166,7 @@ def verify(
             "the version that recorded the bag"
         ) from error
     if why:
-        raise BagError(f"{name} cannot be replayed: {why}")
+        raise BagError(f"the node {name} cannot be replayed: {why}; verify another node")
     _check_inputs(bag, reader, plan, node)
     first = asyncio.run(replay(bag, node, lambda done, total: progress(done, 2 * total)))
     second = asyncio.run(replay(bag, node, lambda done, total: progress(total + done, 2 * total)))
@@ -189,15 +197,15 @@ def _read_plan(reader: BagReader) -> ResolvedGraph:
 
 
 def refusal(node: ResolvedNode) -> str:
-    """Return the reason why a node cannot be replayed; an empty text if it can be."""
+    """Return the reason why a node cannot be replayed, or "" if it can be replayed."""
     class_ = node_class(node.type)
     return class_.replay_refusal(find_parameters_type(class_).model_validate(node.parameters))
 
 
 async def replay(
-    bag: Path, planned: ResolvedNode, progress: Progress = _ignore_progress
+    bag: Path, planned: ResolvedNode, progress: Progress = lambda done, total: None
 ) -> ReplayResult:
-    """Pass the recorded inputs in the bag to a newly built node, once, and store its outputs."""
+    """Replay a newly built node once with its recorded inputs, and return its outputs."""
     result = ReplayResult()
     runs = read_runs(bag, planned.name)
     before, total = 0, sum(len(run.steps) for run in runs)
@@ -217,7 +225,7 @@ def _report_progress(progress: Progress, before: int, total: int, step: int) -> 
 
 
 def _build_node(planned: ResolvedNode, clock: VirtualClock, result: ReplayResult) -> Node:
-    """Build the node as a launcher does; its published messages are stored in `result`."""
+    """Build the node as a launcher does. Its published messages are stored in `result`."""
 
     def store(topic: Topic, message: Message, header: Header) -> None:
         result.sent.append(
@@ -283,7 +291,7 @@ async def _replay_run(
     result: ReplayResult,
     report: Callable[[int], None],
 ) -> None:
-    """Pass those inputs to the node that its execution log of one run contains, in its order."""
+    """Pass the inputs of one run to the node in the order of its execution log."""
     clock = VirtualClock(int(run.steps[0, 3]), clock_id=run.clock_id)
     node = _build_node(planned, clock, result)
     names, timers = list(node.inputs), find_timers(type(node))
@@ -311,19 +319,22 @@ async def _replay_run(
 
 @dataclass(frozen=True, slots=True)
 class NodeRun:
-    """Execution log of a node from one of its starts to the next.
+    """The execution log of a node from one of its starts to the next.
 
     steps (n, 4): one row per executed step: index of the input, or -1 - index of the timer;
-    sequence number; epoch; time, ns.
+        sequence number; epoch; time, ns.
     """
 
     clock_id: str
-    steps: NDArray[np.int64]
+    steps: Ints
 
 
 def read_runs(bag: Path, name: str) -> list[NodeRun]:
-    """Read the execution logs of a node, one per start; an empty list if the bag has none."""
-    logs: dict[int, list[NDArray[np.int64]]] = {}
+    """Read the execution logs of a node, one per start.
+
+    Return an empty list if the bag has none.
+    """
+    logs: dict[int, list[Ints]] = {}
     clock_ids: dict[int, str] = {}
     if "status" not in BagReader(bag).topics:
         return []
@@ -339,10 +350,10 @@ def read_runs(bag: Path, name: str) -> list[NodeRun]:
 
 
 class RecordedInputs:
-    """Reader of a node's recorded inputs, which reads only as far as the execution log needs."""
+    """A reader of a node's recorded inputs, which reads only as far as the execution log needs."""
 
     LOOK_AHEAD = 5000
-    """Number of messages to read before a logged message counts as missing."""
+    """The number of messages to read before a logged message counts as missing."""
 
     def __init__(self, bag: Path, node: Node) -> None:
         self._bag, self._node = bag, node
@@ -358,7 +369,7 @@ class RecordedInputs:
     def latched_before(self, run: NodeRun) -> list[tuple[str, Message, Header]]:
         """Return the latched messages that the node had before the first step of the run.
 
-        Each entry is (port, message, header); the last message of each port.
+        The result contains (port, message, header) of the last message of each port.
         """
         steps = {(names, *key) for names, *key in run.steps[:, :3].tolist()}
         latched = {
@@ -378,7 +389,7 @@ class RecordedInputs:
         return [(port, *entry) for port, entry in found.items()]
 
     def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
-        """Return the message of a port with this sequence number and epoch; None if missing."""
+        """Return the message of a port with this sequence number and epoch, or None."""
         waiting = self._waiting[port]
         latest = self._node.inputs[port].topic.delivery is Delivery.LATEST
         read = seen = 0
@@ -412,7 +423,7 @@ class RecordedInputs:
 
 
 class Timers:
-    """Scheduler that calls the periodic methods of a node on a virtual clock."""
+    """A scheduler that calls the periodic methods of a node on a virtual clock."""
 
     def __init__(self, node: Node, start_ns: int) -> None:
         self._node = node
@@ -437,7 +448,7 @@ class Timers:
 def compare(
     bag: Path, node: ResolvedNode, replayed: ReplayResult, tolerance: float
 ) -> dict[str, Comparison]:
-    """Compare the node's recorded outputs with the replayed ones, by topic."""
+    """Compare the node's recorded outputs with the replayed outputs, by topic."""
     outputs = {port.topic for port in node.outputs} - {"status"}
     recorded: dict[str, dict[int, Message]] = {topic: {} for topic in outputs}
     comparisons = {topic: Comparison() for topic in sorted(outputs)}
@@ -468,7 +479,10 @@ def compare(
 def compute_field_differences(
     one: BaseModel, other: BaseModel, prefix: str = ""
 ) -> dict[str, float]:
-    """Return the difference of each field in which two messages differ; see `Comparison.worst`."""
+    """Return the difference of each field in which two messages differ, by field name.
+
+    It is the maximum absolute difference of numbers, and 1 for other values.
+    """
     found: dict[str, float] = {}
     for name in type(one).model_fields:
         a, b = getattr(one, name), getattr(other, name)
@@ -491,8 +505,8 @@ def _difference(a: Any, b: Any) -> float:
     return 0.0 if a == b else 1.0
 
 
-def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Return the largest difference of two arrays; infinite if a value is NaN in only one."""
+def _distance(a: Floats, b: Floats) -> float:
+    """Return the largest difference of two arrays; infinite if a value is NaN in only one array."""
     same = (a == b) | (np.isnan(a) & np.isnan(b))
     with np.errstate(invalid="ignore"):
         apart = np.where(same, 0.0, np.abs(a - b))
@@ -502,7 +516,8 @@ def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: ResolvedNode) -> None:
     """Raise BagError if an input topic was not recorded.
 
-    A topic without messages is allowed, and one that no node of the graph publishes.
+    A recorded topic may have no messages. A topic that no node of the graph publishes may be
+    missing.
     """
     recorded = set(reader.topics)
     for other in plan.nodes.values():
@@ -516,8 +531,10 @@ def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: Resol
     if missing:
         options = " ".join(f"--include {topic}" for topic in missing)
         raise BagError(
-            f"{bag}: {node.name} reads {', '.join(missing)}, which was not recorded; "
-            f"record it with: flexsheet bag record BAG {options}"
+            f"{bag}: the bag does not contain {', '.join(missing)}, which {node.name} reads; "
+            f"record a new bag with: flexsheet bag record BAG {options}"
         )
     if not {port.topic for port in node.inputs} & set(reader.topics):
-        raise BagError(f"{bag}: contains no input messages of {node.name}; verify another node")
+        raise BagError(
+            f"{bag}: the bag contains no input messages of {node.name}; verify another node"
+        )

@@ -1,7 +1,7 @@
 """Publish and subscribe to ROS 2 topics with the middleware Cyclone DDS.
 
 ROS 2 maps the topic `/a` to the DDS topic `rt/a`, and the type `p/msg/T` to `p::msg::dds_::T_`.
-`mapping.RosTypes` serializes messages to CDR, so Cyclone DDS only transports their bytes.
+`mapping.RosTypes` serializes messages to CDR, and Cyclone DDS only transports the bytes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from flexsheet.launch.ros2.mapping import RosTopic, load_ros_types
 LOOPBACK = "lo"
 MAX_DOMAIN = 232
 MAX_PARTICIPANTS = 120
-"""Maximum number of DDS participants on this computer that find each other without multicast."""
+"""The maximum number of DDS participants that find each other without multicast."""
 
 WAIT_S = 0.2
 BLOCKING_S = 0.1
@@ -50,7 +50,9 @@ def make_configuration(interface: str) -> str:
     """
     if interface not in psutil.net_if_addrs():
         names = ", ".join(sorted(psutil.net_if_addrs()))
-        raise Ros2Error(f"--interface {interface}: no such network interface; choose {names}")
+        raise Ros2Error(
+            f"--interface {interface}: this computer has no such network interface; it has {names}"
+        )
     loopback = interface == LOOPBACK
     multicast = "false" if loopback else "true"
     peers = '<Peers><Peer Address="127.0.0.1"/></Peers>' if loopback else ""
@@ -66,7 +68,7 @@ def make_configuration(interface: str) -> str:
 
 @dataclass(slots=True)
 class Sample:
-    """Received message, serialized as CDR bytes."""
+    """A received message as CDR bytes."""
 
     cdr: bytes
     sample_info: Any = None
@@ -74,7 +76,7 @@ class Sample:
 
 @cache
 def make_dds_type(ros_type: str) -> Any:
-    """Make a Cyclone DDS type for a ROS type; its samples store the CDR bytes in `cdr`."""
+    """Make a Cyclone DDS type for a ROS type. Its samples store the CDR bytes in `cdr`."""
     described = _describe(ros_type)
 
     def serialize(self: Any, **_: Any) -> bytes:
@@ -113,10 +115,12 @@ def _describe(ros_type: str) -> Any:
 
 
 class RosParticipant:
-    """Participant of a DDS domain that publishes and subscribes to ROS topics.
+    """A participant of a DDS domain that publishes and subscribes to ROS topics.
 
     domain: number of the domain, as in the ROS_DOMAIN_ID of the other participants. interface: name
-    of the only network interface to use. Raises Ros2Error if the participant cannot be created.
+        of the network interface to use.
+
+    Raises Ros2Error if the participant cannot be created.
     """
 
     def __init__(self, domain: int, interface: str = LOOPBACK) -> None:
@@ -130,7 +134,9 @@ class RosParticipant:
             self._domain = Domain(domain, configuration)
             self._participant = DomainParticipant(domain)
         except DDSException as error:
-            raise Ros2Error(f"DDS domain {domain} on {interface}: cannot join: {error}") from error
+            raise Ros2Error(
+                f"the DDS domain {domain} on {interface} cannot be joined: {error}; check --domain"
+            ) from error
         self._writers: dict[str, Any] = {}
         self._readers: list[tuple[Any, Callable[[bytes], None]]] = []
         self._waiting = WaitSet(self._participant)
@@ -147,11 +153,11 @@ class RosParticipant:
             )
 
     def has_readers(self, topic: RosTopic) -> bool:
-        """Return whether a topic needs a message: it has readers, or is latched for later ones."""
+        """Return whether a topic has readers, or is latched for later readers."""
         return topic.latched or bool(self._writers[topic.name].get_matched_subscriptions())
 
     def write(self, topic: RosTopic, cdr: bytes) -> None:
-        """Publish a message on an advertised topic. Raises Ros2Error if DDS cannot write it."""
+        """Publish a message (CDR bytes) on an advertised topic. Raises Ros2Error if this fails."""
         from cyclonedds.core import DDSException
 
         kind = make_dds_type(topic.ros_type)
@@ -160,10 +166,15 @@ class RosParticipant:
         try:
             self._writers[topic.name].write(sample)
         except DDSException as error:
-            raise Ros2Error(f"ROS topic {topic.name}: cannot publish: {error}") from error
+            raise Ros2Error(
+                f"ROS topic {topic.name}: a message cannot be published: {error}"
+            ) from error
 
     def subscribe(self, topic: RosTopic, on_message: Callable[[bytes], None]) -> None:
-        """Subscribe: call a function in the running event loop with each message (CDR bytes)."""
+        """Subscribe to a topic.
+
+        `on_message` is called in the running loop with each message's CDR bytes.
+        """
         from cyclonedds.core import InstanceState as State
         from cyclonedds.core import ReadCondition, SampleState, ViewState
         from cyclonedds.sub import DataReader

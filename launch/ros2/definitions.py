@@ -1,16 +1,16 @@
-"""Generate the ROS 2 package `flexsheet_msgs`: message types that equal those of flexsheet.
+"""Generate the ROS 2 package `flexsheet_msgs`, whose message types equal those of flexsheet.
 
-Each message type, and each named group of fields, becomes one ROS type of the same name. Fields
-are converted as follows:
+Each message type and each named group of fields becomes one ROS type of the same name. Fields are
+converted as follows:
 
     bool, int, float, text              bool, int64, float64, string
     timestamp                           builtin_interfaces/Time
     array with at most one named axis   flat sequence or array of its elements, row by row
     value that may be None              sequence with no or one element
-    tuple of values of one type         sequence of them
+    tuple of values of one type         sequence of the values
     anything else (such as a choice between several types)    string that contains JSON
 
-Images are omitted: `mapping.VIEWS` contains them as sensor_msgs/Image.
+Images are omitted, because `mapping.VIEWS` contains them as sensor_msgs/Image.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from flexsheet.messages.field_types import get_annotation, is_image, split_annot
 
 PACKAGE = "flexsheet_msgs"
 HEADER = "std_msgs/Header header\nstring writer\nuint64 sequence_number\n"
-"""First fields of each ROS message type; `writer` is the name of the publishing node."""
+"""The first fields of each ROS message type. `writer` is the name of the publishing node."""
 
 ELEMENTS = {"<f8": "float64", "<f4": "float32", "<i4": "int32", "<i8": "int64", "|u1": "uint8"}
-"""ROS element type for each NumPy element type of an array field."""
+"""The ROS element type for each NumPy element type of an array field."""
 
 Make = Callable[[str, dict[str, Any]], Any]
-"""Function that makes a ROS message from the name of its type and its fields."""
+"""A function that makes a ROS message from the name of its type and its fields."""
 
 
 class Ros2Error(FlexsheetError, RuntimeError):
-    """Raised if messages cannot be exchanged with ROS 2; the text gives reason and remedy."""
+    """Raised if messages cannot be exchanged with ROS 2. The text gives reason and remedy."""
 
     code = "ros2"
     remedy = "Install the packages of the extra `flexsheet[ros2]`, or correct the named value."
@@ -51,7 +51,7 @@ class Ros2Error(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class OwnField:
-    """Field of a ROS type: name, ROS type, and function that converts a value to ROS."""
+    """A field of a ROS type: name, ROS type, and function that converts a value to ROS."""
 
     name: str
     ros_type: str
@@ -92,7 +92,7 @@ def list_fields(kind: type[BaseModel]) -> tuple[OwnField, ...]:
 
 
 def make_definitions(kinds: Iterable[type[Message]]) -> dict[str, str]:
-    """Return the texts of the .msg files of message types and their groups, by ROS type name."""
+    """Return the .msg texts of message types and of their groups of fields, by ROS type name."""
     found: dict[str, str] = {}
     waiting: list[type[BaseModel]] = list(kinds)
     while waiting:
@@ -158,7 +158,7 @@ def _describe(annotation: Any) -> tuple[str, Callable[[Any, Make], Any]]:
 def _describe_sequence(
     item: Any, suffix: str, split: Callable[[Any], tuple[Any, ...]]
 ) -> tuple[str, Callable[[Any, Make], Any]]:
-    """Return the ROS type of a sequence and its conversion; None becomes an empty sequence."""
+    """Return the ROS type of a sequence and its conversion. None becomes an empty sequence."""
     item_type, convert = _describe(item)
     if "[" in item_type:  # ROS does not support sequences of sequences.
         adapter = TypeAdapter(item)

@@ -1,8 +1,8 @@
 """Check messages of external ROS nodes, and convert them to messages of flexsheet.
 
-The messages are not trusted: one is rejected unless its frame, numbers and timestamp are plausible.
-External fingertips are filtered by the same tracker as those from the camera. No external message
-commands the arms directly.
+The messages are not trusted: a message is rejected unless its frame, numbers and timestamp are
+    plausible. External fingertips are filtered by the same tracker as those from the camera. No
+    external message commands the arms directly.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MAX_FUTURE_S = 0.005
 
 @dataclass(frozen=True, slots=True)
 class RosInput:
-    """ROS topic whose messages may be converted and published on a topic of flexsheet."""
+    """A ROS topic whose messages may be converted and published on a topic of flexsheet."""
 
     topic: str
     ros_topic: RosTopic
@@ -48,15 +48,15 @@ INPUTS = {
                           RosTopic("/external/fingertip", "geometry_msgs/msg/PointStamped", False),
                           "point of the finger's pad that touches the sheet"),
 }  # fmt: skip
-"""Possible external inputs, by the flexsheet topic on which they are published."""
+"""The possible external inputs, by the flexsheet topic on which they are published."""
 
 
 @dataclass(slots=True)
 class ExternalInputs:
-    """Checker and converter of external messages.
+    """A checker and converter of external messages.
 
     noise_m: standard deviation of external fingertip positions. rejected: numbers of rejected
-    messages by reason.
+        messages by reason.
     """
 
     noise_m: float
@@ -72,11 +72,12 @@ class ExternalInputs:
     def convert(
         self, topic: str, decode: Callable[[], Any], now_ns: int, unix_ns: int
     ) -> tuple[Message, int] | None:
-        """Convert a ROS message; return it with its source timestamp on the local clock, ns.
+        """Convert a ROS message, and return it with its source timestamp on the local clock, ns.
 
-        Returns None if the message is rejected. decode: function that returns the ROS message, or
-        raises an exception for malformed bytes. now_ns: present time of the local clock. unix_ns:
-        present time since 1970.
+        decode: function that returns the ROS message, or raises an exception for malformed bytes.
+            now_ns: current time of the local clock. unix_ns: current time since 1970.
+
+        Returns None if the message is rejected.
         """
         try:
             if self.scene is None:
@@ -100,7 +101,10 @@ class ExternalInputs:
         return made, at_ns
 
     def _check_header(self, topic: str, header: Any, now_ns: int, unix_ns: int) -> int:
-        """Check frame and timestamp of a header; return the timestamp on the local clock, ns."""
+        """Check the frame and timestamp of a header. Return the timestamp on the local clock, ns.
+
+        Raises RejectedError if the frame or the timestamp is invalid.
+        """
         if header.frame_id != WORLD:
             raise RejectedError(Rejection.WRONG_FRAME)
         stamp_ns = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)

@@ -5,7 +5,7 @@ publish for flexsheet. In addition, each topic is published with all its fields 
 `flexsheet/TOPIC`. The module `definitions` generates the types of these topics.
 
 Children of the frame `world`: `object`, `camera_left`, `camera_right`, `projector`, `left_base`,
-`right_base`, `left_flange_measured`, `right_flange_measured`, `sheet`, `fingertip`.  The measured
+`right_base`, `left_flange_measured`, `right_flange_measured`, `sheet`, `fingertip`. The measured
 flanges have their own names, because a robot model in ROS computes flanges from joint angles.
 """
 
@@ -18,7 +18,6 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.ros2.definitions import (
     Ros2Error,
@@ -47,14 +46,15 @@ from flexsheet.messages.types import (
     TwinEye,
     TwinFinger,
 )
+from flexsheet.nodes.arrays import Floats, Image, Singles
+from flexsheet.nodes.models.camera import camera_matrix
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, quaternion_from_rotation
 
-Floats = NDArray[np.float64]
 OWN_PREFIX = "/flexsheet/"
 WORLD = "world"
 JOINTS = 6
 CONTEXT_TOPICS = frozenset({"scene", "skin", "arm_left", "arm_right"})
-"""Topics whose latest messages are needed to convert messages of other topics."""
+"""The topics whose latest messages are needed to convert messages of other topics."""
 
 SHEET_COLOUR = (0.97, 0.93, 0.84, 0.45)
 _TRIANGLE_LIST = 11
@@ -62,7 +62,7 @@ _FLOAT32 = 7
 
 
 class RosTypes:
-    """ROS 2 message types with their CDR codec, including the types of `flexsheet_msgs`.
+    """The ROS 2 message types with their CDR codec, including the types of `flexsheet_msgs`.
 
     Raises Ros2Error if the package rosbags is not installed.
     """
@@ -120,11 +120,11 @@ def load_ros_types() -> RosTypes:
 
 @dataclass(slots=True)
 class Source:
-    """Context in which a message is converted.
+    """The context in which a message is converted.
 
-    ros: ROS types. topic: topic of the message. at_ns: source timestamp of the message, ns since
-    1970. scene, skin: latest messages of the same graph; None before the first. flanges: latest
-    flange poses (4, 4) by side.
+    topic: topic of the message. at_ns: source timestamp of the message, ns since 1970.
+    scene, skin: latest messages of the same graph; None before the first message.
+    flanges: latest flange poses (4, 4) by side.
     """
 
     ros: RosTypes
@@ -141,11 +141,12 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """ROS topic with a standard type that represents some fields of a message.
+    """A ROS topic with a standard type that represents some fields of a message.
 
-    message: type of the message. fields: names of the fields. name: name of the ROS topic without
-    its first slash; {topic} stands for the topic of the message. make: function that converts a
-    message, or returns None if there is nothing to publish.
+    message: type of the message. fields: names of the fields.
+    name: name of the ROS topic without its first slash; {topic} stands for the topic of the
+        message.
+    make: function that converts a message, or returns None if there is nothing to publish.
     """
 
     message: type[Message]
@@ -158,7 +159,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class RosTopic:
-    """ROS 2 topic: name, which begins with a slash, ROS type, and whether it is latched.
+    """A ROS 2 topic: name, which begins with a slash, ROS type, and whether it is latched.
 
     Later readers of a latched topic receive its last message.
     """
@@ -168,7 +169,7 @@ class RosTopic:
     latched: bool
 
 
-def _image(select: Callable[[Any], tuple[NDArray[np.uint8], str] | None]) -> Any:
+def _image(select: Callable[[Any], tuple[Image, str] | None]) -> Any:
     def make(message: Any, source: Source) -> Any | None:
         found = select(message)
         if found is None:
@@ -200,8 +201,7 @@ def _camera_info(side: Side) -> Callable[[StereoPair, Source], Any | None]:
         lens: Lens = getattr(camera, side)
         column, row = getattr(pair, f"{side}_origin_px")
         height, width = getattr(pair, side).shape
-        matrix = [lens.fx_px, 0.0, lens.cx_px, 0.0, lens.fy_px, lens.cy_px, 0.0, 0.0, 1.0]
-        projection = np.column_stack([np.reshape(matrix, (3, 3)), np.zeros(3)])
+        matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
         cropped = (height, width) != (camera.height_px, camera.width_px)
         roi = {"x_offset": column, "y_offset": row, "height": height, "width": width}
         if not cropped:  # In ROS, a region of interest of zeros means the whole image.
@@ -214,9 +214,9 @@ def _camera_info(side: Side) -> Callable[[StereoPair, Source], Any | None]:
                 "width": camera.width_px,
                 "distortion_model": "plumb_bob",
                 "d": np.array(lens.distortion),
-                "k": np.array(matrix),
+                "k": matrix.ravel(),
                 "r": np.eye(3).ravel(),
-                "p": projection.ravel(),
+                "p": np.column_stack([matrix, np.zeros(3)]).ravel(),
                 "binning_x": 0,
                 "binning_y": 0,
                 "roi": source.ros.make(
@@ -290,7 +290,7 @@ FORCE_DIRECTIONS = {
     "left_edge": (1.0, 0.0, 0.0),
     "right_edge": (-1.0, 0.0, 0.0),
 }
-"""Direction of a positive measured force in the frame of the sheet, by the axis of the sensor."""
+"""The direction of a positive measured force in the sheet frame, by the axis of the sensor."""
 
 
 def _measured_force(force: Force, source: Source) -> Any | None:
@@ -366,7 +366,7 @@ def _fingertip_frame(fingertip: Fingertip, source: Source) -> Any | None:
 
 
 def _eye_pose(eye: Eye, source: Source) -> Any | None:
-    """Return the pose of a frame at the midpoint of the eyes; None if the eyes are not valid.
+    """Return the pose of a frame at the midpoint of the eyes, or None if the eyes are not valid.
 
     The x axis of the frame points from the left to the right eye.
     """
@@ -382,7 +382,7 @@ def _eye_pose(eye: Eye, source: Source) -> Any | None:
     return _pose(source, matrix)
 
 
-def _points(source: Source, points: NDArray[np.float32]) -> Any:
+def _points(source: Source, points: Singles) -> Any:
     field_type = "sensor_msgs/msg/PointField"
     fields = [
         source.ros.make(
@@ -415,8 +415,8 @@ def _deformed_points(body: SoftBody, source: Source) -> Any | None:
 def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floats | None:
     """Return the corners (4, 3), m, of a flat sheet between both clamped edges.
 
-    Their order is lower left, upper left, lower right, upper right.  flanges: poses (4, 4) by side.
-    Returns None before the scene and both arms are known.
+    Their order is lower left, upper left, lower right, upper right. flanges: poses (4, 4) by side.
+        Returns None if the scene or an arm is unknown.
     """
     if scene is None or len(flanges) < 2:
         return None
@@ -536,9 +536,9 @@ VIEWS = (
 
 @cache
 def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
-    """List the ROS topics for a flexsheet topic, each with its view.
+    """List the ROS topics for a flexsheet topic with their views.
 
-    Topics with standard types come first, then the one with all fields, whose view is None.
+    Topics with standard types come first. The last topic contains all fields, and its view is None.
     """
     found: list[tuple[RosTopic, View | None]] = [
         (RosTopic("/" + view.name.format(topic=topic.name), view.ros_type, view.latched), view)
@@ -552,7 +552,7 @@ def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
 
 @dataclass(slots=True)
 class Converter:
-    """Converter of the messages of one graph to ROS 2.
+    """A converter of the messages of one graph to ROS 2.
 
     It stores the latest scene, skin and flange poses, which later conversions need.
     """
@@ -570,10 +570,10 @@ class Converter:
         shift_ns: int,
         wanted: Callable[[RosTopic], bool] = lambda _: True,
     ) -> Iterator[tuple[RosTopic, Any]]:
-        """Convert a message; yield each resulting ROS message with its ROS topic.
+        """Convert a message, and yield each resulting ROS message with its ROS topic.
 
         shift_ns: time since 1970 minus time of the clock in the header. wanted: function that
-        returns whether a ROS topic needs a message.
+            returns whether a ROS topic needs a message.
         """
         match message:
             case Scene():

@@ -1,9 +1,9 @@
 """Describe the hardware of a scene (arms, camera, projector, sheet) by links and joints, like URDF.
 
-Links of each arm: `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and `SIDE_clamp`; SIDE
-is `left` or `right`. Other links: `world`, `camera_left`, `camera_right`, `projector` and `screen`.
-The movable joints are `SIDE_joint_1` to `SIDE_joint_6`. The model contains only geometry, because
-masses and torques are unknown.
+Links of each arm: `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and `SIDE_clamp`,
+    where SIDE is `left` or `right`. Other links: `world`, `camera_left`, `camera_right`,
+    `projector` and `screen`. The movable joints are `SIDE_joint_1` to `SIDE_joint_6`. The model
+    contains only geometry, because masses and torques are unknown.
 """
 
 from __future__ import annotations
@@ -13,18 +13,17 @@ from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.ros2.mapping import list_joints
 from flexsheet.messages.scene import ClosedFormArm, Projector, Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.arms import BRACKET_WIDTH_M, CLAMP_SIZE_M, make_pieces
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, rotation_from_vector, transform
 from flexsheet.nodes.models.sheet import flange_pose
 
-Floats = NDArray[np.float64]
 Vector = tuple[float, float, float]
 Colour = tuple[float, float, float, float]
 
@@ -35,14 +34,14 @@ LENS: Colour = (0.0, 0.42, 0.58, 1.0)
 SCREEN: Colour = (0.97, 0.93, 0.84, 0.35)
 
 CAMERA_BODY_M: Vector = (0.05, 0.035, 0.045)
-"""Size (x, y, z) of the drawn housing of each camera, which is centred behind the lens."""
+"""The size (x, y, z) of the drawn housing of each camera, which is centred behind the lens."""
 PROJECTOR_BODY_M: Vector = (0.16, 0.07, 0.12)
 LENS_LENGTH_M = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """Box of a link: size and centre (m) in the frame of the link, and colour as RGBA (0 to 1)."""
+    """A box of a link: size and centre (m) in the link's frame, and colour as RGBA (0 to 1)."""
 
     size_m: Vector
     centre_m: Vector
@@ -51,7 +50,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """Rigid part of the apparatus, represented by boxes."""
+    """A rigid part of the apparatus, represented by boxes."""
 
     name: str
     boxes: tuple[Box, ...] = ()
@@ -59,7 +58,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class JointLimit:
-    """Axis of a revolute joint in the frame of its child link, range and maximum speed."""
+    """The axis of a revolute joint in the frame of its child link, its range and maximum speed."""
 
     axis: Vector
     min_rad: float
@@ -69,10 +68,10 @@ class JointLimit:
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """Joint between two links.
+    """A joint between two links.
 
     parent_from_child: pose (4, 4) of the child at joint angle zero. limit: axis and range of a
-    revolute joint; None for a fixed joint.
+        revolute joint; None for a fixed joint.
     """
 
     name: str
@@ -82,7 +81,7 @@ class Joint:
     limit: JointLimit | None = None
 
     def pose(self, angle_rad: float) -> Floats:
-        """Return the pose (4, 4) of the child at a joint angle; a fixed joint ignores the angle."""
+        """Return the pose (4, 4) of the child at a joint angle. A fixed joint ignores the angle."""
         if self.limit is None:
             return self.parent_from_child
         rotation = rotation_from_vector(angle_rad * np.array(self.limit.axis))
@@ -91,14 +90,17 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class ApparatusModel:
-    """Links and joints of the apparatus, in an order in which each parent precedes its child."""
+    """The links and joints of the apparatus. Each parent link precedes its child links."""
 
     name: str
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
 
     def poses(self, angles_rad: Mapping[str, float]) -> dict[str, Floats]:
-        """Return the world poses (4, 4) of all links; joints that are not named are at zero."""
+        """Return the world poses (4, 4) of all links.
+
+        The angle of a joint without entry is zero.
+        """
         found = {WORLD: np.eye(4)}
         for joint in self.joints:
             found[joint.child] = found[joint.parent] @ joint.pose(angles_rad.get(joint.name, 0.0))
@@ -196,7 +198,7 @@ def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]
 
 
 def _make_device(body_m: Vector, lens_m: float) -> tuple[Box, ...]:
-    """Make boxes for housing and lens of a device; the lens is at the origin and faces +z."""
+    """Make boxes for the housing and lens of a device. The lens is at the origin and faces +z."""
     depth_m = body_m[2]
     return (
         Box(body_m, (0.0, 0.0, -0.5 * (depth_m + LENS_LENGTH_M)), DARK),

@@ -1,6 +1,6 @@
 """Draw poses, surfaces and the finger as messages of Foxglove, in the world frame.
 
-It requires the package foxglove-sdk.
+The package foxglove-sdk is required.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from foxglove import messages as fg
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from flexsheet.launch.viewing.apparatus_model import WORLD, Colour, Floats
+from flexsheet.launch.viewing.apparatus_model import WORLD, Colour
 from flexsheet.messages.types import EStop, Fingertip
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import transform
 
 SKIN_COLOUR: Colour = (0.84, 0.38, 0.33, 1.0)
@@ -23,12 +24,12 @@ PATH_WIDTH_M = 0.001
 
 
 def make_stamp(at_ns: int) -> Any:
-    """Make a timestamp from a time since 1970, ns."""
+    """Make a Foxglove timestamp from a time since 1970, ns."""
     return fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
 
 
 def make_frame(parent: str, child: str, parent_from_child: Floats, stamp: Any) -> Any:
-    """Make the transform of one frame from its pose (4, 4)."""
+    """Make the transform between two frames from the pose (4, 4) of the child."""
     return fg.FrameTransform(
         timestamp=stamp,
         parent_frame_id=parent,

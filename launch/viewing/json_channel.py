@@ -1,6 +1,6 @@
 """Convert messages to JSON that viewers can list and plot.
 
-Foxglove and Lichtblick reject nested arrays and fields without a type. Therefore an array becomes
+Foxglove and Lichtblick reject nested arrays and fields without a type. An array therefore becomes
 one list, row by row, and a field with the value None is omitted.
 """
 
@@ -9,15 +9,15 @@ from __future__ import annotations
 import types
 from enum import Enum
 from functools import cache
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel
 
-from flexsheet.messages.arrays import ArraySpec
+from flexsheet.messages.field_types import get_annotation, split_annotation
 
 MAX_ARRAY = 64
-"""Maximum number of elements of an array in a JSON message; larger arrays are omitted."""
+"""The maximum number of elements of an array in a JSON message. Larger arrays are omitted."""
 
 JsonSchema = dict[str, Any]
 _NUMBER: JsonSchema = {"type": "number"}
@@ -28,17 +28,12 @@ _OMITTED = object()
 @cache
 def make_schema(kind: type[BaseModel]) -> JsonSchema:
     """Return the JSON Schema that describes the output of `to_json` for a message type."""
-    fields = {}
-    for name, info in kind.model_fields.items():
-        annotation: Any = info.annotation
-        for mark in info.metadata:
-            annotation = Annotated[annotation, mark]
-        fields[name] = _describe(annotation)
+    fields = {name: _describe(get_annotation(info)) for name, info in kind.model_fields.items()}
     return {"type": "object", "title": kind.__name__, "properties": fields}
 
 
 def to_json(value: Any) -> Any:
-    """Convert a message to JSON types; omit arrays of more than MAX_ARRAY elements."""
+    """Convert a message to JSON types. Arrays of more than `MAX_ARRAY` elements are omitted."""
     found = _convert(value)
     return None if found is _OMITTED else found
 
@@ -66,12 +61,8 @@ def _convert(value: Any) -> Any:
 
 
 def _describe(annotation: Any) -> JsonSchema:
-    """Return the JSON Schema for the type annotation of a field."""
-    marks: list[Any] = []
-    while get_origin(annotation) is Annotated:
-        annotation, *more = get_args(annotation)
-        marks += more
-    if any(isinstance(mark, ArraySpec) for mark in marks):
+    annotation, spec = split_annotation(annotation)
+    if spec is not None:
         return {"type": "array", "items": _NUMBER}
     origin, arguments = get_origin(annotation), get_args(annotation)
     if origin in (Union, types.UnionType):
@@ -95,9 +86,10 @@ def _describe_type(kind: type) -> JsonSchema:
 
 
 def _merge(schemas: list[JsonSchema]) -> JsonSchema:
-    """Return one schema for values of several types.
+    """Return one JSON Schema for values of several types.
 
-    If all types are objects, the schema contains the fields of all; else it is text.
+    If all types are objects, the schema contains the fields of all types. Otherwise it is an array
+    or text.
     """
     if not schemas:
         return _TEXT

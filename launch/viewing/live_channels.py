@@ -1,6 +1,6 @@
 """Define the channels that live viewers can display, and make their messages from the graph.
 
-Each topic of the graph becomes a JSON channel of the same name. Further channels are:
+Each topic of the graph becomes a JSON channel of the same name. The other channels are:
 
     tf                                   poses of links, sheet target and fingertip
     apparatus, sheet, object, finger     the 3D scene
@@ -8,7 +8,7 @@ Each topic of the graph becomes a JSON channel of the same name. Further channel
     TOPIC/left, TOPIC/right, ...         images as JPEG; .../calibration of the stereo camera
     log                                  e-stops and notes of the nodes
 
-In the frame `viewer` z points up, as viewers expect; in the frame `world` y points up.
+In the frame `viewer` z points up, as viewers expect. In the frame `world` y points up.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 from foxglove import messages as fg
-from numpy.typing import NDArray
 
 from flexsheet.launch.bags.export import list_images
 from flexsheet.launch.ros2.mapping import SHEET_COLOUR, list_joints
@@ -61,27 +60,26 @@ from flexsheet.messages.types import (
     StereoPair,
     TwinEye,
 )
+from flexsheet.nodes.arrays import Floats, Image
 from flexsheet.nodes.console.sheet import COLUMNS, ROWS, compute_sheet_points
+from flexsheet.nodes.models.camera import camera_matrix
 from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, transform
 from flexsheet.nodes.models.shapes.triangles import triangulate_grid
-
-Floats = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 VIEWER = "viewer"
 VIEWER_FROM_WORLD = transform(rotation_from_vector((0.5 * np.pi, 0.0, 0.0)), np.zeros(3))
 EYE_COLOUR: Colour = (0.98, 0.98, 0.98, 1.0)
 EYE_RADIUS_M = 0.011
 SHEET_STEP = 2
-"""Step between the rows and columns of the mesh of the sheet that are sent to viewers."""
+"""The step between the rows and columns of the sheet's mesh that are sent to viewers."""
 JPEG_QUALITY = 80
 
 
 class Pace(Enum):
-    """Rule for how often a channel sends messages.
+    """The rule for how often a channel sends messages.
 
     NUMBERS, IMAGES: at most at the configured rate of numbers or images. EACH: every message.
-    STATIC: when the scene changes, and once per second for viewers that connect later.
+        STATIC: when the scene changes, and once per second for viewers that connect later.
     """
 
     NUMBERS = "numbers"
@@ -92,7 +90,7 @@ class Pace(Enum):
 
 @dataclass(slots=True)
 class LiveState:
-    """Latest message of each topic, with the model of the apparatus and its joint angles."""
+    """The latest message of each topic, with the model of the apparatus and its joints."""
 
     latest: dict[str, Message] = field(default_factory=dict)
     model: ApparatusModel | None = None
@@ -115,7 +113,7 @@ class LiveState:
         return found if isinstance(found, Fingertip) else None
 
     def edges(self) -> tuple[Floats, Floats] | None:
-        """Return the world poses (4, 4) of the left and right clamped edge; None if unknown."""
+        """Return the world poses (4, 4) of the left and right clamped edge, or None if unknown."""
         scene, found = self.scene, []
         for side in get_args(Side):
             state = self.latest.get(f"arm_{side}")
@@ -128,12 +126,13 @@ class LiveState:
 
 @dataclass(frozen=True, slots=True)
 class LiveChannel:
-    """Channel of the live view.
+    """A channel of the live view.
 
-    topics: topics of the graph that the channel needs in addition to the scene. triggers: topics
-    whose messages cause the channel to send. make: function that makes a message of the channel
-    from the state, the received message and its timestamp, or returns None if there is nothing to
-    send. schema: JSON Schema, or None for messages of the Foxglove type `kind`.
+    topics: topics of the graph that the channel needs in addition to the scene.
+    triggers: topics whose messages cause the channel to send.
+    make: function that makes a message of the channel from the state, the received message and its
+        timestamp, or returns None if there is nothing to send.
+    schema: JSON Schema, or None for messages of the Foxglove type `kind`.
     """
 
     name: str
@@ -186,7 +185,6 @@ def list_channels(topics: list[Topic]) -> Iterator[LiveChannel]:
 
 
 def _list_image_names(topic: Topic) -> tuple[str, ...]:
-    """Return the names of the image fields in the messages of a topic."""
     names: dict[type[Message], tuple[str, ...]] = {
         StereoPair: ("left", "right"),
         Frame: ("image",),
@@ -222,8 +220,7 @@ def _make_calibration_maker(side: Side) -> Callable[..., Any]:
             return None
         camera = state.scene.camera
         lens: Lens = camera.left if side == "left" else camera.right
-        matrix = [lens.fx_px, 0.0, lens.cx_px, 0.0, lens.fy_px, lens.cy_px, 0.0, 0.0, 1.0]
-        projection = [lens.fx_px, 0.0, lens.cx_px, 0.0, 0.0, lens.fy_px, lens.cy_px, 0.0]
+        matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
         return fg.CameraCalibration(
             timestamp=stamp,
             frame_id=f"camera_{side}",
@@ -231,9 +228,9 @@ def _make_calibration_maker(side: Side) -> Callable[..., Any]:
             height=camera.height_px,
             distortion_model="plumb_bob",
             D=list(lens.distortion),
-            K=matrix,
+            K=matrix.ravel().tolist(),
             R=np.eye(3).ravel().tolist(),
-            P=[*projection, 0.0, 0.0, 1.0, 0.0],
+            P=np.column_stack([matrix, np.zeros(3)]).ravel().tolist(),
         )
 
     return make

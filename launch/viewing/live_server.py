@@ -1,7 +1,7 @@
 """Serve a running graph to Foxglove and Lichtblick over their WebSocket protocol, read-only.
 
-The server of the Foxglove SDK has no authentication and accepts requests from any web page.
-Therefore it listens on the loopback interface only. Viewers cannot publish, call services or change
+The server of the Foxglove SDK has no authentication and accepts requests from any web page. It
+therefore listens on the loopback interface only. Viewers cannot publish, call services or change
 parameters. A topic is read from the graph only while a viewer has subscribed to a channel that
 needs it. Each viewer has a bounded queue, and a slow viewer loses the oldest messages.
 """
@@ -39,18 +39,18 @@ from flexsheet.messages.types import Status
 
 ADDRESS = "127.0.0.1"
 MAX_BACKLOG = 64
-"""Maximum number of messages in the queue of one viewer."""
+"""The maximum number of messages in the queue of one viewer."""
 UPDATE_S = 0.1
-"""Period with which the server checks which channels have viewers."""
+"""The period with which the server checks which channels have viewers."""
 STATIC_S = 1.0
 TIME_S = 1.0 / 30.0
 ALWAYS_READ = frozenset({"scene", "status"})
-"""Topics that the server always reads, because they are small and give poses and parameters."""
+"""The topics that the server always reads, because they are small and give poses and parameters."""
 URDF_PARAMETER = "/robot_description"
 
 
 class ReadOnlyParameters(ServerListener):
-    """Listener that answers requests for parameters.
+    """A listener that answers requests for parameters.
 
     It ignores requests to change parameters, and answers them with the present values.
     """
@@ -59,7 +59,7 @@ class ReadOnlyParameters(ServerListener):
         self.values: dict[str, Any] = {}
 
     def select(self, names: list[str]) -> list[Parameter]:
-        """Return the named parameters; without names, return all."""
+        """Return the named parameters, or all parameters if no names are given."""
         values = self.values
         return [Parameter(name, value=values[name]) for name in names or values if name in values]
 
@@ -73,10 +73,11 @@ class ReadOnlyParameters(ServerListener):
 
 
 class LiveServer:
-    """Server that shows one running graph to viewers.  Requires a running event loop.
+    """A server that shows one running graph to viewers. It requires a running event loop.
 
     rate_hz: maximum rate of numbers per channel. image_rate_hz: maximum rate of images and meshes
-    per channel. port: TCP port; 0 selects a free one. on_problem: called with the text of an error.
+        per channel. port: TCP port; 0 selects a free port. on_problem: function that is called with
+        the text of an error.
     """
 
     def __init__(
@@ -138,7 +139,7 @@ class LiveServer:
         return set(self._subscribers)
 
     async def serve(self) -> None:
-        """Serve until the calling task is cancelled.  Raises exceptions of the server's tasks."""
+        """Serve until the calling task is cancelled. Raises exceptions of the server's tasks."""
         await asyncio.gather(*self._tasks)
 
     def close(self) -> None:
@@ -167,7 +168,7 @@ class LiveServer:
             await asyncio.sleep(period_s)
 
     def _update_subscribers(self) -> None:
-        """Subscribe to the topics that channels with viewers need, and to no others."""
+        """Subscribe to the topics that channels with viewers need, and to no other topics."""
         wanted = set(ALWAYS_READ & self._plan.writers.keys())
         for channel in self.channels:
             if self._sinks[channel.name].has_sinks():

@@ -9,7 +9,7 @@ from flexsheet.launch.viewing.apparatus_model import ApparatusModel, Box, Joint,
 from flexsheet.nodes.models.rigid import rpy_from_rotation
 
 UNKNOWN_EFFORT = "0"
-"""Value of the attribute `effort`, which URDF requires; the maximum torques are unknown."""
+"""The value of the attribute `effort`, which URDF requires. The maximum torques are unknown."""
 
 
 def make_urdf(model: ApparatusModel) -> str:
@@ -70,5 +70,5 @@ def _make_joint(joint: Joint) -> xml.Element:
 
 
 def _join(values: Iterable[float]) -> str:
-    """Format numbers separated by spaces, with all digits so that no precision is lost."""
+    """Format numbers with all digits, separated by spaces."""
     return " ".join(repr(float(value)) for value in values)

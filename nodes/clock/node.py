@@ -1,4 +1,4 @@
-"""Measure the offsets of other hosts' clocks by pings between the clock nodes (one per host)."""
+"""Measure the offsets of other hosts' clocks by pings between the clock nodes of the hosts."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ PEER_TIMEOUT_NS = 60_000_000_000
 
 
 class ClockParameters(NodeParameters):
-    """Parameters of the clock node, from the key "clocks" of the launch file."""
+    """The parameters of the clock node, from the key `clocks` of the launch file."""
 
     rate_hz: Positive = Field(default=8.0, description="rate at which pings are sent, Hz")
     max_offset_uncertainty_s: Positive = Field(
         default=0.005,
-        description="maximum uncertainty (s) of a clock offset with which nodes still work",
+        description="maximum uncertainty of a clock offset, s; above it, no arm moves",
     )
     max_drift_ratio: float = Field(
         default=5e-4,
@@ -34,7 +34,7 @@ class ClockParameters(NodeParameters):
 
 
 class ClockNode(Node):
-    """Node that exchanges pings with all other clock nodes, and publishes the clock offsets."""
+    """A node that exchanges pings with all other clock nodes, and publishes the clock offsets."""
 
     measures_clocks = True
     role: ClassVar[NodeRole | None] = NodeRole.CLOCK

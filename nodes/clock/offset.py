@@ -1,12 +1,13 @@
 """Estimate the offset of another clock from pings, with guaranteed bounds.
 
-A ping has four timestamps: sent (t1, own clock), received (t2, other clock), answered (t3, other
-clock), received back (t4, own clock).  A message arrives after it was sent.  The other clock minus
-ours is therefore at most t2 - t1 at time t1, and at least t3 - t4 at time t4.  The maximum drift
-limits how much it changes in between.  Nothing else is assumed about the delays of the network.
+A ping has four timestamps: it is sent at t1 on the own clock and received at t2 on the other clock.
+    The reply is sent at t3 on the other clock and received at t4 on the own clock. A message
+    arrives after it was sent. The time of the other clock minus that of the own clock is therefore
+    at most t2 - t1 at time t1, and at least t3 - t4 at time t4. The maximum drift limits the change
+    between both times. Nothing else is assumed about the delays of the network.
 
 Source: Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on intersecting
-intervals.
+    intervals.
 """
 
 from __future__ import annotations
@@ -22,7 +23,10 @@ FIT_SPAN_NS = 5_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """Offset from one ping: other clock minus ours at our time `at_ns`; offset_ns +- half_ns."""
+    """The clock offset from one ping, with its bounds.
+
+    The other clock minus the own clock was offset_ns +- half_ns at time `at_ns` of the own clock.
+    """
 
     at_ns: int
     offset_ns: int
@@ -31,10 +35,10 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class OffsetEstimate:
-    """Estimated time of the other clock minus ours, with guaranteed bounds.
+    """The estimated time of the other clock minus that of the own clock, with guaranteed bounds.
 
-    It applies at our time `at_ns`; the bounds are offset_ns +- half_ns. drift_ratio: estimated rate
-    of change of the offset.
+    The bounds are offset_ns +- half_ns at time `at_ns` of the own clock.
+    drift_ratio: estimated rate of change of the offset.
     """
 
     at_ns: int
@@ -44,9 +48,11 @@ class OffsetEstimate:
 
 
 def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -> Sample | None:
-    """Make the sample of a ping from its four timestamps (see the module's docstring), ns.
+    """Make the sample of a ping from its four timestamps, ns, or None if they are inconsistent.
 
-    Return None for inconsistent timestamps.  max_drift_ratio: maximum relative drift of the clocks.
+    t1, t4: own clock when the ping was sent and its reply was received.
+    t2, t3: other clock when the ping was received and its reply was sent.
+    max_drift_ratio: maximum relative drift of the clocks.
     """
     round_trip_ns, remote_ns = t4 - t1, t3 - t2
     drift_ns = max_drift_ratio * round_trip_ns
@@ -60,27 +66,23 @@ def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -
 
 
 def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float) -> tuple[int, int]:
-    """Return the bounds of the offset (ns) at `at_ns`, from all samples and the maximum drift.
+    """Return the lower and upper bound of the offset (ns) at `at_ns`, from all samples.
 
-    If the samples are inconsistent, the lower bound is above the upper one.
+    max_drift_ratio: maximum relative drift of the clocks. If the samples are inconsistent, the
+        lower bound is above the upper bound.
     """
-    low = max(
-        one.offset_ns - one.half_ns - int(max_drift_ratio * abs(at_ns - one.at_ns)) - 1
-        for one in samples
-    )
-    high = min(
-        one.offset_ns + one.half_ns + int(max_drift_ratio * abs(at_ns - one.at_ns)) + 1
-        for one in samples
-    )
+    errors = [one.half_ns + int(max_drift_ratio * abs(at_ns - one.at_ns)) + 1 for one in samples]
+    low = max(one.offset_ns - error for one, error in zip(samples, errors, strict=True))
+    high = min(one.offset_ns + error for one, error in zip(samples, errors, strict=True))
     return low, high
 
 
 def fit_drift(samples: list[Sample]) -> tuple[float, float]:
-    """Fit a line to the samples to estimate the drift.
+    """Fit a line to the offsets of the samples, and return its value and slope.
 
-    Return the line's value at the newest sample, relative to that sample's offset (ns), and its
-    slope. The least squares are weighted by the inverse square of the bounds, which favours pings
-    that did not wait in a queue.  Both results are 0 if the samples span less than FIT_SPAN_NS.
+    The value is that of the line at the newest sample, minus the offset of this sample, ns. The
+    least squares are weighted by the inverse square of the bounds, which favours pings that did not
+    wait in a queue. Both results are 0 if the samples span less than `FIT_SPAN_NS`.
     """
     newest = samples[-1]
     if newest.at_ns - samples[0].at_ns < FIT_SPAN_NS:
@@ -99,11 +101,12 @@ def fit_drift(samples: list[Sample]) -> tuple[float, float]:
 
 @dataclass(slots=True)
 class OtherClock:
-    """Samples of one other clock over the last minute: the most accurate of each half second.
+    """The samples of another clock over the last minute: the most accurate sample of each half
+    second.
 
     max_drift_ratio: maximum relative drift of the clocks.
-    resets: how often all samples were deleted because a new one was inconsistent with them, for
-      example after a clock was set.
+    resets: number of times when all samples were deleted, because a new sample was inconsistent
+        with them. This happens, for example, after a clock was set.
     """
 
     max_drift_ratio: float
@@ -111,7 +114,7 @@ class OtherClock:
     resets: int = 0
 
     def add(self, sample: Sample) -> None:
-        """Add a sample if it is the most accurate one of its half second."""
+        """Add a sample if it is the most accurate sample of its half second."""
         samples = self.samples
         if samples and sample.at_ns <= samples[-1].at_ns:
             return
@@ -129,7 +132,10 @@ class OtherClock:
         samples.append(sample)
 
     def estimate(self, at_ns: int) -> OffsetEstimate | None:
-        """Estimate the offset at our time `at_ns`; None before the first sample."""
+        """Estimate the offset at time `at_ns` of the own clock.
+
+        Return None before the first sample.
+        """
         if not self.samples:
             return None
         low, high = compute_bounds(self.samples, at_ns, max_drift_ratio=self.max_drift_ratio)

@@ -16,31 +16,30 @@ from flexsheet.nodes.parameter_marks import DeviceFile
 
 
 class SerialSource(LimitedModel):
-    """Force gauge at a serial port that sends one line of text per measurement."""
+    """A force gauge at a serial port that sends one line of text per measurement."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     kind: Literal["serial"] = "serial"
     port: DeviceFile = Field(description="path of the port, such as /dev/ttyUSB0")
-    baud: int = 9600
+    baud: int = Field(default=9600, description="rate of the serial port, bits per second")
 
     def open(self) -> GaugeReader:
         return SerialGauge(self.port, self.baud)
 
 
 class GaugeParameters(NodeParameters):
-    """Parameters of the gauge node."""
-
     source: SerialSource
     axis: ForceAxis = Field(
         default="sheet_normal", description="component that the gauge measures; see topic `force`"
     )
     newtons_per_unit: Finite = Field(
         default=1.0,
-        description="force per displayed unit, N; negative if positive readings mean a pull",
+        description="force per displayed unit, N; negative if a positive reading means a pull",
     )
     zero_units: Finite = Field(
-        default=0.0, description="reading without contact, in displayed units; it is subtracted"
+        default=0.0,
+        description="reading without contact, in displayed units, which is subtracted",
     )
     standard_deviation_n: NonNegative = Field(
         default=0.02, description="standard deviation of noise and calibration error, N"
@@ -60,7 +59,7 @@ class GaugeParameters(NodeParameters):
 
 
 class Gauge(Node):
-    """Node that publishes each reading of a force gauge with the time of its measurement."""
+    """A node that publishes each reading of a force gauge with the time of its measurement."""
 
     opens_devices: ClassVar[bool] = True
     parameters: GaugeParameters
@@ -68,7 +67,7 @@ class Gauge(Node):
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        return "it reads a device; the bag has its readings as topic force"
+        return "it reads a device; the bag contains its readings as the topic force"
 
     async def setup(self) -> None:
         self._reader: GaugeReader | None = None
@@ -117,7 +116,7 @@ class Gauge(Node):
             within = abs(self._last_n) <= given.max_force_n
             self._publish("ok" if within else "overload", round(1e9 * given.delay_s))
         if self._reader.unreadable:
-            self.note = f"{self._reader.unreadable} lines without a number"
+            self.note = f"the gauge has sent {self._reader.unreadable} lines without a number"
 
     def _publish(self, reason: ForceReason, age_ns: int) -> None:
         self.force.publish(
@@ -134,7 +133,7 @@ class Gauge(Node):
 
     @periodic("watch_hz")
     def watch(self) -> None:
-        """Reopen a disconnected gauge; publish an invalid force while no readings arrive."""
+        """Reopen a disconnected gauge, and publish an invalid force while no readings arrive."""
         if self._reader is None:
             self._open()
         if self.clock.now_ns() - self._last_ns > 1e9 * self.parameters.silence_s:

@@ -16,7 +16,7 @@ NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 class GaugeError(FlexsheetError, OSError):
-    """Raised if the gauge cannot be opened or read; the text names the device and the cause."""
+    """Raised if the gauge cannot be opened or read. The text names the device and the cause."""
 
     code = "gauge"
     remedy = "Check the cable, the path in `port`, and the permission to open it (group dialout)."
@@ -26,31 +26,33 @@ class GaugeError(FlexsheetError, OSError):
 
 
 class GaugeReader(Protocol):
-    """Interface of a gauge driver: a file descriptor to wait on, and the received numbers."""
+    """The interface of a gauge driver: a file descriptor to wait for, and the received numbers."""
 
     unreadable: int
 
     def fileno(self) -> int: ...
 
     def read(self) -> list[float]:
-        """Return the numbers that have arrived; raises GaugeError if the device is lost."""
+        """Return the numbers that have arrived. Raises GaugeError if the connection is lost."""
         ...
 
     def close(self) -> None: ...
 
 
 class SerialGauge:
-    """Gauge at a serial port that sends one measurement per line, such as "+0.123 N".
+    """A gauge at a serial port that sends one measurement per line, such as "+0.123 N".
 
-    unreadable: number of lines without a finite number.
+    unreadable: number of lines that contain no finite number.
     """
 
     def __init__(self, port: str, baud: int) -> None:
-        """Open the port with echo and control characters disabled; raises GaugeError."""
+        """Open the port without echo and control characters. Raises GaugeError if this fails."""
         self.port, self.unreadable, self._rest = port, 0, b""
         speed = getattr(termios, f"B{baud}", None)
         if speed is None:
-            raise GaugeError(0, f"{port}: baud rate {baud} is not supported; for example 9600")
+            raise GaugeError(
+                0, f"{port}: the baud rate {baud} is not supported; use for example 9600"
+            )
         self._fd = -1
         try:
             self._fd = os.open(port, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -72,7 +74,7 @@ class SerialGauge:
         except BlockingIOError:
             return []
         except OSError as error:
-            raise GaugeError(0, f"{self.port}: {error.strerror}") from error
+            raise GaugeError(0, f"{self.port}: cannot be read: {error.strerror}") from error
         if not data:
             raise GaugeError(0, f"{self.port}: the device has closed the connection")
         *lines, rest = re.split(rb"[\r\n]+", self._rest + data)
@@ -89,7 +91,7 @@ class SerialGauge:
 
 
 def parse_line(line: bytes) -> float | None:
-    """Return the first number of a line; None if there is no finite one."""
+    """Return the first number in a line, or None if the line contains no finite number."""
     found = NUMBER.search(line[:MAX_LINE_BYTES])
     value = math.nan if found is None else float(found.group())
     return value if math.isfinite(value) else None

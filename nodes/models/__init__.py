@@ -1,1 +1,1 @@
-"""Compute what several nodes need, in functions of arrays without sockets, clocks or files."""
+"""Provide models that several nodes need, as functions of arrays without sockets or files."""

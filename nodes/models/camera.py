@@ -1,7 +1,8 @@
 """Project and undistort points with a pinhole camera and Brown's distortion.
 
-The camera frame has x to the right, y down and z along the optical axis. Points are (..., 3), m.
-Pixels are (..., 2) with the origin at the centre of the top left pixel, as in OpenCV.
+The camera frame has x to the right, y down and z along the optical axis. Points have the shape
+(..., 3), m. Pixels have the shape (..., 2), and their origin is the centre of the top left pixel,
+as in OpenCV.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from flexsheet.nodes.arrays import Floats
 
 
 def camera_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> Floats:
-    """Return the 3x3 matrix of a pinhole camera from focal lengths and principal point, pixels."""
+    """Return the matrix (3, 3) of a pinhole camera with these focal lengths and principal point."""
     return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
 
 
@@ -40,9 +41,10 @@ def distort(normalized: Floats, distortion: Floats) -> Floats:
 def undistort(distorted: Floats, distortion: Floats) -> Floats:
     """Remove lens distortion from normalized image coordinates (..., 2) by fixed-point iteration.
 
+    distortion: coefficients k1, k2, p1, p2, k3, as for `distort`.
+
     The iteration stops when no coordinate changes by more than 1e-13, or after `MAX_ITERATIONS`. It
-    converges where the distortion changes slowly, which is the case inside the image of usual
-    lenses.
+    converges where the distortion changes slowly, as it does inside the image of usual lenses.
     """
     k1, k2, p1, p2, k3 = distortion
     point = distorted.copy()
@@ -61,12 +63,19 @@ def undistort(distorted: Floats, distortion: Floats) -> Floats:
 
 
 def project(points_camera: Floats, matrix: Floats, distortion: Floats) -> Floats:
-    """Return the pixels (..., 2) of points (..., 3) in the camera frame with z > 0."""
+    """Return the pixels (..., 2) of points (..., 3) in the camera frame, m, with z > 0.
+
+    matrix: camera matrix (3, 3). distortion: coefficients, as for `distort`.
+    """
     normalized = distort(points_camera[..., :2] / points_camera[..., 2:], distortion)
     return normalized @ matrix[:2, :2].T + matrix[:2, 2]
 
 
 def normalize(pixels: Floats, matrix: Floats, distortion: Floats) -> Floats:
-    """Return undistorted normalized coordinates (..., 2) of pixels; a pixel's ray is (x, y, 1)."""
+    """Return the undistorted normalized coordinates (..., 2) of pixels (..., 2).
+
+    The ray of normalized coordinates (x, y) has the direction (x, y, 1). matrix: camera matrix (3,
+    3). distortion: coefficients, as for `distort`.
+    """
     distorted = (pixels - matrix[:2, 2]) / np.array([matrix[0, 0], matrix[1, 1]])
     return undistort(distorted, distortion)

@@ -13,10 +13,10 @@ from flexsheet.nodes.models.rigid import rotation_from_vector
 def world_from_finger(
     direction_world: Sequence[float], tilt_rad: Sequence[float] | Floats = (0.0, 0.0)
 ) -> Floats:
-    """Return the rotation matrix (3, 3) from a finger's frame to the world.
+    """Return the rotation matrix (3, 3) from a finger's frame to the world frame.
 
-    direction_world: vector (3,) from the tip to the hand; if it has no tilt, y is horizontal.
-    tilt_rad: rotation vector of the finger about the world's x and y axes.
+    direction_world: vector (3,) from the fingertip to the hand. Without tilt, y is horizontal.
+    tilt_rad: rotation (2,) of the finger about the world's x and y axes, as a rotation vector.
     """
     x = np.asarray(direction_world, dtype=np.float64)
     x = x / np.linalg.norm(x)

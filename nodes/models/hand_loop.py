@@ -1,17 +1,18 @@
-"""Predict whether a hand that touches the sheet is stable, from the sampled closed loop.
+"""Predict from the sampled closed loop whether a hand that touches the sheet is stable.
 
-A finger pushes into the sheet.  The planner moves the sheet along its normal by `slope` times the
-measured depth.  If slope > 0, it moves away from the finger (a retreat, for soft objects).  If
-slope < 0, it moves towards the finger (an advance, for stiff ones).  The camera measures the depth
-once per period T.  The sheet follows after a delay, so it can add energy.  The hand has the mass m,
-damping b and stiffness k, the sheet the stiffness ks.  With the depth x and the sheet's offset s:
+A finger pushes into the sheet. The planner moves the sheet along its normal by `slope` times the
+measured depth. If slope > 0, the sheet moves away from the finger (a retreat, for soft objects). If
+slope < 0, it moves towards the finger (an advance, for stiff objects). The camera measures the
+depth once per period T. The sheet follows after a delay, so it can add energy. The hand has the
+mass m, damping b and stiffness k, the sheet the stiffness ks. With the depth x and the sheet's
+offset s:
 
     m x'' + b x' + k x + ks (x - s) = 0
     s(t) = slope (y_j + y'_j (t - j T - delay))
 
-Here y_j is the filtered depth of measurement j, and y'_j is its change per period.  The filter is
-an alpha-beta filter: it estimates the depth and its rate, so it does not lag behind a depth that
-changes at a constant rate.  The state changes over one period by an exact linear map.  The loop is
+Here y_j is the filtered depth of measurement j, and y'_j is its change per period. The filter is an
+alpha-beta filter: it estimates the depth and its rate, so it does not lag behind a depth that
+changes at a constant rate. The state changes over one period by an exact linear map. The loop is
 stable if all eigenvalues of this map are inside the unit circle.
 """
 
@@ -26,30 +27,30 @@ import scipy
 from flexsheet.nodes.arrays import Floats
 
 MIN_DECAY_PER_S = 0.5
-"""Minimum decay rate of the slowest mode at which the loop counts as stable."""
+"""The minimum decay rate of the slowest mode at which the loop counts as stable."""
 
 GAIN_MARGIN = 1.5
 DELAY_MARGIN_S = 0.02
-"""Required stability margins: factor on the gain, and additional delay (s)."""
+"""The required stability margins: factor on the gain, and additional delay (s)."""
 
 MAX_SLOPE = 20.0
-"""Upper limit of the search for the critical slope, far above any slope in use."""
+"""The upper limit of the search for the critical slope, far above any slope in use."""
 
 SLOPES = 32
-"""Number of slopes at which the search evaluates the decay rate."""
+"""The number of slopes at which the search evaluates the decay rate."""
 
 DELAYS_S = (0.02, 0.04, 0.06, 0.08, 0.1, 0.13, 0.17)
 BANDWIDTHS_RAD_PER_S = (4.5, 5.5, 6.5, 8.0, 10.0, 12.5, 16.0, 20.0)
 SHEET_STIFFNESSES_N_PER_M = (50.0, 120.0, 300.0)
-"""Grid of `OffsetBoundsTable`: delays, bandwidths of the filter and stiffnesses of the sheet."""
+"""The grid of `OffsetBoundsTable`: delays, filter bandwidths and stiffnesses of the sheet."""
 
 FILTER_DAMPING_RATIO = 0.5
-"""Damping ratio of the depth's filter.  A larger one permits smaller offsets per depth."""
+"""The damping ratio of the depth's filter. A larger ratio permits smaller offsets per depth."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hand:
-    """Mechanical impedance of a hand at the fingertip, along the sheet's normal."""
+    """The mechanical impedance of a hand at the fingertip, along the sheet's normal."""
 
     mass_kg: float
     damping_ns_per_m: float
@@ -66,23 +67,23 @@ HANDS = {
     "arm": Hand(1.0, 15.0, 600.0),
     "arm of low damping": Hand(1.5, 5.2, 100.0),
 }
-"""Hands that cover the range of measurements in the literature.
+"""The hands that cover the range of measurements in the literature.
 
-Finger: Hajian and Howe 1997.  Wrist: from its resonance of 6 to 12 Hz, Lakie 2015.  Arm:
-Mussa-Ivaldi, Hogan and Bizzi 1985.  Damping ratios of wrist and arm: 0.15 to 0.4.
+Finger: Hajian and Howe 1997. Wrist: from its resonance of 6 to 12 Hz, Lakie 2015. Arm:
+    Mussa-Ivaldi, Hogan and Bizzi 1985. Damping ratios of wrist and arm: 0.15 to 0.4.
 """
 
 LIMITING_HANDS = tuple(hand for name, hand in HANDS.items() if "low damping" in name)
-"""Hands with low damping, which become unstable first and thus determine the bounds."""
+"""The hands with low damping, which become unstable first and therefore determine the bounds."""
 
 
 @dataclass(frozen=True, slots=True)
 class SampledLoop:
-    """Timing and filter of the path from the finger's depth to the sheet's offset.
+    """The timing and filter of the path from the finger's depth to the sheet's offset.
 
     period_s: time between two measurements.
-    delay_s: time from a measurement until the sheet reaches the position that follows from it.
-    bandwidth_rad_per_s: natural frequency of the depth's filter; infinite for none.
+    delay_s: time from a measurement until the sheet reaches the position computed from it.
+    bandwidth_rad_per_s: natural frequency of the depth's filter; infinite if there is no filter.
     lead_s: time by which the filtered depth is extrapolated with its estimated rate.
     """
 
@@ -93,9 +94,9 @@ class SampledLoop:
 
 
 def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[float, float]:
-    """Return the gains (alpha, beta) of the depth's filter for the time since the last measurement.
+    """Return the gains (alpha, beta) of the depth's filter for a step of `step_s`.
 
-    Its poles are those of a continuous filter with `FILTER_DAMPING_RATIO`.  With an infinite
+    The poles are those of a continuous filter with `FILTER_DAMPING_RATIO`. With an infinite
     bandwidth, the estimates are the measured depth and its last change.
     """
     if math.isinf(bandwidth_rad_per_s):
@@ -111,8 +112,9 @@ def make_loop_matrices(
 ) -> Floats:
     """Return the matrices (k, n, n) that map the state over one period, for slopes (k,).
 
-    The state contains depth and speed, and the filter's estimates of both.  The offsets that have
-    not yet taken effect and the last two that have follow, newest first.
+    The state contains depth and speed, the filter's estimates of both, the offsets that have not
+    yet taken effect, and the last two offsets that have taken effect. The newest offset comes
+    first.
     """
     whole, fraction = divmod(loop.delay_s / loop.period_s, 1.0)
     waiting = int(whole) + 1
@@ -157,7 +159,7 @@ def make_loop_matrices(
 def compute_decays_per_s(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the decay rate (k,) of the slowest mode for each slope, 1/s.
+    """Return the decay rate (k,) of the slowest mode for slopes (k,), 1/s.
 
     A negative rate means that the mode grows.
     """
@@ -178,8 +180,10 @@ def compute_critical_slope(
 ) -> float:
     """Return the smallest magnitude of slope at which the loop is unstable, at most `max_slope`.
 
-    The decay rate is interpolated between slopes on a grid.  Stability at even larger slopes is
-    ignored.  towards_finger: search among negative slopes, which move the sheet to the finger.
+    towards_finger: whether the slopes are negative, which moves the sheet to the finger.
+
+    The decay rate is interpolated between slopes on a grid. Stability at even larger slopes is
+    ignored.
     """
     magnitudes = np.concatenate([[0.0], np.geomspace(0.01 * max_slope, max_slope, SLOPES)])
     decays = compute_decays_per_s(
@@ -200,10 +204,10 @@ def compute_critical_slope(
 
 @dataclass(frozen=True, slots=True)
 class OffsetBounds:
-    """Maximum slopes at which every hand is stable; slope: sheet offset divided by finger depth.
+    """The maximum slopes (sheet offset divided by finger depth) at which every hand is stable.
 
     bandwidths_rad_per_s (f,): bandwidths of the depth's filter, ascending.
-    sheet_stiffnesses_n_per_m (k,): stiffness of the sheet under the finger.
+    sheet_stiffnesses_n_per_m (k,): stiffnesses of the sheet under the finger.
     max_advances, max_retreats (f, k): maximum slopes towards the finger and away from it.
     """
 
@@ -213,11 +217,11 @@ class OffsetBounds:
     max_retreats: Floats
 
     def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slope (n,) towards the finger for stiffnesses (n,) of the sheet."""
+        """Return the maximum slopes (n,) towards the finger for sheet stiffnesses (n,), N/m."""
         return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slope (n,) away from the finger for stiffnesses (n,) of the sheet."""
+        """Return the maximum slopes (n,) away from the finger for sheet stiffnesses (n,), N/m."""
         return self._interpolate(self.max_retreats, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def _interpolate(
@@ -231,7 +235,10 @@ class OffsetBounds:
 
 @dataclass(frozen=True, slots=True)
 class OffsetBoundsTable:
-    """Table of `OffsetBounds` over delays (d,), for one camera period; the slopes are (d, f, k)."""
+    """A table of `OffsetBounds` over delays (d,), for one camera period.
+
+    The slopes are (d, f, k).
+    """
 
     delays_s: Floats
     bandwidths_rad_per_s: Floats
@@ -240,7 +247,7 @@ class OffsetBoundsTable:
     max_retreats: Floats
 
     def at_delay(self, delay_s: float) -> OffsetBounds:
-        """Return the bounds at the next longer delay of the table; beyond the last, bounds of 0."""
+        """Return the bounds at the next longer delay of the table; bounds of 0 if there is none."""
         row = int(np.searchsorted(self.delays_s, delay_s - 1e-9))
         axes = self.bandwidths_rad_per_s, self.sheet_stiffnesses_n_per_m
         if row == len(self.delays_s):
@@ -252,8 +259,10 @@ class OffsetBoundsTable:
 def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBoundsTable:
     """Compute the maximum slopes at which every hand is stable with margins of gain and delay.
 
-    For an advance, the gain margin divides the critical slope.  For a retreat, it multiplies the
-    sheet's stiffness instead, because a slope cannot exceed 1.  The sheet never retreats by more
+    advance_limit: upper limit of the slopes towards the finger.
+
+    For an advance, the gain margin divides the critical slope. For a retreat, it multiplies the
+    sheet's stiffness instead, because a slope cannot exceed 1: the sheet never retreats by more
     than the finger moves.
     """
     shape = len(DELAYS_S), len(BANDWIDTHS_RAD_PER_S), len(SHEET_STIFFNESSES_N_PER_M)
@@ -293,6 +302,6 @@ def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBou
 
 
 def _descend(slopes: Floats) -> Floats:
-    """Reduce slopes (d, f, k) so that they never rise with the delay or the stiffness."""
+    """Reduce slopes (d, f, k) so that they never increase with the delay or the stiffness."""
     result = np.minimum.accumulate(np.minimum.accumulate(slopes, axis=0), axis=2)
     return np.asarray(result)

@@ -1,6 +1,6 @@
 """Interpolate between two values, and between the points of predicted paths.
 
-A predicted path has positions at 0, step, 2 step, ... seconds after its start.
+The points of a predicted path have the times 0, step, 2 step, ... after its start.
 """
 
 from __future__ import annotations
@@ -15,19 +15,24 @@ Real = TypeVar("Real", float, Floats)
 
 
 def smoothstep(t: Real) -> Real:
-    """Return 3 t^2 - 2 t^3 for t in 0..1, which rises from 0 to 1 with zero slope at both ends."""
+    """Return 3 t^2 - 2 t^3 for t from 0 to 1.
+
+    The function rises from 0 to 1 and has zero slope at both ends.
+    """
     return t * t * (3.0 - 2.0 * t)
 
 
 def interpolate_path(path: Floats, step_s: float, time_s: float) -> tuple[Floats, Floats]:
-    """Return position (3,) m and velocity (3,) m/s on a path (n >= 2, 3) `time_s` after its start.
+    """Return position (3,), m, and velocity (3,), m/s, on a path at a time after its start.
+
+    path (n, 3): positions, m, at intervals of `step_s`.
 
     The interpolation is cubic with central differences as slopes (Catmull and Rom 1974), and linear
     beyond both ends. Raises ValueError for a path of fewer than two points.
     """
     count = len(path)
     if count < 2:
-        raise ValueError(f"predicted path: {count} points; at least two are required")
+        raise ValueError(f"the predicted path has {count} points; at least two are required")
     steps = time_s / step_s
     i = min(max(int(np.floor(steps)), 0), count - 2)
     t = steps - i

@@ -1,4 +1,4 @@
-"""Measure the period of messages that come at the camera's rate."""
+"""Measure the period of messages whose rate is that of the camera."""
 
 from __future__ import annotations
 
@@ -8,14 +8,18 @@ from statistics import median
 INTERVALS = 15
 MIN_INTERVALS = 8
 MAX_PERIOD_S = 0.1
-"""Maximum period; longer intervals count as interruptions."""
+"""The maximum period. Longer intervals between messages count as interruptions."""
 
 TOLERANCE_RATIO = 0.2
-"""Maximum relative deviation up to which the period in the scene is used."""
+"""The maximum relative deviation from the scene's period at which the scene's period is used."""
 
 
 class MeasuredPeriod:
-    """Estimator of the period of messages; it starts with the period in the scene."""
+    """An estimator of the period of messages.
+
+    scene_period_s: camera period in the scene, s. It is returned until enough messages have been
+        added, and while the measured period is close to it.
+    """
 
     def __init__(self, scene_period_s: float) -> None:
         self._scene_period_s = scene_period_s
@@ -23,7 +27,10 @@ class MeasuredPeriod:
         self._last_ns = 0
 
     def add(self, source_ns: int) -> float:
-        """Add a message, given the time of its camera exposure; return the period (s)."""
+        """Add a message, and return the period, s.
+
+        source_ns: source timestamp of the message, which is the time of its camera exposure.
+        """
         interval_s = (source_ns - self._last_ns) * 1e-9
         self._last_ns = source_ns
         if 0.0 < interval_s <= MAX_PERIOD_S:

@@ -1,7 +1,8 @@
 """Follow a moving target with bounded speed and acceleration.
 
-The target's velocity is fed forward, so that a follower that has reached the target does not lag.
-Before that, it approaches without overshoot if the target's velocity is constant.
+The velocity of the target is fed forward, so a follower that has reached the target does not lag
+behind it. Before that, the follower approaches without overshoot if the target's velocity is
+constant.
 """
 
 from __future__ import annotations
@@ -20,15 +21,18 @@ from flexsheet.nodes.models.rigid import (
 )
 
 BRAKE_FRACTION = 1.0 / 3.0
-"""Fraction of the acceleration for braking towards the target; the rest is for following it."""
+"""The fraction of the acceleration that is used to brake towards the target.
+
+The remaining acceleration is used to follow the target.
+"""
 
 
 def closing_speed(distance: Floats | float, deceleration: Floats | float, step_s: float) -> Floats:
-    """Return the maximum speeds at which a point can still stop within distances (n,) >= 0.
+    """Return the maximum speeds (n,) at which a point can still stop within distances (n,) >= 0, m.
 
-    In each step the point moves by speed * step_s, then its speed decreases by deceleration *
-    step_s. So w^2/(2 a) + w dt/2 = distance, with speed w, deceleration a and step dt. A distance
-    shorter than that takes one step.
+    In each step, the point moves by speed * step_s, and then its speed decreases by deceleration *
+    step_s. Therefore w^2/(2 a) + w dt/2 = distance, with speed w, deceleration a and step dt. A
+    shorter distance takes one step.
     """
     half = 0.5 * deceleration * step_s
     speed = np.sqrt(half * half + 2.0 * deceleration * distance) - half
@@ -44,10 +48,11 @@ def follow(
     max_acceleration: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """Return the displacement (n,) over a step towards a moving target, and the velocity after it.
+    """Return the displacement (n,) in a step towards a moving target, and the velocity (n,) after
+    it.
 
-    error: target at the end of the step minus the current point. `max_acceleration` bounds the
-    change of the mean velocity from one step to the next.
+    error (n,): target at the end of the step minus the current point. `max_acceleration` bounds the
+        change of the mean velocity from one step to the next.
     """
     target_velocity = _clamp_length(target_velocity, max_speed)
     desired = desired_velocity(
@@ -75,7 +80,11 @@ def desired_velocity(
     max_acceleration: float,
     step_s: float,
 ) -> Floats:
-    """Return the fastest velocity (n,) towards the target that still allows a stop there."""
+    """Return the fastest velocity (n,) towards the target at which the point can still stop there.
+
+    error (n,): target at the end of the step minus the current point. The units are those of
+        `error` and s.
+    """
     offset = error - target_velocity * step_s
     distance = measure_length(offset)
     if distance == 0.0:
@@ -91,14 +100,13 @@ def measure_length(vector: Floats) -> float:
 
 
 def _clamp_length(vector: Floats, longest: float) -> Floats:
-    """Limit the length of a vector to `longest`."""
     length = measure_length(vector)
     return vector if length <= longest else vector * (longest / length)
 
 
 @dataclass(frozen=True, slots=True)
 class SheetMotion:
-    """Motion state of the sheet: pose, twist (m/s, rad/s), stretch ratio and its rate (1/s)."""
+    """The motion state of the sheet: pose, twist (m/s, rad/s), stretch ratio and its rate (1/s)."""
 
     world_from_sheet: Floats
     twist_world: Floats
@@ -108,7 +116,7 @@ class SheetMotion:
 
 @dataclass(frozen=True, slots=True)
 class SheetBounds:
-    """Limits of the motion of the sheet's centre, orientation and stretch."""
+    """The limits of the motion of the sheet's centre, its orientation and its stretch."""
 
     speed_m_per_s: float
     acceleration_m_per_s2: float
@@ -120,18 +128,18 @@ class SheetBounds:
 
 @dataclass(frozen=True, slots=True)
 class EdgeBound:
-    """Limit of the speed of all points of the clamped edges.
+    """The limit of the speed of all points of the clamped edges.
 
     reach_m: half the length of an edge. Translation and rotation are scaled by the same factor. If
-    each arm limited the speed of its edge separately, the edges would leave the sheet's path and
-    their distance would change.
+        each arm limited the speed of its edge separately, the edges would leave the sheet's path
+        and their distance would change.
     """
 
     speed_m_per_s: float
     reach_m: float
 
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
-        """Return the factor (0..1) on linear and angular speed that keeps the edges' limit."""
+        """Return the factor (0 to 1) on both speeds that keeps the limit of the edges."""
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge
 
@@ -139,7 +147,7 @@ class EdgeBound:
 def follow_sheet(
     now: SheetMotion, target: SheetMotion, *, bounds: SheetBounds, edges: EdgeBound, step_s: float
 ) -> SheetMotion:
-    """Return the sheet after a step towards `target`, the target at the end of the step."""
+    """Return the sheet's motion after a step towards its target at the end of the step."""
     away = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(
         target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T
@@ -202,7 +210,7 @@ def follow_sheet(
 
 
 def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> SheetMotion:
-    """Return the sheet after a step of the fastest deceleration within the bounds."""
+    """Return the sheet's motion after a step of the fastest deceleration within the bounds."""
     linear = _decelerate(now.twist_world[:3], bounds.acceleration_m_per_s2 * step_s)
     angular = _decelerate(now.twist_world[3:], bounds.turn_acceleration_rad_per_s2 * step_s)
     rate = _decelerate(
@@ -218,7 +226,7 @@ def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> Shee
 
 
 def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
-    """Extrapolate the motion by `duration_s`, positive or negative, with constant velocity."""
+    """Return the motion after `duration_s` (positive or negative) of constant velocity."""
     return replace(
         motion,
         world_from_sheet=moved(motion.world_from_sheet, motion.twist_world, duration_s),
@@ -229,7 +237,10 @@ def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
 def follow_trajectory(
     motion: SheetMotion, time_s: float, *, keep_s: float, brake_s: float
 ) -> SheetMotion:
-    """Return the motion `time_s` later: constant twist for `keep_s`, then uniform deceleration."""
+    """Return the motion `time_s` later.
+
+    The twist is constant for `keep_s`, and then decreases uniformly to zero within `brake_s`.
+    """
     braked_s = min(max(time_s - keep_s, 0.0), brake_s)
     travelled_s = min(time_s, keep_s) + braked_s - 0.5 * braked_s * braked_s / brake_s
     return replace(
@@ -246,7 +257,7 @@ def _decelerate(velocity: Floats, change: float) -> Floats:
 
 
 def _orthonormal(pose: Floats) -> Floats:
-    """Return the pose with rounding errors removed from its rotation (Gram-Schmidt on x, y)."""
+    """Return the pose (4, 4) without the rounding errors of its rotation (Gram-Schmidt on x, y)."""
     (ax, bx, _, px), (ay, by, _, py), (az, bz, _, pz), last = pose.tolist()
     length = sqrt(ax * ax + ay * ay + az * az)
     ax, ay, az = ax / length, ay / length, az / length

@@ -1,7 +1,8 @@
-"""Decide from noisy residuals whether the scene describes the hardware incorrectly.
+"""Detect from noisy residuals that the scene describes the hardware incorrectly.
 
-A residual is averaged with exponentially decaying weights.  It is suspicious when its mean has
-deviated from the expected value by more than a threshold for some time without interruption.
+A residual is a measured value minus its expected value. Its mean is computed with exponentially
+decaying weights. An error is suspected when the mean has exceeded a threshold for some time without
+interruption.
 """
 
 from __future__ import annotations
@@ -13,23 +14,31 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats
 
 MAX_GAP_S = 1.0
-"""Maximum duration of one sample; a longer pause contains no information."""
+"""The maximum time between two residuals that is added to the weight of the mean."""
 
 CLEAR_RATIO = 0.8
-"""Fraction of the threshold below which a suspicion ends; below 1, so that it does not flicker."""
+"""The fraction of the threshold below which a suspicion ends.
+
+It is below 1, so that the suspicion does not start and end repeatedly.
+"""
 
 
 class ResidualMonitor:
-    """Monitor of the mean of a residual vector.
+    """A monitor of the mean of a residual vector.
 
-    mean: weighted mean of the samples, in their unit; zeros before the first sample.
+    mean: weighted mean of the residuals, in their unit; zeros before the first residual.
     suspected: whether the mean has exceeded the threshold for long enough.
     """
 
     def __init__(
         self, components: int, *, threshold: float, memory_s: float = 1.5, confirm_s: float = 1.5
     ) -> None:
-        """Set the mean's time constant, `memory_s`, and the time to a suspicion, `confirm_s`."""
+        """Set the parameters of the monitor.
+
+        components: length of the residual vector. threshold: maximum magnitude of the mean, in the
+            unit of the residuals. memory_s: time constant of the mean. confirm_s: time above the
+            threshold after which an error is suspected.
+        """
         self.mean, self.suspected, self.threshold = np.zeros(components), False, threshold
         self._memory_s, self._confirm_s = memory_s, confirm_s
         self._weight_s, self._above_s = 0.0, 0.0
@@ -46,7 +55,7 @@ class ResidualMonitor:
         return float(np.linalg.norm(self.mean))
 
     def add(self, residual: Floats, at_ns: int) -> None:
-        """Add a residual (components,), measured minus expected value; ignore it if not finite."""
+        """Add a residual (components,) at the time `at_ns`. Ignore it if it is not finite."""
         if not np.isfinite(residual).all():
             return
         step_s = 0.0 if self._last_ns is None else (at_ns - self._last_ns) * 1e-9

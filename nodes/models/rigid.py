@@ -1,7 +1,7 @@
 """Compute with rigid transforms.
 
-A transform `a_from_b` is a 4x4 homogeneous matrix that maps coordinates in frame b to frame a.
-Twists are 6-vectors, linear part first (m/s), then angular (rad/s), both in the world frame.
+A transform `a_from_b` is a homogeneous matrix (4, 4) that maps coordinates in frame b to frame a. A
+twist is a vector (6,) in the world frame: linear velocity (m/s), then angular velocity (rad/s).
 """
 
 from __future__ import annotations
@@ -18,7 +18,10 @@ _UNIT: Floats = np.eye(4)
 
 
 def rotation_from_rpy(rpy_rad: ArrayLike) -> Floats:
-    """Return the rotation matrix of roll, pitch, yaw about the fixed x, y, z axes (as in URDF)."""
+    """Return the rotation matrix (3, 3) of rotations about the fixed x, y and z axes, as in URDF.
+
+    rpy_rad (3,): roll, pitch and yaw.
+    """
     roll, pitch, yaw = np.asarray(rpy_rad, dtype=np.float64)
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     cy, sy = np.cos(yaw), np.sin(yaw)
@@ -32,9 +35,9 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> Floats:
 
 
 def rpy_from_rotation(rotation: Floats) -> Floats:
-    """Return roll, pitch, yaw (rad) of a rotation matrix.
+    """Return roll, pitch and yaw (3,), rad, of a rotation matrix (3, 3).
 
-    At a pitch of +-90 degrees roll and yaw have the same axis; the yaw is then zero.
+    At a pitch of +-90 degrees, roll and yaw have the same axis. The yaw is then zero.
     """
     level = float(np.hypot(rotation[0, 0], rotation[1, 0]))
     pitch = float(np.arctan2(-rotation[2, 0], level))
@@ -45,9 +48,9 @@ def rpy_from_rotation(rotation: Floats) -> Floats:
 
 
 def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
-    """Return the matrix of a rotation vector (Rodrigues' formula), accurate near zero.
+    """Return the matrix (3, 3) of a rotation vector (3,) by Rodrigues' formula.
 
-    The result is NaN for a vector that is not finite.
+    The result is accurate near zero, and NaN for a vector that is not finite.
     """
     x, y, z = np.asarray(vector_rad, dtype=np.float64).tolist()
     angle = sqrt(x * x + y * y + z * z)
@@ -70,7 +73,10 @@ def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
 
 
 def vector_from_rotation(rotation: Floats) -> Floats:
-    """Return the rotation vector (rad) of length 0..pi, accurate near 0 and pi."""
+    """Return the rotation vector (3,), rad, of a rotation matrix (3, 3).
+
+    Its length is from 0 to pi. It is accurate near both limits.
+    """
     w, x, y, z = quaternion_from_rotation(rotation).tolist()
     length = sqrt(x * x + y * y + z * z)
     scale = 2.0 if length < 1e-12 else 2.0 * atan2(length, w) / length
@@ -78,7 +84,7 @@ def vector_from_rotation(rotation: Floats) -> Floats:
 
 
 def quaternion_from_rotation(rotation: Floats) -> Floats:
-    """Return the unit quaternion (w, x, y, z), w >= 0, for a rotation matrix.
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix (3, 3).
 
     Shepperd's method computes the largest component first, to avoid division by a small number.
     """
@@ -101,13 +107,13 @@ def quaternion_from_rotation(rotation: Floats) -> Floats:
 
 
 def skew(vector: ArrayLike) -> Floats:
-    """Return the skew-symmetric matrix S with S @ u = vector x u."""
+    """Return the skew-symmetric matrix S (3, 3) of a vector (3,), such that S @ u = vector x u."""
     x, y, z = np.asarray(vector, dtype=np.float64).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def transform(rotation: Floats, position: ArrayLike) -> Floats:
-    """Return the 4x4 transform with a rotation (3, 3) and a position (3,), m."""
+    """Return the transform (4, 4) with a rotation (3, 3) and a position (3,), m."""
     result = _UNIT.copy()
     result[:3, :3] = rotation
     result[:3, 3] = position
@@ -115,12 +121,12 @@ def transform(rotation: Floats, position: ArrayLike) -> Floats:
 
 
 def transform_from_rpy(position_m: ArrayLike, rpy_rad: ArrayLike) -> Floats:
-    """Return the transform of a position (m) and roll, pitch, yaw (rad), as in scene files."""
+    """Return the transform (4, 4) of a position (3,), m, and roll, pitch, yaw (3,), rad."""
     return transform(rotation_from_rpy(rpy_rad), position_m)
 
 
 class Pose(Protocol):
-    """Interface of the poses in scenes: position (m) and roll, pitch, yaw (rad)."""
+    """The interface of the poses in scenes: position (m) and roll, pitch, yaw (rad)."""
 
     @property
     def position_m(self) -> ArrayLike: ...
@@ -130,25 +136,25 @@ class Pose(Protocol):
 
 
 def pose_matrix(pose: Pose) -> Floats:
-    """Return a pose as a homogeneous matrix (4, 4)."""
+    """Return the transform (4, 4) of a pose."""
     return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def inverse(a_from_b: Floats) -> Floats:
-    """Return the inverse b_from_a of a rigid transform a_from_b."""
+    """Return the inverse b_from_a (4, 4) of a rigid transform a_from_b."""
     rotation = a_from_b[:3, :3].T
     return transform(rotation, -rotation @ a_from_b[:3, 3])
 
 
 def apply(a_from_b: Floats, points_b: Floats) -> Floats:
-    """Transform points (..., 3) from frame b to frame a."""
+    """Return points (..., 3) of frame b in frame a."""
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
 def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
-    """Return whether a matrix is a finite 4x4 rigid transform with last row (0 0 0 1).
+    """Return whether a matrix is a finite rigid transform (4, 4) with the last row (0 0 0 1).
 
-    Products and lengths of the rotation's rows may differ from 0 and 1 by the tolerance.
+    tolerance: maximum deviation of the products of different rows of the rotation from 0.
     """
     if matrix.shape != (4, 4):
         return False
@@ -172,7 +178,7 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
 
 
 def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Floats:
-    """Return a body's pose after moving for `duration_s` with a constant twist.
+    """Return a body's pose (4, 4) after it has moved for `duration_s` with a constant twist.
 
     twist_world (6,): velocity of the body's origin (m/s), then angular velocity (rad/s).
     """
@@ -181,7 +187,7 @@ def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Fl
 
 
 def angle_between(a: Floats, b: Floats) -> float:
-    """Return the angle (rad, 0..pi) between two vectors (3,), accurate for small angles."""
+    """Return the angle (rad, 0 to pi) between two vectors (3,), accurate for small angles."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     across = hypot(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
     return atan2(across, ax * bx + ay * by + az * bz)

@@ -1,10 +1,10 @@
 """Estimate the lag of an arm behind its commands from commanded and measured joints.
 
-The measured joints are compared with the commanded ones at each lag of a grid.  The estimate is the
-lag at which the variance of the difference is smallest.  For white noise, this is the
+The measured joints are compared with the commanded joints at each lag of a grid. The estimate is
+the lag at which the variance of the difference is smallest. For white noise, this is the
 maximum-likelihood estimate (Knapp and Carter, The generalized correlation method for estimation of
-time delay, 1976).  The weight of old samples decays exponentially.  A constant difference, by
-gravity or an encoder offset, has no influence, so constant velocity gives no information.
+time delay, 1976). The weight of old samples decays exponentially. A constant difference due to
+gravity or an encoder offset has no influence, so constant velocity gives no information.
 """
 
 from __future__ import annotations
@@ -17,62 +17,70 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats
 
 GRID_STEP_S = 0.004
-"""Step of the grid of lags.  A parabola through three grid points gives the minimum."""
+"""The step of the grid of lags. A parabola through three grid points gives the minimum."""
 
 MEMORY_S = 1.2
-"""Time constant with which the weight of samples decays."""
+"""The time constant with which the weight of samples decays."""
 
 MIN_OBSERVED_S = 1.0
-"""Duration of observed motion that is necessary for the first estimate."""
+"""The duration of observed motion that is required for the first estimate."""
 
 MIN_SPEED_RAD_PER_S = 0.01
-"""Standard deviation of the joints' speed below which the arm moves too little for an estimate."""
+"""The standard deviation of the joints' speed below which there is no estimate."""
 
 MAX_MISFIT_RATIO = 0.05
-"""Unexplained fraction of the motion's variance above which there is no estimate.  The arm then
-does not move as commanded, or its joints have reversed signs."""
+"""The unexplained fraction of the motion's variance above which there is no estimate.
+
+With a larger fraction, the arm does not move as commanded, or its joints have reversed signs.
+"""
 
 CORRELATION_S = 0.1
-"""Time over which errors of the difference are correlated, so that they count as one sample."""
+"""The time over which errors of the difference are correlated, so that they count as one sample."""
 
 MIN_NOISE_RATIO = 0.2
-"""Minimum fraction of the difference's variance that is noise, since the servo model is inexact."""
+"""The minimum fraction of the difference's variance that is attributed to noise.
+
+It accounts for the errors of the servo model.
+"""
 
 MAX_UNCERTAINTY_S = 0.004
-"""Standard deviation of an estimate above which it is not used."""
+"""The standard deviation of an estimate above which the estimate is not used."""
 
 MAX_SLEW_S_PER_S = 0.02
-"""Maximum rate at which the lag in use changes, so that targets do not jump."""
+"""The maximum rate at which the used lag changes, so that targets do not jump."""
 
 HISTORY = 256
 MIN_COMMANDS = 4
-"""Number of stored commands, and minimum number with which a measurement is compared."""
+"""The minimum number of commands with which a measurement is compared."""
 
 MIN_STEP_S = 0.02
-"""Minimum time between two used measurements; more would add computation, but no information."""
+"""The minimum time between two used measurements.
+
+More measurements would need more computing time, but add no information.
+"""
 
 MAX_JOINT_RAD = 10.0
-"""Maximum angle of a joint; larger ones are errors."""
+"""The maximum angle of a joint. A larger angle is an error."""
 
 MAX_GAP_S = 0.05
-"""Gap between commands after which the motion is unknown, so that the history starts again."""
+"""The maximum gap between commands. After a longer gap, the recorded motion is discarded."""
 
 
 @dataclass(frozen=True, slots=True)
 class LagBounds:
-    """Minimum and maximum of the lag (s) that may be used."""
+    """The minimum and maximum of the lag (s) that may be used."""
 
     min_s: float
     max_s: float
 
     def clip(self, lag_s: float) -> float:
-        """Return the lag within the bounds."""
+        """Return the lag (s), limited to the bounds."""
         return min(max(lag_s, self.min_s), self.max_s)
 
 
 @dataclass(frozen=True, slots=True)
 class LagEstimate:
-    """Identified lag with its standard deviation, s.
+    """An identified lag with its standard deviation, s.
 
     tracking_error_rad: standard deviation of measured minus commanded joints at this lag (norm over
         the joints).
@@ -86,14 +94,15 @@ class LagEstimate:
 
 
 class ServoLagEstimator:
-    """Estimator of one arm's lag; `lag_s` is always finite and within the bounds.
+    """An estimator of one arm's lag.
 
-    estimate: newest estimate; None before the first.
-    lag_s: lag in use; it starts at the initial lag and changes slowly towards the estimate.
+    estimate: newest estimate; None before the first estimate.
+    lag_s: lag to use, always within the bounds. It starts at the initial lag and changes slowly
+        towards the estimate.
     """
 
     def __init__(self, initial_s: float, bounds: LagBounds) -> None:
-        """Start with an initial lag, s, that is clipped to the bounds."""
+        """Start with an initial lag (s), which is limited to the bounds."""
         self.estimate: LagEstimate | None = None
         self.lag_s = bounds.clip(initial_s)
         self._bounds = bounds
@@ -104,7 +113,7 @@ class ServoLagEstimator:
         self.restart()
 
     def restart(self) -> None:
-        """Discard the recorded motion, after a gap; `lag_s` and `estimate` remain."""
+        """Discard the recorded motion after a gap. `lag_s` and `estimate` remain."""
         self._count = 0
         count = len(self._lags_s)
         self._weight = 0.0
@@ -115,7 +124,7 @@ class ServoLagEstimator:
         self._last_s: float | None = None
 
     def on_command(self, at_s: float, joints_rad: Floats) -> None:
-        """Add commanded joints (6,) rad that were sent at `at_s`."""
+        """Add commanded joints (6,), rad, that were sent at the time `at_s`."""
         if not (math.isfinite(at_s) and _are_joints(joints_rad)):
             self.restart()
             return
@@ -129,7 +138,7 @@ class ServoLagEstimator:
         self._count += 1
 
     def on_measurement(self, at_s: float, joints_rad: Floats) -> None:
-        """Add joints (6,) rad that were measured at `at_s`, after the newest command."""
+        """Add joints (6,), rad, that were measured at the time `at_s`, after the newest command."""
         if not (math.isfinite(at_s) and _are_joints(joints_rad)):
             return
         times = self._times_s[: self._count]
@@ -156,7 +165,8 @@ class ServoLagEstimator:
     def _add(self, measured: Floats, wanted_s: Floats, step_s: float) -> None:
         """Add one measurement to the weighted means and variances of all lags.
 
-        wanted_s: times of the commands to compare, one per lag.  step_s: weight of the measurement.
+        measured (6,): measured joints, rad. wanted_s: times of the commands to compare, one per
+            lag. step_s: weight of the measurement.
         """
         times, joints = self._times_s[: self._count], self._joints[: self._count]
         # For times after the newest command, that command is used.
@@ -183,7 +193,7 @@ class ServoLagEstimator:
         self._bend_square += gain * (float(bend @ bend) - self._bend_square)
 
     def _solve(self) -> LagEstimate | None:
-        """Return the lag with the smallest variance; None if the motion does not determine it."""
+        """Return the lag with the smallest variance, or None if the motion is insufficient."""
         if self._weight < MIN_OBSERVED_S * (1.0 - math.exp(-1.0)):
             return None
         if not self._speed_square >= MIN_SPEED_RAD_PER_S**2:
@@ -212,12 +222,12 @@ class ServoLagEstimator:
 
 
 def _are_joints(joints_rad: Floats) -> bool:
-    """Return whether joints (6,) are plausible angles; NaN is not, since comparisons are false."""
+    """Return whether joints (6,), rad, are plausible angles. NaN is not plausible."""
     return bool((np.abs(joints_rad) <= MAX_JOINT_RAD).all())
 
 
 def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
-    """Return weighted mean (6,) and total variance, updated with a value (6,) of weight `gain`."""
+    """Return the mean (6,) and total variance after adding a value (6,) with the weight `gain`."""
     deviation = value - mean
     return mean + gain * deviation, square + gain * (
         (1.0 - gain) * float(deviation @ deviation) - square

@@ -23,17 +23,17 @@ from flexsheet.messages.types import Recording
 from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 RETRY_NS = 5_000_000_000
-"""Time after a disk error before the next attempt to start a bag."""
+"""The time from a disk error to the next attempt to start a bag."""
 
 
 class BagRecording:
-    """Recording of messages to bags, while it is requested.
+    """A recording of messages to bags, while it is requested.
 
     A bag is ended when the free disk space falls to `keep_free_bytes`, which leaves space for its
-    index.  When twice as much is free again, a new bag starts with the last messages of all
-    latched topics.  Disk errors during writing are passed to `on_error`, not raised.
+    index. When twice as much is free again, a new bag starts with the last messages of all latched
+    topics. Disk errors during writing are passed to `on_error`, not raised.
 
-    note: state of the recording, one line.  lost: number of lost messages since the last bag.
+    note: state of the recording, one line. lost: number of messages lost since the last bag.
     """
 
     def __init__(
@@ -53,15 +53,15 @@ class BagRecording:
         self._retry_ns = self._bag_started_ns = 0
         self.requested = False
         self.lost = 0
-        self.note = "waiting for a request to record"
+        self.note = "waits for a request to record"
 
     @property
     def path(self) -> Path | None:
-        """Return the path of the current bag; None if there is none."""
+        """Return the path of the current bag, or None if no bag is open."""
         return None if self._bag is None else self._bag.path
 
     def start(self) -> None:
-        """Start a bag named after the current time.  Raises BagError or OSError."""
+        """Start a bag whose name contains the current time. Raises BagError or OSError."""
         self.requested, self.lost = True, 0
         # The time of day is only used to name the bag.
         now = datetime.now(UTC)
@@ -69,12 +69,14 @@ class BagRecording:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise BagError(f"{self._path.parent}: cannot be created: {error.strerror}") from error
+            raise BagError(
+                f"{self._path.parent}: the folder cannot be created: {error.strerror}"
+            ) from error
         self._start_bag()
         self.check_disk()
 
     def set_requested(self, requested: bool) -> None:
-        """Start a bag, or end the current one; disk errors are passed to `on_error`."""
+        """Start a bag, or end the current bag. Disk errors are passed to `on_error`."""
         try:
             if requested and not self.requested:
                 self.start()
@@ -87,9 +89,9 @@ class BagRecording:
             self._end_bag(error)
 
     def check_disk(self) -> None:
-        """End the bag if free disk space is low, and start a new bag when there is enough again.
+        """End the bag if free disk space is low, and start a new bag when there is enough space.
 
-        Also start a new bag when the current one reaches the maximum size or duration.
+        A new bag is also started when the current bag reaches the maximum size or duration.
         """
         if not self.requested:
             return
@@ -97,7 +99,7 @@ class BagRecording:
         if self._bag is not None and free >= minimum and self._is_full(self._bag):
             self._split(self._bag)
         elif self._bag is not None and free < minimum:
-            self._end_bag(OSError(f"only {free >> 20} MiB free at {self._path.parent}"))
+            self._end_bag(OSError(f"only {free >> 20} MiB are free at {self._path.parent}"))
         elif self._bag is None and free >= 2 * minimum and self._clock.now_ns() >= self._retry_ns:
             lost, self.lost = self.lost, 0
             try:
@@ -116,7 +118,7 @@ class BagRecording:
         )
 
     def _split(self, bag: BagWriter) -> None:
-        """Close the bag and start the next one, which begins with the latched messages."""
+        """Close the bag and start the next bag, which begins with the latched messages."""
         self._bag = None
         try:
             bag.close()
@@ -125,7 +127,7 @@ class BagRecording:
             self._end_bag(error)
 
     def write(self, topic: Topic, frames: Any, header: Header) -> bool:
-        """Write a message; return whether it is lost because no bag is open.
+        """Write a message. Return true if the message is lost because no bag is open.
 
         The last message of each writer of a latched topic is stored for the next bag. Recording
         commands are not stored.
@@ -145,7 +147,7 @@ class BagRecording:
         return self.requested
 
     def close(self) -> None:
-        """Close the bag.  Raises BagError if it could not be written completely."""
+        """Close the bag. Raises BagError if the bag could not be written completely."""
         if self._bag is not None:
             self._bag.close()
 
@@ -167,7 +169,6 @@ class BagRecording:
         self.note = f"recording to {bag.path}"
 
     def _end_bag(self, error: Exception) -> None:
-        """Close the bag after a disk error, and report the error."""
         bag, self._bag = self._bag, None
         self._retry_ns = self._clock.now_ns() + RETRY_NS
         self.note = f"{NodeNote.NOT_RECORDING.phrase} {error}"
@@ -181,7 +182,7 @@ class BagRecording:
 
 
 def free_path(path: Path) -> Path:
-    """Return a path that does not exist: `path`, or one with the suffix -2, -3, ..."""
+    """Return `path`, or if it exists, a path with the suffix -2, -3, ... that does not exist."""
     if not path.exists():
         return path
     for number in count(2):
@@ -194,7 +195,10 @@ def free_path(path: Path) -> Path:
 def open_bag(
     path: Path, recording: Mapping[str, str], *, compress: bool, attach: Iterable[Path]
 ) -> BagWriter:
-    """Open a bag at a free path and attach files to it.  Raises BagError or OSError."""
+    """Open a bag at a free path, and attach files to it. Raises BagError or OSError.
+
+    recording: table of text that identifies the recording. attach: files to store in the bag.
+    """
     bag = BagWriter(free_path(path), {"recording": recording}, compress=compress)
     try:
         for file in attach:

@@ -1,4 +1,4 @@
-"""Record topics to a bag: the serialized messages and the schemas to decode them."""
+"""Record topics to a bag, with the schemas that are needed to decode the messages."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 
 class Recorder(Node):
-    """Node that writes the messages it receives to a bag; it never overwrites an existing bag.
+    """A node that writes the messages it receives to a bag.
 
-    If the disk is full, the graph continues without a recording.  Lost messages are counted as
-    dropped, and the node's note contains the reason; see `BagRecording`.
+    An existing bag is never overwritten. If the disk is full, the graph continues without a
+    recording. Lost messages are counted as dropped, and the note of the node contains the reason.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RECORDER
@@ -59,7 +59,7 @@ class Recorder(Node):
 
     @periodic("watch_hz")
     def watch_disk(self) -> None:
-        """End the bag before the disk is full; start a new bag when there is space again."""
+        """End the bag before the disk is full, and start a new bag when there is space again."""
         self._recording.check_disk()
         self.note = self._recording.note
 

@@ -14,20 +14,21 @@ RUN_FILES = tuple(
 
 
 class RecorderParameters(NodeParameters):
-    """Parameters of the recorder: which topics to record, to which bag, and disk limits."""
+    """The parameters of the recorder: the topics to record, the bag file, and disk limits."""
 
     bag: Path = Field(
-        description="bag file to write; %Y%m%d-%H%M%S and similar codes become the start time"
+        description="bag file to write; codes such as %Y%m%d-%H%M%S are replaced by the start time"
     )
     topics: tuple[str, ...] = Field(
-        default=(), description="topics to record; empty: all that are logged by default"
+        default=(), description="topics to record; empty: all topics that are logged by default"
     )
     include: tuple[str, ...] = Field(
         default=(), description="further topics to record, for example stereo"
     )
     compress: bool | None = Field(
         default=None,
-        description="compress the bag; null: only if it has no images, which take long to compress",
+        description="whether the bag is compressed; null: only if it has no images, because their "
+        "compression takes long",
     )
     start_paused: bool = Field(
         default=False,
@@ -36,8 +37,8 @@ class RecorderParameters(NodeParameters):
     keep_free_bytes: int = Field(
         default=256 << 20,
         ge=0,
-        description="minimum free space on the disk, below which the bag is ended; another bag "
-        "starts when twice as much is free",
+        description="free space on the disk below which the bag is ended; another bag starts when "
+        "twice as much is free",
     )
     watch_hz: float = Field(
         default=2.0,
@@ -51,5 +52,6 @@ class RecorderParameters(NodeParameters):
         default=None, gt=0.0, description="duration at which another bag is started; null: no limit"
     )
     attach: tuple[Path, ...] = Field(
-        default=RUN_FILES, description="files to store in the bag; @run is the directory of the run"
+        default=RUN_FILES,
+        description="files to store in the bag; @run stands for the directory of the run",
     )

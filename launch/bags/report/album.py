@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from flexsheet.nodes.arrays import Image
 
 MAX_BOOKMARK_SHOTS = 40
-"""Maximum number of stored shots (image sets) at bookmarks; further shots are only counted."""
+"""The maximum number of stored shots (image sets) at bookmarks. Further shots are only counted."""
 
 MAX_WIDTH_PX = 420
 QUALITY = 82
@@ -18,7 +19,10 @@ QUALITY = 82
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """JPEG images taken at one time, each with a title. marked: label of a bookmark, or empty."""
+    """A set of JPEG images taken at one time. Each image has a title.
+
+    marked: label of a bookmark; empty if there is none.
+    """
 
     seconds: float
     title: str
@@ -28,10 +32,10 @@ class Shot:
 
 @dataclass(slots=True)
 class Album:
-    """Shots at regular intervals (at most `limit`), and the first shot after each bookmark.
+    """The shots at regular intervals (at most `limit`), and the first shot after each bookmark.
 
-    bookmarks: (seconds, label), in order. count: number of all shots in the session. left_out:
-    number of shots at bookmarks that are not stored.
+    bookmarks: (seconds, label), in the order of time. count: number of all shots in the session.
+        left_out: number of shots at bookmarks that are not stored.
     """
 
     limit: int
@@ -42,10 +46,8 @@ class Album:
     _regular: list[Shot] = field(default_factory=list)
     _at_bookmarks: list[Shot] = field(default_factory=list)
 
-    def add(
-        self, seconds: float, title: str, pictures: Sequence[tuple[str, NDArray[np.uint8]]]
-    ) -> None:
-        """Take a shot into account; encode and store its images only if it is selected."""
+    def add(self, seconds: float, title: str, pictures: Sequence[tuple[str, Image]]) -> None:
+        """Add a shot. Its images are encoded and stored only if it is selected."""
         passed = [label for at_s, label in self.bookmarks if at_s <= seconds]
         self.bookmarks = self.bookmarks[len(passed) :]
         if passed and len(self._at_bookmarks) >= MAX_BOOKMARK_SHOTS:
@@ -65,13 +67,13 @@ class Album:
 
 
 def _shot(
-    seconds: float, title: str, pictures: Sequence[tuple[str, NDArray[np.uint8]]], marked: str = ""
+    seconds: float, title: str, pictures: Sequence[tuple[str, Image]], marked: str = ""
 ) -> Shot:
     return Shot(seconds, title, tuple((name, jpeg(one)) for name, one in pictures), marked)
 
 
-def jpeg(image: NDArray[np.uint8]) -> bytes:
-    """Encode a grey (h, w) or RGB (h, w, 3) image as JPEG, reduced to at most `MAX_WIDTH_PX`."""
+def jpeg(image: Image) -> bytes:
+    """Encode a grey (h, w) or RGB (h, w, 3) image as JPEG, at most `MAX_WIDTH_PX` wide."""
     height, width = image.shape[:2]
     if width > MAX_WIDTH_PX:
         size = (MAX_WIDTH_PX, max(round(height * MAX_WIDTH_PX / width), 1))

@@ -1,4 +1,4 @@
-"""Draw the charts of the bag report as SVG for light and dark pages, each with a description."""
+"""Draw the charts of the bag report as SVG for light and dark pages, with descriptions."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
 
 WIDTH_IN = 9.0
 GOOD, MIDDLE, DOUBTFUL, BAD = "#7fa99b", "#0072b2", "#e69f00", "#c0392b"
@@ -32,7 +31,7 @@ STATE_COLOURS = {
 }  # fmt: skip
 HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop": "xx",
            "engaged": "xx", "lost": "xx", "disconnected": "..", "stopping": ".."}  # fmt: skip
-"""Hatches that distinguish states for readers who cannot see the colours."""
+"""The hatches that distinguish states for readers who cannot see the colours."""
 
 MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
@@ -47,7 +46,7 @@ EVENTS = (
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Chart. svg: image. text: description of its content. caption: explanation for readers."""
+    """A chart. svg: image. text: description of the image. caption: explanation for readers."""
 
     svg: str
     text: str
@@ -55,7 +54,7 @@ class Chart:
 
 
 def draw_charts(session: Session) -> dict[str, Chart]:
-    """Draw all charts for which the bag has data; return them by name."""
+    """Draw all charts for which the bag has data, and return them by name."""
     makers: dict[str, Callable[[Session], Chart | None]] = {
         "timeline": timeline,
         "latency": latencies,
@@ -81,7 +80,7 @@ def _figure(rows: int, columns: int, height_in: float) -> tuple[Figure, NDArray[
 
 
 def _over_time(axes: Axes, session: Session) -> None:
-    """Limit the x axis to the duration of the bag; call this after the lines are drawn."""
+    """Limit the x axis to the duration of the bag. The lines must be drawn before."""
     mark_isolated(axes)
     axes.set_xlim(0.0, session.info.duration_s)
     axes.grid(visible=True, alpha=0.2)
@@ -101,7 +100,7 @@ def mark_isolated(axes: Axes) -> None:
 
 
 def timeline(session: Session) -> Chart | None:
-    """Draw the states of sheet, arms and tracker as strips along time, with events above them."""
+    """Draw the states of sheet, arms and tracker as strips along time, with events below them."""
     strips = [
         (name, states)
         for name, states in (
@@ -164,7 +163,7 @@ def timeline(session: Session) -> Chart | None:
 
 
 def sort_by_duration(states: States) -> list[tuple[str, float]]:
-    """Return the states and their total durations in s, the longest first."""
+    """Return the states and their total durations (s) in the order of decreasing duration."""
     lasted = [(state, seconds) for state, seconds in states.seconds.items() if seconds > 0.05]
     return sorted(lasted, key=lambda one: -one[1])
 
@@ -172,7 +171,7 @@ def sort_by_duration(states: States) -> list[tuple[str, float]]:
 def find_intervals(
     states: States, grid: Grid, *, lasting: bool = False
 ) -> Iterator[tuple[str, float, float]]:
-    """Yield the intervals of constant state: (state, start s, end s).
+    """Yield the intervals of constant state: (state, start in s, end in s).
 
     lasting: whether a state continues until the next state, also through gaps without messages.
     """
@@ -196,7 +195,7 @@ def find_intervals(
 
 
 def latencies(session: Session) -> Chart | None:
-    """Draw median and 99 % quantile of the latency from exposure to each event, against time."""
+    """Draw the median and 99 % quantile of the latency from exposure to each event against time."""
     events = [event for event in EVENTS if event in session.latencies]
     if not events:
         return None
@@ -274,7 +273,7 @@ def paths(session: Session) -> Chart | None:
 
 
 def sheet_errors(session: Session) -> Chart | None:
-    """Draw the maximum position and angle errors of the sheet in each interval in contact."""
+    """Draw the maximum position and angle errors of the sheet in contact, against time."""
     errors = session.errors
     shown = [
         (name, label)
@@ -354,7 +353,7 @@ def draw_joint_speeds(session: Session) -> Chart | None:
 
 
 def forces(session: Session) -> Chart | None:
-    """Draw the forces at the sheet's edges, the object's force and the push depth, against time."""
+    """Draw the forces at the sheet's edges, the object's force and the push depth against time."""
     arms = {side: arm for side, arm in session.arms.items() if arm.edge_force.overall()}
     if not arms:
         return None

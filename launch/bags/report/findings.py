@@ -12,24 +12,24 @@ from flexsheet.messages.busy import BUSY_REMEDY
 Gravity = Literal["bad", "doubtful"]
 
 SLOW_RATIO = 0.5
-"""Fraction of a topic's minimum rate below which the topic counts as slow, as in the console."""
+"""The fraction of a topic's minimum rate below which the topic counts as slow."""
 
 MAX_UNSEEN_RATIO = 0.05
-"""Maximum fraction of images without a valid fingertip."""
+"""The maximum fraction of images without a valid fingertip."""
 
 MAX_LIMIT_RATIO = 1.0
-"""Ratio of a value to its limit above which the value is reported as a problem."""
+"""The ratio of a value to its limit above which the value is reported as a problem."""
 
 ROUNDING = 1.02
-"""Factor by which measured speeds and forces may exceed their limits, because of rounding."""
+"""The factor by which measured speeds and forces may exceed their limits, due to rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionFinding:
-    """Problem found in a session.
+    """A problem that was found in a session.
 
-    gravity: "bad" for a failure, "doubtful" for something to check. section: id of the section of
-    the page with details.
+    gravity: "bad" for a failure, "doubtful" for something to check. section: id of the page section
+        with details.
     """
 
     gravity: Gravity
@@ -38,7 +38,7 @@ class SessionFinding:
 
 
 BRIEFLY_BUSY_FRACTION = 0.05
-"""Maximum fraction of the time in which a computer may be overloaded without being a failure."""
+"""The maximum fraction of time in which an overloaded computer is not reported as a failure."""
 
 CHECKED = (
     "overload of the computers; "
@@ -53,7 +53,7 @@ CHECKED = (
 def find_problems(numbers: dict[str, Any]) -> list[SessionFinding]:
     """Return all problems in the numbers of a session.
 
-    Overload is first, because it causes most other problems; failures follow.
+    Overload is first, because it causes most other problems. Failures follow.
     """
     found = [
         *_check_bag(numbers),
@@ -94,7 +94,9 @@ def _check_bag(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     bag = numbers["bag"]
     if not bag["complete"]:
         yield SessionFinding(
-            "bad", f"The bag is incomplete ({bag['problem']}); its readable part is shown.", "bag"
+            "bad",
+            f"The bag is incomplete ({bag['problem']}); only its readable part is evaluated.",
+            "bag",
         )
     if lost := int(bag["recording"].get("lost_messages", 0)):
         yield SessionFinding(
@@ -116,17 +118,21 @@ def _check_bag(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     for name, host in numbers["hosts"].items():
         if host["missing_devices"]:
             devices = ", ".join(host["missing_devices"])
-            text = f"{name}: devices of its nodes do not exist: {devices}."
+            text = f"{name}: these devices of its nodes are missing: {devices}."
             yield SessionFinding("bad", text, "bag")
 
 
 def _check_arms(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     counts, first = numbers["events"]["counts"], numbers["events"]["first"]
-    for kind, what in (("estop", "E-stop"), ("fault", "Arm fault"), ("arm", "Arm not operating")):
+    for kind, what in (
+        ("estop", "An e-stop was engaged or released"),
+        ("fault", "An arm had a fault"),
+        ("arm", "An arm stopped operating"),
+    ):
         if kind in counts:
             event = next(one for one in first if one["kind"] == kind)
             start = f"first at {event['seconds']:.2f} s: {event['text']}"
-            text = f"{what}, {_times(counts[kind])}; {start}."
+            text = f"{what} {_times(counts[kind])}, {start}."
             yield SessionFinding("bad", text, "timeline")
     scene = numbers["scene"] or {}
     for side, arm in numbers["arms"].items():
@@ -142,7 +148,10 @@ def _check_arms(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
             most = arm[key]
             if most is not None and limit in scene and most > ROUNDING * scale * scene[limit]:
                 allowed = scale * scene[limit]
-                text = f"{side} arm: {what} {most:.3g} {unit}, limit {allowed:.3g} {unit}."
+                text = (
+                    f"{side} arm: the {what} reached {most:.3g} {unit}; the scene allows "
+                    f"{allowed:.3g} {unit}."
+                )
                 yield SessionFinding("bad", text, "arms")
 
 
@@ -173,7 +182,7 @@ def _check_topics(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
             text = f"{name}: {topic['missing']} messages never reached the recorder."
             yield SessionFinding("doubtful", text, "topics")
         if expected and rate and topic["messages"] > 10 and rate < SLOW_RATIO * expected[0]:
-            text = f"{name} had {rate:.3g} Hz; at least {expected[0]:.3g} Hz are expected."
+            text = f"{name} had a rate of {rate:.3g} Hz; at least {expected[0]:.3g} Hz is expected."
             yield SessionFinding("doubtful", text, "topics")
         if topic["silences"]:
             gap_s = topic["longest_silence_s"]
@@ -190,7 +199,8 @@ def _check_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
         p99 = numbers["latency_ms"].get(event, {}).get("p99")
         if p99 is not None and p99 > allowed_ms:
             text = (
-                f"Exposure to {event}: {p99:.1f} ms (99 %); the scene allows {allowed_ms:.3g} ms."
+                f"The time from exposure to {event} was {p99:.1f} ms (99 %); the scene allows "
+                f"{allowed_ms:.3g} ms."
             )
             yield SessionFinding("doubtful", text, "latency")
     contact = numbers["sheet"]["contact"]
@@ -208,7 +218,7 @@ def _check_tolerances(numbers: dict[str, Any]) -> Iterator[SessionFinding]:
     body = numbers["soft_body"]
     if body["out_of_range"]:
         ratio = body["out_of_range"] / sum(body["methods"].values())
-        text = f"The soft body's method was outside its valid range in {ratio:.1%} of its results."
+        text = f"The soft body's method was outside its valid range in {ratio:.1%} of the results."
         yield SessionFinding("doubtful", text, "nodes")
 
 

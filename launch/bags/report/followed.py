@@ -5,20 +5,19 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.series import Grid, RunningMoments, Spread
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 MAX_CONTACT_HEIGHT_M = 0.001
-"""Maximum height of the true finger above the undeformed object that counts as contact.
+"""The maximum height of the true finger above the undeformed object that counts as contact.
 
-The pad of a fingertip deforms by about this much."""
+The pad of a fingertip deforms by about this much.
+"""
 
 
 class Sizes:
-    """Mean, 95 % quantile (accurate to 2.3 %) and maximum of positive values.
+    """The mean, 95 % quantile (accurate to 2.3 %) and maximum of positive values.
 
     The values are not stored.
     """
@@ -27,13 +26,15 @@ class Sizes:
         self._moments, self._spread = RunningMoments(), Spread(Grid(0, 1.0, 1))
 
     def add(self, values: Floats) -> None:
-        """Add values (n,) to the statistics."""
         self._moments.add(values)
         for value in values.tolist():
             self._spread.add(0, value)
 
     def summary(self, scale: float) -> dict[str, float] | None:
-        """Return mean, 95 % quantile and maximum times `scale`; None if there are no values."""
+        """Return mean, 95 % quantile and maximum, multiplied by `scale`.
+
+        Return None if there are no values.
+        """
         found, p95 = self._moments.summary(scale), self._spread.quantile_s(0.95)
         if found is None or p95 is None:
             return None
@@ -41,9 +42,9 @@ class Sizes:
 
 
 class FollowedFinger:
-    """Accumulator of the errors of the true sheet relative to the true finger.
+    """An accumulator of the errors of the true sheet relative to the true finger.
 
-    A drop-out is an interval without following, during at least part of which there is contact.
+    A drop-out is an interval in which the arms do not follow, and which includes contact.
     """
 
     def __init__(self) -> None:
@@ -57,8 +58,8 @@ class FollowedFinger:
     ) -> None:
         """Add the errors (n,) at consecutive exposures.
 
-        heights_m: height of the true finger above the undeformed object, negative below it.
-        following: bool (n,), whether both arms follow a sheet target that follows the finger.
+        heights_m (n,): height of the true finger above the undeformed object, negative below it.
+        following (n,): whether both arms follow a sheet target that follows the finger.
         """
         contact = heights_m <= MAX_CONTACT_HEIGHT_M
         self.exposures += len(contact)
@@ -74,10 +75,10 @@ class FollowedFinger:
                 self.drop_outs += 1
 
     def figures(self) -> dict[str, Any]:
-        """Return the summary of the errors; values that require contact are None if there is none.
+        """Return a summary of the errors. Values that require contact are None without contact.
 
         contact_ratio: fraction of the exposures that are in contact. following_ratio: fraction of
-        the exposures in contact at which the arms follow.
+            the exposures in contact at which the arms follow.
         """
         return {
             "contact_ratio": self._in_contact / self.exposures if self.exposures else None,

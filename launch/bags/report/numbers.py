@@ -18,11 +18,11 @@ from flexsheet.messages.topics import TOPICS
 DEGREES = float(np.degrees(1.0))
 
 METHODS = ("method", *Methods.model_fields)
-"""Names of node parameters that select a method."""
+"""The names of node parameters that select a method."""
 
 
 def compute_numbers(session: Session) -> dict[str, Any]:
-    """Compute all numbers of the report; None where the bag lacks the data."""
+    """Compute all numbers of the report. A number is None if the bag lacks the data."""
     info, scene = session.info, session.scene
     return {
         "bag": {
@@ -203,7 +203,10 @@ def _node(session: Session, name: str, summary: NodeSummary) -> dict[str, Any]:
 
 
 def describe_methods(parameters: Mapping[str, Any], scene: Scene | None) -> str | None:
-    """Describe the methods that a node uses; "auto" means the method named in the scene."""
+    """Describe the methods that a node uses, or return None if it has no such parameter.
+
+    The value "auto" means the method that the scene selects.
+    """
     by_scene = scene.methods.model_dump() if scene is not None else {}
     by_scene["method"] = (by_scene.get("soft_body") or {}).get("method")
     found = []

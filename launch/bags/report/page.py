@@ -15,7 +15,7 @@ from flexsheet.launch.bags.report.numbers import compute_numbers
 from flexsheet.launch.bags.report.session import Session
 
 MARK = "<!-- made by: flexsheet bag report -->"
-"""Comment in a report file. It shows that a later report may overwrite the file."""
+"""The comment that marks a file as a report, which a later report may overwrite."""
 
 COLOURS = {
     "light": {"ground": "#ffffff", "text": "#1f2328", "quiet": "#57606a", "line": "#d0d7de",
@@ -40,7 +40,7 @@ SECTIONS = {
 
 EVENTS_SHOWN = 60
 BRIEF_S = 0.02
-"""Minimum duration of states in the table of the page. Chart and --json contain all states."""
+"""The minimum duration of states in the table of the page. Chart and --json contain all states."""
 
 _CSS = """
 * { box-sizing: border-box; }
@@ -88,7 +88,7 @@ pre { background: var(--panel); padding: .75rem; overflow-x: auto; }
 
 
 def render_page(session: Session) -> str:
-    """Render the report of a recorded session as HTML."""
+    """Render the report of a recorded session as HTML text."""
     numbers, charts = compute_numbers(session), draw_charts(session)
     name = Path(numbers["bag"]["path"]).name
     body = [
@@ -183,7 +183,7 @@ def _bag(numbers: Mapping[str, Any]) -> Iterator[str]:
              or "none: the nodes use the scene's optics and geometry"),
         ]  # fmt: skip
     if scene is None:
-        yield _missing("No scene was recorded, so no tolerances can be checked.")
+        yield _missing("No scene was recorded, so the tolerances cannot be checked.")
     else:
         rows += [
             ("Scenes", ", ".join(scene["all"])),
@@ -231,7 +231,7 @@ def _timeline(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterat
     texts = ", ".join(f"{count} × {kind}" for kind, count in counts.items())
     title = f"Events ({texts})"
     if len(events) > EVENTS_SHOWN:
-        title += f"; the first {EVENTS_SHOWN}; --json contains all"
+        title += f"; only the first {EVENTS_SHOWN} are shown, and --json contains all"
     event_rows = [(one["seconds"], one["kind"], one["text"]) for one in events[:EVENTS_SHOWN]]
     yield table(title, ("time, s", "kind", "event"), event_rows)
 
@@ -282,8 +282,8 @@ def _latency(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterato
     if frames["count"]:
         median_ms = _format(_lookup(frames["draw_ms"], "p50"))
         yield (
-            f"<p>{frames['count']} frames, drawn in {median_ms} ms (median), {frames['late']} of "
-            "them late.</p>"
+            f"<p>{frames['count']} frames were drawn in {median_ms} ms (median). "
+            f"{frames['late']} of them were late.</p>"
         )
     else:
         yield _missing("No frame was recorded.")
@@ -322,7 +322,7 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
         )  # fmt: skip
     if followed := numbers["sheet"]["followed"]:
         yield table(
-            "The true finger along each path. In contact: at most 1 mm above the object. Followed: "
+            "The true finger on each path. In contact: at most 1 mm above the object. Followed: "
             "both arms followed a target that followed the finger. Δd and Δθ: errors of the true "
             "sheet in contact, mean (95 %, maximum)",
             ("path", "start, s", "duration, s", "in contact, %", "followed in contact, %",
@@ -348,7 +348,7 @@ def _arms(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[s
     if not numbers["arms"]:
         yield _missing("No arm was recorded.")
         return
-    yield figure(charts.get("joints"), "Too few arm states for joint speeds.")
+    yield figure(charts.get("joints"), "There are too few arm states to compute joint speeds.")
     yield figure(charts.get("force"), "No edge force was recorded.")
     scene = numbers["scene"]
     yield table(
@@ -426,8 +426,8 @@ def _images(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
             yield _missing(missing)
             continue
         if numbers["images"][key] > len(shots):
-            rest = f", without {album.left_out} shots at bookmarks" if album.left_out else ""
-            yield f"<p>{len(shots)} of {numbers['pictures'][key]}{rest}.</p>"
+            rest = f", without {album.left_out} at bookmarks" if album.left_out else ""
+            yield f"<p>{len(shots)} of {numbers['images'][key]} are shown{rest}.</p>"
         yield from _album(title, album)
 
 
@@ -451,7 +451,7 @@ def _image(title: str, shot: Shot, name: str, jpeg: bytes) -> str:
 
 
 def figure(chart: Chart | None, missing: str) -> str:
-    """Render a chart with its caption; if there is no chart, render the text `missing`."""
+    """Render a chart with its caption. If there is no chart, render the text `missing`."""
     if chart is None:
         return _missing(missing)
     data = b64encode(chart.svg.encode()).decode()
@@ -463,7 +463,7 @@ def figure(chart: Chart | None, missing: str) -> str:
 
 
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Render a table. The first column contains row headers; numbers have three digits."""
+    """Render a table. The first column contains row headers, and numbers have three digits."""
     body = []
     for first, *rest in rows:
         cells = "".join(_cell(value) for value in rest)
@@ -484,7 +484,6 @@ def _cell(value: Any) -> str:
 
 
 def _format(value: Any) -> str:
-    """Format a value of a table cell for display."""
     match value:
         case None:
             return "–"
@@ -520,7 +519,7 @@ def _missing(text: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format a duration for display: 3.2 s, 4 min 10 s, 2 h 5 min."""
+    """Format a duration (s) for display, such as "3.2 s", "4 min 10 s" or "2 h 5 min"."""
     if seconds < 60.0:
         return f"{seconds:.3g} s"
     minutes, rest = divmod(round(seconds), 60)

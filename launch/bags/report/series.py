@@ -1,4 +1,4 @@
-"""Summarize measured quantities in equal intervals of a bag's time.
+"""Summarize measured quantities in equal intervals of a bag's duration.
 
 The required memory does not depend on the duration of the bag.
 """
@@ -12,26 +12,26 @@ from math import log10
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 MIN_DURATION_S, MAX_DURATION_S, CELLS_PER_DECADE = 1e-5, 1e2, 100
-"""Range and resolution of the histogram in `Spread`; a bin is 2.3 % wide."""
+"""The range and resolution of the histogram in `Spread`. A bin is 2.3 % wide."""
 
 CELLS = 7 * CELLS_PER_DECADE
 MAX_STATE_AGE_S = 0.5
-"""Maximum time for which a state is assumed to last without another message."""
+"""The maximum time for which a state is assumed to last without another message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Division of a bag's duration into `count` equal intervals."""
+    """A division of a bag's duration into `count` equal intervals."""
 
     start_ns: int
     duration_s: float
     count: int
 
     def index(self, at_ns: int) -> int:
-        """Return the index of a time's interval; times outside count to the first or the last."""
+        """Return the index of the interval that contains a time, or of the nearest interval."""
         fraction = (at_ns - self.start_ns) * 1e-9 / max(self.duration_s, 1e-9)
         return min(max(int(fraction * self.count), 0), self.count - 1)
 
@@ -42,14 +42,13 @@ class Grid:
 
 
 class Range:
-    """Minimum and maximum of a quantity in each interval; NaN if the interval has no values."""
+    """The minimum and maximum of a quantity in each interval; NaN if the interval has no values."""
 
     def __init__(self, grid: Grid) -> None:
         self.minimum = np.full(grid.count, np.nan)
         self.maximum = np.full(grid.count, np.nan)
 
     def add(self, index: int, value: float) -> None:
-        """Add a value to the interval `index`."""
         # The negated comparison is also true if the stored value is NaN, its initial value.
         if not value >= self.minimum[index]:
             self.minimum[index] = value
@@ -57,21 +56,21 @@ class Range:
             self.maximum[index] = value
 
     def overall(self) -> tuple[float, float] | None:
-        """Return minimum and maximum over all intervals; None if there are no values."""
+        """Return the minimum and maximum over all intervals, or None if there are no values."""
         if np.isnan(self.maximum).all():
             return None
         return float(np.nanmin(self.minimum)), float(np.nanmax(self.maximum))
 
 
 class Spread:
-    """Distribution of durations (such as latencies) in each interval, as logarithmic histograms."""
+    """The distribution of durations (such as latencies) in each interval, as histograms."""
 
     def __init__(self, grid: Grid) -> None:
         self.counts: NDArray[np.int32] = np.zeros((grid.count, CELLS), np.int32)
         self.longest_s = 0.0
 
     def add(self, index: int, duration_s: float) -> None:
-        """Add a duration to interval `index`; at least `MIN_DURATION_S` is counted."""
+        """Add a duration (s) to the interval `index`. It counts as at least `MIN_DURATION_S`."""
         self.longest_s = max(self.longest_s, duration_s)
         cell = CELLS_PER_DECADE * log10(max(duration_s, MIN_DURATION_S) / MIN_DURATION_S)
         self.counts[index, min(int(cell), CELLS - 1)] += 1
@@ -81,20 +80,20 @@ class Spread:
         return int(self.counts.sum())
 
     def quantile_s(self, fraction: float) -> float | None:
-        """Return a quantile of all durations, accurate to 2.3 %; None if there are no durations."""
+        """Return a quantile of all durations, accurate to 2.3 %; None without durations."""
         found = _quantiles(self.counts.sum(axis=0, keepdims=True), fraction)[0]
         return None if np.isnan(found) else float(min(found, self.longest_s))
 
     def quantiles_s(self, fraction: float) -> Floats:
-        """Return a quantile of the durations in each interval (count,).
+        """Return a quantile (count,) of the durations in each interval, s.
 
-        It is NaN for intervals that have no durations.
+        The quantile is NaN for intervals that have no durations.
         """
         return _quantiles(self.counts, fraction)
 
 
 def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
-    """Return quantiles (n,) of n histograms, given as rows (n, CELLS) of counts."""
+    """Return quantiles (n,), s, of n histograms, given as rows (n, CELLS) of counts."""
     sums = np.cumsum(counts, axis=1)
     rank = fraction * sums[:, -1:]
     cell = np.argmax(sums >= np.maximum(rank, 1), axis=1)
@@ -106,7 +105,7 @@ def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
 
 
 class PointSeries:
-    """Last position of a moving point in each interval (count, 3); NaN if there is none."""
+    """The last position (count, 3) of a moving point in each interval; NaN if there is none."""
 
     def __init__(self, grid: Grid) -> None:
         self.points = np.full((grid.count, 3), np.nan)
@@ -116,9 +115,9 @@ class PointSeries:
 
 
 class States:
-    """Most severe state of a device in each interval, and total time in each state.
+    """The most severe state of a device in each interval, and the total time in each state.
 
-    order: the expected states, from the least to the most severe.
+    order: expected states, from the least to the most severe.
     """
 
     NOTHING = -1
@@ -127,12 +126,11 @@ class States:
         self.names = list(order)
         self.codes: NDArray[np.int8] = np.full(grid.count, self.NOTHING, np.int8)
         self.seconds = dict.fromkeys(self.names, 0.0)
-        self.changes = 0
         self.state: str | None = None
         self._since_ns = 0
 
     def add(self, index: int, at_ns: int, state: str) -> bool:
-        """Add the state reported at `at_ns`; return whether it differs from the previous state."""
+        """Add the state reported at `at_ns`. Return whether it differs from the previous state."""
         if state not in self.seconds:
             self.names.append(state)
             self.seconds[state] = 0.0
@@ -140,7 +138,6 @@ class States:
             passed_s = (at_ns - self._since_ns) * 1e-9
             self.seconds[self.state] += min(max(passed_s, 0.0), MAX_STATE_AGE_S)
         changed = self.state is not None and self.state != state
-        self.changes += changed
         self.state, self._since_ns = state, at_ns
         self.codes[index] = max(int(self.codes[index]), self.names.index(state))
         return changed
@@ -148,7 +145,7 @@ class States:
 
 @dataclass(slots=True)
 class RunningMoments:
-    """Mean, standard deviation and maximum of values, computed without storing the values."""
+    """The mean, standard deviation and maximum of values that are not stored."""
 
     count: int = 0
     total: float = 0.0
@@ -163,7 +160,7 @@ class RunningMoments:
             self.maximum = max(self.maximum, float(values.max()))
 
     def summary(self, scale: float) -> dict[str, float] | None:
-        """Return mean, standard deviation and maximum times `scale`.
+        """Return mean, standard deviation and maximum, multiplied by `scale`.
 
         Return None if there are no values.
         """
@@ -176,7 +173,7 @@ class RunningMoments:
 
 @dataclass(slots=True)
 class Events:
-    """Events in order of time: the first `limit` of each kind, and the count of all."""
+    """The first `limit` events of each kind in the order of time, and the number of all events."""
 
     limit: int = 100
     stored: list[tuple[float, str, str]] = field(default_factory=list)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from flexsheet.launch.bags.report.album import Album
@@ -49,8 +48,8 @@ from flexsheet.messages.types import (
     TwinFinger,
 )
 from flexsheet.nodes import NodeRole
+from flexsheet.nodes.arrays import Floats
 
-Floats = NDArray[np.float64]
 Progress = Callable[[float, float], None]
 
 MAX_INTERVALS, FINE_INTERVALS = 240, 1200
@@ -59,7 +58,7 @@ STEREO_SHOTS, EYE_SHOTS, FRAME_SHOTS = 6, 12, 6
 MIN_EARLIER_UPTIME_S = 10.0
 SILENT_PERIODS, MIN_SILENCE_S = 10.0, 0.5
 SPEED_OVER_NS = 25_000_000
-"""Interval over which speeds are averaged, because timestamps of single messages are irregular."""
+"""The interval over which speeds are averaged, because timestamps are irregular."""
 
 PHASES = ("wait", "approach", "contact", "hold")
 MODES = (
@@ -80,10 +79,11 @@ An arm that is lost in this time, and does not move again, was stopped at the en
 
 @dataclass(slots=True)
 class Flow:
-    """Regularity of a topic's messages, and its missing sequence numbers.
+    """The regularity of a topic's messages, and the number of missing messages.
 
-    age: time from the source timestamp to the recording. lost: number of missing sequence numbers.
-    silences: number of intervals without messages that exceed ten of the slowest expected periods.
+    age: distribution of the time from the source timestamp to the recording. lost: number of
+        missing sequence numbers. silences: number of intervals without messages that are too long.
+        longest_silence_s: duration of the longest interval.
     """
 
     age: Spread
@@ -97,7 +97,7 @@ class Flow:
 
 @dataclass(slots=True)
 class PortTotals:
-    """Counts of the messages that the readers of a topic skipped, lost and refused.
+    """The numbers of messages that the readers of a topic skipped, lost and refused.
 
     Counters of all starts of a node are summed. Counts from before the start of the bag are
     subtracted.
@@ -112,7 +112,8 @@ class PortTotals:
     def add(self, node: str, epoch: int, port: PortStatus, *, started_earlier: bool) -> None:
         """Add the counters that a reader reports.
 
-        started_earlier: whether the node was running long before the start of the bag.
+        epoch: start of the reader, ns. started_earlier: whether the reader was running long before
+            the start of the bag.
         """
         before = self.newest.get(node)
         if before is not None and before[0] != epoch:
@@ -129,7 +130,7 @@ class PortTotals:
         self.refused += sign * port.rejected
 
     def totals(self) -> tuple[int, int, int]:
-        """Return the skipped, lost and refused messages of all readers."""
+        """Return the numbers of skipped, lost and refused messages of all readers."""
         now = [port for _, port in self.newest.values()]
         return (
             self.skipped + sum(port.dropped for port in now),
@@ -140,14 +141,13 @@ class PortTotals:
 
 @dataclass(slots=True)
 class HostLoad:
-    """Number of status reports of a host, of those in which it is busy, and the worst report."""
+    """The number of a host's status reports, of those in which it is busy, and the worst report."""
 
     reports: int = 0
     busy: int = 0
     worst: HostStatus | None = None
 
     def update(self, host: HostStatus) -> None:
-        """Add one status report of the host."""
         self.reports += 1
         if is_busy(host):
             self.busy += 1
@@ -161,7 +161,7 @@ def _pressure(host: HostStatus) -> float:
 
 @dataclass(slots=True)
 class NodeSummary:
-    """Summary of the status messages of a node: processor use, memory, starts and errors."""
+    """A summary of a node's status messages: processor use, memory, starts and errors."""
 
     cpu: RunningMoments = field(default_factory=RunningMoments)
     resident_bytes: int = 0
@@ -173,7 +173,10 @@ class NodeSummary:
     note: str = ""
 
     def add(self, status: Status, epoch: int) -> bool:
-        """Add a status message of the node; return whether it contains a new error."""
+        """Add a status message of the node, and return whether it contains a new error.
+
+        epoch: start of the node, ns.
+        """
         self.cpu.add(np.array([status.cpu_ratio]))
         self.resident_bytes = max(self.resident_bytes, status.resident_bytes)
         if epoch != self.epoch:
@@ -187,7 +190,7 @@ class NodeSummary:
 
 
 class Arm:
-    """Summary of one arm: its modes, speeds and the force at its edge of the sheet."""
+    """A summary of one arm: its modes, its speeds, and the force at its edge of the sheet."""
 
     def __init__(self, grid: Grid, fine: Grid) -> None:
         self.modes = States(fine, MODES)
@@ -200,7 +203,7 @@ class Arm:
         self._recent: deque[tuple[int, Floats, Floats]] = deque()
 
     def add(self, arm: ArmState, source_ns: int, index: int) -> None:
-        """Add an arm state, whose joints were measured at `source_ns`, to the interval `index`."""
+        """Add an arm state to the interval `index`. Its joints were measured at `source_ns`."""
         self.cycle.add(0, arm.cycle_s)
         if arm.edge_force_n is not None:
             self.edge_force.add(index, arm.edge_force_n)
@@ -223,7 +226,7 @@ class Arm:
 
 
 class Session:
-    """Summary of a bag. `scene` is the last recorded scene."""
+    """A summary of a bag. `scene` is the last recorded scene."""
 
     def __init__(
         self, reader: BagReader, info: BagInfo, bookmarks: list[tuple[float, str]]
@@ -270,7 +273,7 @@ class Session:
     def joint_speeds_rad_per_s(self, side: str) -> tuple[float, ...]:
         """Return the maximum joint speeds (6,) of an arm, rad/s.
 
-        If there is no scene, return the speeds of an RV-1A.
+        If no scene was recorded, return the speeds of an RV-1A.
         """
         model = RV_1A if self.scene is None else getattr(self.scene.arms, side).model
         return tuple(model.speed_rad_per_s)
@@ -474,14 +477,14 @@ class Session:
 
 
 def add_correction(label: str, correction: str) -> str:
-    """Append the name of the image correction to an image's label, unless it contains that name."""
+    """Append the name of the image correction to an image's label, unless the label contains it."""
     return label if correction in label else ", ".join(filter(None, (label, correction)))
 
 
 def _list_silence_limits() -> dict[str, float]:
-    """Return the interval (s) from which each topic counts as silent, by topic.
+    """Return the interval (s) without messages from which a topic counts as silent, by topic.
 
-    Only topics with an expected rate and a single writer have one.
+    Only topics with an expected rate and a single writer have a limit.
     """
     return {
         topic.name: max(SILENT_PERIODS / topic.rate_hz[0], MIN_SILENCE_S)
@@ -494,7 +497,7 @@ SILENCE_LIMITS_S = _list_silence_limits()
 
 
 def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -> Session:
-    """Read and summarize a bag, even an incomplete one. Raises BagError if nothing can be read."""
+    """Read and summarize a complete or incomplete bag. Raises BagError if nothing can be read."""
     reader = BagReader(bag)
     info = reader.info()
     readable = {one.name for one in info.topics if one.readable}

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.followed import FollowedFinger
 from flexsheet.launch.bags.report.series import Grid, Range, RunningMoments
@@ -30,15 +29,14 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import ArmSpec, Scene
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget, TwinArms, TwinFinger
+from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Shape, make_shape
 from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
-Floats = NDArray[np.float64]
-
 BLOCK = 2000
-"""Number of finger samples that are processed together."""
+"""The number of finger samples that are processed together."""
 
 TOPICS_READ = (
     "scene",
@@ -49,22 +47,25 @@ TOPICS_READ = (
     "arm_right",
     "twin/arms",
 )
-"""Topics needed for errors relative to the true finger. In a simulator's bag, their timestamps
-are on one clock."""
+"""The topics needed for errors relative to the true finger.
+
+In a simulator's bag, their timestamps are on one clock.
+"""
 
 SAME_RUN_NS = 1_000_000_000
 
 SILENT_NS = 100_000_000
-"""Maximum age of an arm's last state; with an older state the arm counts as not following."""
+"""The maximum age of an arm's last state. With an older state, the arm counts as not following."""
 
 
 @dataclass(slots=True)
 class FingerRun:
-    """One motion of the simulated finger along a path.
+    """A motion of the simulated finger along a path.
 
     zero_ns: start of the path. done_ns: last exposure on the path. end_ns: last exposure that names
-    the path. stroke_s: duration of the stroke, for a stroke of the experiment, else None. sums:
-    errors of that stroke relative to the measured and the true finger.
+        the path.
+    stroke_s: duration of the stroke; None if the path is no stroke of an experiment.
+    sums: errors of this stroke relative to the measured and the true finger.
     """
 
     label: str
@@ -77,7 +78,7 @@ class FingerRun:
 
     @property
     def stroke_window_ns(self) -> tuple[int, int]:
-        """Return start and end of the stroke, ns; an empty interval if the path is no stroke."""
+        """Return the start and end of the stroke, ns. They are equal if the path is no stroke."""
         if self.stroke_s is None:
             return self.zero_ns, self.zero_ns
         begin_s, finish_s = stroke_window_s(self.stroke_s)
@@ -85,13 +86,13 @@ class FingerRun:
         return self.zero_ns + round(begin_s * 1e9), min(finish_ns, self.end_ns)
 
     def figures(self) -> dict[str, Any]:
-        """Return how well the sheet followed the finger; see `FollowedFinger.figures`."""
+        """Return numbers for how well the sheet followed the finger on this path."""
         seconds = (self.done_ns - self.zero_ns) * 1e-9
         return {"path": self.label, "seconds": seconds, **self.followed.figures()}
 
 
 class MotionBuffer:
-    """Buffer for samples of a finger and of both sheet edges, until errors can be computed."""
+    """A buffer for samples of a finger and of both sheet edges, until errors can be computed."""
 
     def __init__(self) -> None:
         self.finger: list[tuple[int, Floats]] = []
@@ -99,10 +100,11 @@ class MotionBuffer:
 
     def pop_complete(
         self,
-    ) -> tuple[SampledMotion, tuple[SampledMotion, SampledMotion], NDArray[np.int64]] | None:
-        """Return the motions, and the finger's times that both edges cover; keep later samples.
+    ) -> tuple[SampledMotion, tuple[SampledMotion, SampledMotion], Ints] | None:
+        """Return the motions of the finger and of both edges, and the finger's times that both
+        edges cover.
 
-        Returns None if there are too few samples.
+        Later samples remain in the buffer. Returns None if there are too few samples.
         """
         if len(self.finger) < 2 or min(map(len, self.edges)) < 2:
             return None
@@ -118,7 +120,7 @@ class MotionBuffer:
 
 
 class SheetErrors:
-    """Accumulator of sheet errors. Messages are added in order; `finish` is called at the end."""
+    """An accumulator of sheet errors. Messages are added in order, and then `finish` is called."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
@@ -139,7 +141,7 @@ class SheetErrors:
         self.runs: list[FingerRun] = []
 
     def add(self, message: Any, source_ns: int) -> None:
-        """Add a message; all source timestamps must be on one clock."""
+        """Add a message. All source timestamps must be on one clock."""
         match message:
             case Scene():
                 self.finish()
@@ -189,7 +191,7 @@ class SheetErrors:
             side.edges[name == "right"].append((source_ns, row))
 
     def _is_following(self, at_ns: int) -> float:
-        """Return 1 if both arms follow the sheet target, and this follows the finger, else 0."""
+        """Return 1 if both arms follow a sheet target that follows the finger, otherwise 0."""
         arms = [self._arms.get(side) for side in ("left", "right")]
         both = all(arm is not None and arm[1] and at_ns - arm[0] <= SILENT_NS for arm in arms)
         return float(both and not self._target_holds)
@@ -211,7 +213,7 @@ class SheetErrors:
             last.done_ns = source_ns
 
     def finish(self) -> None:
-        """Compute the errors for all buffered samples that have both edges."""
+        """Compute the errors of all buffered finger samples for which both edges are known."""
         scene, shape = self._scene, self._shape
         if scene is None or shape is None:
             self.measured, self.true = MotionBuffer(), MotionBuffer()
@@ -248,7 +250,7 @@ class SheetErrors:
         del self._contact[: -2 * BLOCK]
         del self._following[: -2 * BLOCK]
 
-    def _add_errors(self, name: str, times_ns: NDArray[np.int64], d: Floats, theta: Floats) -> None:
+    def _add_errors(self, name: str, times_ns: Ints, d: Floats, theta: Floats) -> None:
         prefix = "true_" if name == "true" else ""
         self.contact[f"{prefix}d"].add(d)
         self.contact[f"{prefix}theta"].add(theta)
@@ -259,9 +261,7 @@ class SheetErrors:
             self.distance[name].add(index, one_d)
             self.angle[name].add(index, one_theta)
 
-    def _add_strokes(
-        self, name: str, times_ns: NDArray[np.int64], d: Floats, theta: Floats
-    ) -> None:
+    def _add_strokes(self, name: str, times_ns: Ints, d: Floats, theta: Floats) -> None:
         prefix = "true_" if name == "true" else ""
         for run in self.runs:
             begin_ns, finish_ns = run.stroke_window_ns
@@ -270,16 +270,14 @@ class SheetErrors:
                 run.sums.setdefault(f"{prefix}delta_d", RunningMoments()).add(d[inside])
                 run.sums.setdefault(f"{prefix}delta_theta", RunningMoments()).add(theta[inside])
 
-    def _add_followed(
-        self, times_ns: NDArray[np.int64], d: Floats, theta: Floats, heights: Floats
-    ) -> None:
+    def _add_followed(self, times_ns: Ints, d: Floats, theta: Floats, heights: Floats) -> None:
         following = make_motion(self._following, "twin/finger").interpolate(times_ns)[:, 0] > 0.5
         for run in self.runs:
             inside = (times_ns >= run.zero_ns) & (times_ns <= run.done_ns)
             if inside.any():
                 run.followed.add(d[inside], theta[inside], heights[inside], following[inside])
 
-    def _read_contact(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.bool_], Floats]:
+    def _read_contact(self, times_ns: Ints) -> tuple[Bools, Floats]:
         """Return whether the sheet target was in contact (n,), and its normal offset (n,), m."""
         if len(self._contact) < 2:
             return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))
@@ -290,7 +288,7 @@ class SheetErrors:
 
 
 def read_followed(bag: Path) -> list[dict[str, Any]]:
-    """Return how well the sheet followed the finger on each path in a bag, in order."""
+    """Return a summary for each finger path in a bag of how well the sheet followed the finger."""
     errors = SheetErrors(Grid(0, 1.0, 1))
     for _, message, header, _ in BagReader(bag, topics=TOPICS_READ):
         errors.add(message, header.source_ns)

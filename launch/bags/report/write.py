@@ -54,7 +54,7 @@ def _draft_path(output: Path) -> Path:
 
 
 def _check(output: Path) -> None:
-    """Check before the bag is read that the page can be written; else raise BagError."""
+    """Raise BagError if the page cannot be written, before the bag is read."""
     draft = _draft_path(output)
     try:
         draft.touch()
@@ -67,7 +67,7 @@ def _check(output: Path) -> None:
         raise _unwritable(output, error) from error
     if MARK not in head:
         raise BagError(
-            f"{output}: file exists and is not a report, so it is not overwritten; give another "
+            f"{output}: the file is not a report, so it is not overwritten; give another "
             "file with -o"
         )
 

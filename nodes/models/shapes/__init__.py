@@ -34,9 +34,11 @@ from flexsheet.nodes.models.shapes.triangles import MeshError
 def make_shape(geometry: Mapping[str, Any]) -> Shape:
     """Make the shape that a geometry describes, as in `make_shape(dict(scene.object.geometry))`.
 
-    geometry: the key `shape` is the name of the shape, `origin` is ignored, and the other keys are
-    its dimensions. Raises KeyError for an unknown name and ValueError (for meshes its subclass
-    MeshError) for invalid dimensions.
+    geometry: the key `shape` is the name of the shape, the key `origin` is ignored, and the other
+        keys are the dimensions.
+
+    Raises KeyError for an unknown name, and ValueError (for meshes its subclass MeshError) for
+    invalid dimensions.
     """
     dimensions = {key: value for key, value in geometry.items() if key not in ("shape", "origin")}
     return GEOMETRIES[geometry["shape"]].make_shape(**dimensions)

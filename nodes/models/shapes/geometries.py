@@ -1,8 +1,8 @@
 """Describe each kind of geometry in one table, `GEOMETRIES`.
 
-The functions in a description receive the dimensions of a geometry. These are an object with the
-dimensions as attributes, such as `scene.object.geometry` or the shape itself. To add a kind of
-geometry, write its shape class and add a description to the table.
+The functions in a description receive the dimensions of a geometry as an object with attributes,
+such as `scene.object.geometry` or the shape itself. A new kind of geometry needs a shape class and
+a description in the table.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from flexsheet.nodes.models.shapes.solids import (
 from flexsheet.nodes.models.shapes.surface import Shape
 
 INNER_RATIO = 0.8
-"""Size of the undistorted lattice inside the mesh of a round solid over the size of the solid."""
+"""The size of the undistorted lattice inside the mesh of a round solid, over the solid's size."""
 
 
 @dataclass(frozen=True, slots=True)
 class CuboidMap:
-    """Map from the surface of the cube [-1, 1]^3 to the surface of a solid, used for meshing.
+    """A map from the surface of the cube [-1, 1]^3 to the surface of a solid, used for meshing.
 
     half_m: half extents (3,) of the solid.
-    inner_m: half extents (3,) that the whole lattice would have if it were nowhere distorted.
-    surface: function that maps points (n, 3) on the cube to points (n, 3) on the solid.
-    is_round: true if the whole surface is curved, as on an ellipsoid; false if it has flat faces.
+    inner_m: half extents (3,) of the whole lattice if no part of it were distorted.
+    surface: function that maps points (n, 3) on the cube to points (n, 3) on the solid, m.
+    is_round: whether the whole surface is curved, as on an ellipsoid; false if it has flat faces.
     """
 
     half_m: Floats
@@ -46,15 +46,16 @@ class CuboidMap:
 
 @dataclass(frozen=True, slots=True)
 class GeometryDescription:
-    """Description of one kind of geometry by functions of its dimensions.
+    """A description of one kind of geometry by functions of its dimensions.
 
-    make_shape: makes the shape; the dimensions are its keyword arguments.
-    bounds_m: returns the lower and upper corner (3,) of the bounding box of the solid. For a
-        half-space it is that of the touchable rectangle.
-    extent_m: returns how far the touchable surface extends from the origin along a unit vector.
-    scale: returns the dimensions that change if the geometry is scaled by a ratio.
-    cuboid_map: returns the map for meshing, given dimensions and shape; None if the shape is meshed
-        by another method.
+    make_shape: function that makes the shape; the dimensions are its keyword arguments.
+    bounds_m: function that returns the lower and upper corner (3,) of the bounding box of the
+        solid. For a half-space, it is the bounding box of the rectangle that can be touched.
+    extent_m: function that returns how far the touchable surface extends from the origin along a
+        unit vector.
+    scale: function that returns the changed dimensions if the geometry is scaled by a ratio.
+    cuboid_map: function that returns the map for meshing, given dimensions and shape; None if the
+        shape is meshed by another method.
     """
 
     make_shape: Callable[..., Shape]
@@ -65,12 +66,12 @@ class GeometryDescription:
 
 
 def map_round_solid(half_m: Floats) -> CuboidMap:
-    """Return the map of an ellipsoid with half extents (3,), centred on the origin."""
+    """Return the map for meshing an ellipsoid with half extents (3,), m, centred on the origin."""
     return CuboidMap(half_m, INNER_RATIO * half_m, lambda w: half_m * cube_to_sphere(w), True)
 
 
 def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
-    """Return the map that moves points on a box to the nearest points of a box-like solid.
+    """Return the map for meshing that moves points on a box to their nearest points on `shape`.
 
     half_m (3,): half extents of the box.
     """
@@ -80,8 +81,8 @@ def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
 def cube_to_sphere(w: Floats) -> Floats:
     """Map points w (n, 3) on the surface of the cube [-1, 1]^3 to the unit sphere.
 
-    The map is smooth and nearly area-preserving. Its first coordinate is
-    w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3); the others follow by cyclic permutation.
+    The map is smooth and nearly area-preserving. Its first coordinate is w1 sqrt(1 - w2^2/2 -
+    w3^2/2 + w2^2 w3^2/3). The other coordinates follow by cyclic permutation.
     """
     square = np.square(w)
     second, third = np.roll(square, -1, axis=1), np.roll(square, -2, axis=1)
@@ -98,7 +99,7 @@ def _cylinder_bounds(cylinder: Any) -> tuple[Floats, Floats]:
 
 
 def _cylinder_extent(cylinder: Any, direction: Floats) -> float:
-    """Return the extent of the side of a cylinder, because its end caps cannot be touched."""
+    """Return the extent (m) of the side of a cylinder, whose end caps cannot be touched."""
     return float(cylinder.radius_m * np.hypot(direction[1], direction[2]))
 
 
@@ -172,4 +173,4 @@ GEOMETRIES: dict[str, GeometryDescription] = {
         scale=_scale_mesh,
     ),
 }
-"""Descriptions by name; scene files give the name in `object.geometry.shape`."""
+"""The descriptions of the geometries, by the name in `object.geometry.shape` of scene files."""

@@ -10,13 +10,13 @@ normal along the surface). With d = x - p_i, the signed distance of a point x to
 s_i(x) = n_i d + d A_i d / 2.
 2. Blending (partition of unity; Ohtake et al., Multi-level Partition of Unity Implicits, 2003):
 f(x) = sum w_i s_i / sum w_i. The weights are w_i = (1 - t_i)^4 with t_i = (d d + 3 (n_i d)^2) /
-rho^2, and w_i = 0 for t_i > 1. The surface is f = 0. The region t_i < 1, in which a jet has weight,
-is its support.
+rho^2, and w_i = 0 for t_i > 1. The surface is f = 0. The support of a jet is the region t_i < 1, in
+which its weight is not zero.
 
 f is three times continuously differentiable, so the normal has a continuous second derivative along
-a path. Supports are half as thick along the normal as across it, so that the two sides of a thin
-part do not affect each other. Edges sharper than `rho` are rounded over about that length;
-`deviation_m` measures the resulting distance between surface and mesh.
+a path. Supports are half as thick along the normal as across it, so the two sides of a thin part do
+not affect each other. Edges sharper than `rho` are rounded over about that length. `deviation_m`
+measures the resulting distance between surface and mesh.
 """
 
 from __future__ import annotations
@@ -48,43 +48,51 @@ from flexsheet.nodes.models.shapes.triangles import (
 )
 
 FLATNESS = 3.0
-"""Flatness of a jet's support: it extends 1 / sqrt(1 + FLATNESS) as far along the jet's normal as
-across it."""
+"""The flatness of a jet's support.
+
+The support extends 1 / sqrt(1 + FLATNESS) as far along the jet's normal as across it.
+"""
 FIT_RATIO = 1.25
-"""Radius around a jet within which vertices are used for its fit, divided by `rho`."""
+"""The radius around a jet within which vertices are used for its fit, divided by `rho`."""
 SPACING_RATIO = 1.0 / 3.0
-"""Minimum distance between jets on the same side of the surface, divided by `rho`."""
+"""The minimum distance between jets on the same side of the surface, divided by `rho`."""
 MIN_NORMAL_COSINE = 0.2
-"""Minimum cosine of the angle between the normals of a jet and of a vertex used for its fit."""
+"""The minimum cosine of the angle between the normals of a jet and of a vertex used for its fit."""
 MAX_CURVATURE_RATIO = 2.0
-"""Maximum curvature of a jet (1/m), multiplied by `rho`."""
+"""The maximum curvature of a jet (1/m), multiplied by `rho`."""
 EDGE = 1.5
-"""Curvature above which a point counts as an edge, divided by the maximum curvature of a jet."""
+"""The curvature above which a point counts as an edge, divided by a jet's maximum curvature."""
 OFF_ONE, FAR_OFF_ONE = 0.35, 0.6
-"""Limits of | |grad f| - 1 |, which is 0 where neighbouring jets agree. Above the first limit, jets
-with different normals meet at an edge. Above the second, the point with f = 0 is an artefact beyond
-the rim of a thin part, and not on the surface."""
+"""The limits of | |grad f| - 1 |, which is 0 where neighbouring jets agree.
+
+Above the first limit, jets with different normals meet at an edge. Above the second limit, the
+point with f = 0 is an artefact beyond the rim of a thin part, and not on the surface.
+"""
 MIN_SUPPORT = 0.1
-"""Minimum sum of the weights w_i on the surface; it is smaller only beyond a rim."""
+"""The minimum sum of the weights w_i on the surface. The sum is smaller only beyond a rim."""
 MEMBERS_KNOWN = 0.1
-"""Distance that a point may move, divided by `rho`, before its list of nearby jets is updated."""
+"""The distance that a point may move before its list of nearby jets is updated, over `rho`."""
 STRIDE_RATIO = 0.4
-"""Maximum step of the projection divided by `rho`; it keeps the iteration within the supports."""
+"""The maximum step of the projection, divided by `rho`. It keeps the iteration in the supports."""
 REST_RATIO = 1e-3
-"""Step, divided by `rho`, below which the projection has converged. The remaining error is some
-nanometres and about 1e-5 rad."""
+"""The step, divided by `rho`, below which the projection has converged.
+
+The remaining error is some nanometres and about 1e-5 rad.
+"""
 APART_RATIO = 0.4
-"""Distance above which two nearest points count as distinct, divided by `rho`."""
+"""The distance above which two nearest points count as distinct, divided by `rho`."""
 MAX_DEVIATION_RATIO = 0.22
-"""Maximum distance between the surface and the mesh, divided by `rho`."""
+"""The maximum distance between the surface and the mesh, divided by `rho`."""
 MAX_EXTENT_FRACTION = 1.0 / 3.0
 MAX_STARTS = 6
-"""Maximum number of additional starting points in the search for the global nearest point."""
+"""The maximum number of additional starting points in the search for the global nearest point."""
 MIN_CURVATURE_FACTOR = 0.1
-"""Lower bound on the eigenvalues of I + h A (h: height above the jet, A: its shape operator), which
-vanish at a centre of curvature."""
+"""The lower bound on the eigenvalues of I + h A (h: height above the jet, A: shape operator).
+
+These eigenvalues vanish at a centre of curvature.
+"""
 RIM_FRACTION = 0.8
-"""Fraction of the radius beyond which `rise_m` reduces the weight of heights."""
+"""The fraction of the radius beyond which `rise_m` reduces the weight of heights."""
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
@@ -93,9 +101,11 @@ if TYPE_CHECKING:
 
 
 def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
-    """Return the default smoothing length of a mesh: 1.75 times its median edge length, m.
+    """Return the default smoothing length (m) of a mesh: 1.75 times its median edge length.
 
-    With a shorter length, the facets would still be noticeable. With a longer one, curved parts
+    vertices (v, 3), m; triangles (t, 3).
+
+    With a shorter length, the facets would still be noticeable. With a longer length, curved parts
     would be flattened. `benchmarks.shapes` measures both effects.
     """
     run = half_edges(triangles)
@@ -104,13 +114,15 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
 
 
 class SmoothMeshShape:
-    """Closed mesh, smoothed over the length `smoothing_m`; see the module docstring."""
+    """A closed mesh that is smoothed over the length `smoothing_m`."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
         """Fit the local quadratics (jets) that define the smooth surface of a closed mesh.
 
+        vertices_m (v, 3), triangles (t, 3): mesh. smoothing_m: smoothing length.
+
         Raises MeshError for a mesh that does not bound a solid or is too small for the smoothing
-        length, and ValueError for a length that is not positive.
+        length, and ValueError for a smoothing length that is not positive.
         """
         check_positive(smoothing_m=smoothing_m)
         vertices = np.asarray(vertices_m, dtype=np.float64)
@@ -161,7 +173,7 @@ class SmoothMeshShape:
         """Find the nearest points, as specified by `Shape.closest`.
 
         `on_edge` is true where the curvature exceeds `EDGE * MAX_CURVATURE_RATIO / smoothing_m`.
-        This is the case at rims thinner than `smoothing_m` and at rounded edges, over which a sheet
+        This happens at rims thinner than `smoothing_m` and at rounded edges, over which a sheet
         cannot roll. `undecided` is true where two distinct surface points are equally near.
         """
         queries = check_points(points)
@@ -202,9 +214,10 @@ class SmoothMeshShape:
         return self.closest(points).height_m
 
     def _continue_from(self, query: Floats, before: Floats) -> Nearest | None:
-        """Find the nearest point of one query (3,), starting at the previous point `before` (3,).
+        """Find the nearest point of a query (3,), starting at the previous nearest point `before`
+        (3,).
 
-        Returns None if the projection does not converge.
+        Return None if the projection does not converge.
         """
         feet = self._descend_one(query, before)
         if not feet.is_nearest[0]:
@@ -221,7 +234,8 @@ class SmoothMeshShape:
         )
 
     def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
-        """Return the nearest points of queries (n, 3), and whether each one is ambiguous (n,).
+        """Return the nearest points of queries (n, 3), and whether each nearest point is ambiguous
+        (n,).
 
         before: nearest points (n, 3) of the previous queries, or None.
         """
@@ -236,11 +250,12 @@ class SmoothMeshShape:
         return feet, undecided
 
     def _find_global_nearest(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
-        """Return the global nearest points of queries (n, 3), and whether each is ambiguous (n,).
+        """Return the global nearest points of queries (n, 3), and whether each of them is ambiguous
+        (n,).
 
-        First, each query is projected from its nearest jet, which gives a point at a distance D.
-        Any nearer point has a jet within the radius `_cover` = c. Because curvature is bounded,
-        that jet is at most sqrt(D^2 + c^2 (1 + 4 D / rho)) from the query. Among the jets in this
+        Each query is projected from its nearest jet, which gives a point at a distance D. Any
+        nearer point has a jet within the radius `_cover` = c. Because curvature is bounded, that
+        jet is at most sqrt(D^2 + c^2 (1 + 4 D / rho)) from the query. Among the jets in this
         radius, `_select_starts` chooses the starting points of further projections.
         """
         nearest, rho = self._tree.query(queries)[1], self.smoothing_m
@@ -279,12 +294,12 @@ class SmoothMeshShape:
     ) -> tuple[Indices, Indices]:
         """Choose further starting points for the search for a nearer surface point.
 
-        lists: indices of the candidate jets (local quadratic fits) of each query. feet (n, 3),
-        distance (n,): nearest points found so far and their distances. Returns k pairs: indices of
-        the queries (k,) and of the jets (k,) at which to start.
+        lists: indices of the candidate jets (local quadratic fits) of each query.
+        feet (n, 3), distance (n,): nearest points found so far, m, and their distances, m.
 
-        A jet is chosen if the nearest point on its quadratic is close to the jet and not much
-        farther than `distance`. Jets within `rho` of `feet` or of a chosen jet are left out.
+        Return k pairs: indices of the queries (k,) and of the jets (k,) at which to start. A jet is
+            chosen if the nearest point on its quadratic is close to the jet and not much farther
+            than `distance`. Jets within `rho` of `feet` or of a chosen jet are omitted.
         """
         rows = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
         jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
@@ -335,7 +350,7 @@ class SmoothMeshShape:
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
         """Return how far the object rises above its tangent plane at a surface point, m.
 
-        See `Shape.rise_m`. The height is evaluated only at the centres of the local quadratic fits.
+        This implements `Shape.rise_m`. The height is evaluated only at the centres of the jets.
         """
         offset = self._centre[:-1] - point
         height = offset @ normal
@@ -347,7 +362,7 @@ class SmoothMeshShape:
         return float((height[within] * np.minimum(weight, 1.0)).max())
 
     def _on_jet(self, queries: Floats, jet: Indices) -> Floats:
-        """Return approximate nearest points (n, 3) of queries on the quadratics of jets (n,)."""
+        """Return the approximate nearest points (n, 3) of queries (n, 3) on the jets (n,)."""
         normal, operator = self._normal[jet], self._operator[jet]
         offset = queries - self._centre[jet]
         height = (offset * normal).sum(1)[:, None]
@@ -361,11 +376,13 @@ class SmoothMeshShape:
         return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
 
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
-        """List, for each jet, the jets that have weight in its neighbourhood.
+        """List, for each jet, the jets whose weight is not zero in its neighbourhood.
 
-        cover (j,): radius of the neighbourhood of each jet. Returns a table (j, k) of jet indices
-        and the number (j,) of valid entries in each row. Rows are padded with the index of a
-        far-away jet without influence, which this method appends to the jets.
+        cover (j,): radius of the neighbourhood of each jet, m.
+
+        Return a table (j, k) of jet indices, and the number (j,) of valid entries in each row. Rows
+        are padded with the index of a far-away jet without influence, which this method appends to
+        the jets.
         """
         reach = self.smoothing_m + cover + MEMBERS_KNOWN * self.smoothing_m
         lists = self._tree.query_ball_point(self._centre, reach)
@@ -379,7 +396,7 @@ class SmoothMeshShape:
         return table, counts
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate f at points (n, 3) near the surface; this implements a `LevelSet`.
+        """Evaluate f at points (n, 3) near the surface. This implements a `LevelSet`.
 
         The last result (n,) is the sum of the weights w_i.
         """
@@ -421,10 +438,11 @@ class SmoothMeshShape:
         return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
 
     def surroundings(self, point: Floats) -> tuple[int, Indices, Floats, Floats, Floats]:
-        """Return the index of the jet nearest to a point (3,), and the k jets with weight near it.
+        """Return the index of the jet nearest to a point (3,), and the k jets with weight near the
+        point.
 
-        The latter are given as indices (k,), centres (k, 3), normals (k, 3) and shape operators
-        (k, 3, 3).
+        The k jets are given as indices (k,), centres (k, 3), normals (k, 3) and shape operators (k,
+        3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
@@ -438,9 +456,9 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """Function (`LevelAt`) that evaluates f of a `SmoothMeshShape` along one projection.
+    """A function (`LevelAt`) that evaluates f of a `SmoothMeshShape` along one projection.
 
-    To save time, the list of nearby local fits (jets) is updated only when the point has moved by
+    To save time, the list of nearby jets is updated only when the point has moved by
     `MEMBERS_KNOWN` times `rho`.
     """
 
@@ -486,7 +504,7 @@ class _LevelNear:
 def _on_surface_only(feet: SurfaceProjections) -> SurfaceProjections:
     """Clear `is_nearest` for projections that ended beyond the rim of a thin part.
 
-    There, f = 0 does not represent the surface.
+    Beyond a rim, f = 0 does not represent the surface.
     """
     beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
     feet.is_nearest[beyond_rim | (feet.support < MIN_SUPPORT)] = False
@@ -507,7 +525,10 @@ def _put(
 
 
 def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Floats, Floats]:
-    """Fit local quadratics; return centres (j, 3), normals (j, 3), shape operators (j, 3, 3)."""
+    """Fit the jets of a mesh. Return centres (j, 3), normals (j, 3) and shape operators (j, 3, 3).
+
+    rho: smoothing length, m.
+    """
     rough = vertex_normals(vertices, triangles)
     from scipy.spatial import cKDTree
 
@@ -528,9 +549,10 @@ def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Flo
 
 
 def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
-    """Select vertices such that no two on the same side of the surface are closer than `spacing`.
+    """Return the indices of vertices that are at least `spacing` (m) apart on each side of the
+    surface.
 
-    Every other vertex has a selected vertex within that distance. Returns the selected indices.
+    Every other vertex has a selected vertex within that distance on the same side.
     """
     selected, covered = [], np.zeros(len(vertices), dtype=bool)
     for vertex in range(len(vertices)):
@@ -559,9 +581,9 @@ def _jet(
 ) -> tuple[Floats, Floats, Floats]:
     """Fit a quadratic z(x, y) to the points `around` (m, 3) by weighted least squares.
 
-    origin, rough (3,): vertex and approximate normal, which defines the z axis. Lengths are scaled
-    by the radius of the fit. If there are too few points, the solution of minimum norm is used.
-    Returns the centre (3,), the normal (3,) and the shape operator (3, 3).
+    origin, rough (3,): vertex and approximate normal, which is the z axis. Lengths are scaled by
+        the radius of the fit. If there are too few points, the solution of minimum norm is used.
+        Return the centre (3,), the normal (3,) and the shape operator (3, 3).
     """
     reach = FIT_RATIO * rho
     first = np.cross(rough, _IDENTITY[np.abs(rough).argmin()])

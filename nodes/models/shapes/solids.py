@@ -1,6 +1,6 @@
-"""Define the shapes of virtual objects that have formulas: cylinder, sphere, plane, ellipsoid, box.
+"""Define the virtual objects with simple formulas: cylinder, sphere, plane, ellipsoid and box.
 
-Each class implements the interface `Shape` of `surface`, where the terms are defined.
+Each class implements the interface `Shape` of the module `surface`, which defines the terms.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _IDENTITY = np.eye(3)
 
 @dataclass(frozen=True, slots=True)
 class CylinderShape(Convex):
-    """Circular cylinder about the x axis, centred on the origin.
+    """A circular cylinder about the x axis, centred on the origin.
 
     Only the side can be touched, because the sheet is clamped along x. For a finger beyond an end
     cap, the nearest point is on the rim of the side, and `on_edge` is true.
@@ -42,7 +42,10 @@ class CylinderShape(Convex):
         check_positive(radius_m=self.radius_m, length_m=self.length_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the nearest points, as specified by `Shape.closest`; ambiguous on the axis."""
+        """Find the nearest points, as specified by `Shape.closest`.
+
+        They are ambiguous on the axis.
+        """
         queries = check_points(points)
         radial = queries * np.array([0.0, 1.0, 1.0])
         normal, radius, undecided = _directions(radial, previous, queries, across=(1, 2))
@@ -56,7 +59,7 @@ class CylinderShape(Convex):
         return Nearest(point, normal, radius - self.radius_m, operator, beyond, undecided)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distances to the solid with its end caps, see `Shape`."""
+        """Return the signed distances (m) to the solid, including its end caps."""
         queries = check_points(points)
         aside = np.hypot(queries[..., 1], queries[..., 2]) - self.radius_m
         beyond = np.abs(queries[..., 0]) - 0.5 * self.length_m
@@ -64,13 +67,13 @@ class CylinderShape(Convex):
         return np.asarray(outside + np.minimum(np.maximum(aside, beyond), 0.0))
 
     def angle_rad(self, point: Floats) -> float:
-        """Return the angle of a point (3,) about the axis, rad: 0 on +z, positive towards +y."""
+        """Return the angle (rad) of a point (3,) about the axis: 0 on +z, positive towards +y."""
         return float(np.arctan2(point[1], point[2]))
 
 
 @dataclass(frozen=True, slots=True)
 class SphereShape(Convex):
-    """Sphere centred on the origin."""
+    """A sphere centred on the origin."""
 
     radius_m: float
 
@@ -78,7 +81,10 @@ class SphereShape(Convex):
         check_positive(radius_m=self.radius_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the nearest points, as specified by `Shape.closest`; ambiguous at the centre."""
+        """Find the nearest points, as specified by `Shape.closest`.
+
+        They are ambiguous at the centre.
+        """
         queries = check_points(points)
         normal, radius, undecided = _directions(queries, previous, queries, across=(0, 1, 2))
         operator = (_IDENTITY - _outer(normal)) / self.radius_m
@@ -87,13 +93,12 @@ class SphereShape(Convex):
         return Nearest(point, normal, radius - self.radius_m, operator, nowhere, undecided)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distances, as specified by `Shape.signed_distance`."""
         return np.asarray(np.linalg.norm(check_points(points), axis=-1) - self.radius_m)
 
 
 @dataclass(frozen=True, slots=True)
 class PlaneShape(Convex):
-    """Half-space z <= 0 that can be touched on a rectangle of its face, centred on the origin."""
+    """A half-space z <= 0 that can be touched on a rectangle of its face, centred on the origin."""
 
     width_m: float
     height_m: float
@@ -104,7 +109,7 @@ class PlaneShape(Convex):
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """Find the nearest points, as specified by `Shape.closest`.
 
-        `on_edge` is true beyond the rectangle, whose width is along x and height along y.
+        `on_edge` is true beyond the rectangle, whose width is along x and whose height is along y.
         """
         queries = check_points(points)
         check_previous(previous, queries)
@@ -119,13 +124,13 @@ class PlaneShape(Convex):
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distances to the whole half-space, see `Shape.signed_distance`."""
+        """Return the signed distances (m) to the whole half-space, not only to the rectangle."""
         return check_points(points)[..., 2].copy()
 
 
 @dataclass(frozen=True, slots=True)
 class EllipsoidShape(Convex):
-    """Ellipsoid centred on the origin with semi-axes along x, y and z."""
+    """An ellipsoid centred on the origin, with semi-axes along x, y and z."""
 
     semi_axes_m: tuple[float, float, float]
 
@@ -134,7 +139,10 @@ class EllipsoidShape(Convex):
             check_positive(**{f"semi_axes_m ({axis})": length})
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the nearest points, as specified by `Shape.closest`; see `_undecided`."""
+        """Find the nearest points, as specified by `Shape.closest`.
+
+        `_undecided` defines where they are ambiguous.
+        """
         queries = check_points(points)
         before = check_previous(previous, queries)
         flat = queries.reshape(-1, 3)
@@ -176,11 +184,10 @@ class EllipsoidShape(Convex):
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distances, as specified by `Shape.signed_distance`."""
         return self.closest(points).height_m
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """Evaluate a quadratic that is zero on the ellipsoid: value, gradient, Hessian and ones."""
+        """Evaluate a quadratic function that is zero on the ellipsoid, as a `LevelSet`."""
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)
@@ -190,7 +197,7 @@ class EllipsoidShape(Convex):
     def _level_at(
         self, point: Triple
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
-        """Evaluate the function of `_level` at a single point; this implements a `LevelAt`."""
+        """Evaluate the function of `_level` at a single point, as a `LevelAt`."""
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
         value = 0.5 * (x * x * p + y * y * q + z * z * r - 1.0)
@@ -215,10 +222,10 @@ class EllipsoidShape(Convex):
 
         With the semi-axes e_i, the nearest point to a query q is x_i = e_i^2 q_i / (t + e_i^2). t
         is the largest root of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to
-        an Ellipsoid, 2013). Newton's method is applied to the reciprocal of the root of this sum,
-        which is concave in t, so it converges monotonically (Conn, Gould, Toint, Trust-Region
-        Methods, sec. 7.3). On a plane of symmetry the terms have poles. Queries there are therefore
-        moved by a billionth of the shortest axis in the directions `sides` (n, 3).
+        an Ellipsoid, 2013). Newton's method is applied to the reciprocal of the square root of this
+        sum, which is concave in t, so the method converges monotonically (Conn, Gould, Toint,
+        Trust-Region Methods, sec. 7.3). On a plane of symmetry the terms have poles. Queries there
+        are therefore moved by a billionth of the shortest axis in the directions `sides` (n, 3).
         """
         axes = np.array(self.semi_axes_m)
         nudge = 1e-9 * axes.min()
@@ -243,11 +250,13 @@ class EllipsoidShape(Convex):
 
 @dataclass(frozen=True, slots=True)
 class RoundedBoxShape(Convex):
-    """Box centred on the origin, with rounded edges and corners.
+    """A box centred on the origin, with rounded edges and corners.
 
     size_m: full extents along x, y and z, including the rounding. edge_radius_m: radius of edges
-    and corners, at most half of the smallest extent. The normal is continuous along the surface;
-    the curvature is not. In the methods, the core is the box of all centres of this radius.
+        and corners, at most half of the smallest extent.
+
+    The normal is continuous along the surface, but the curvature is not. The core is the box that
+    contains all centres of the edge radius.
     """
 
     size_m: tuple[float, float, float]
@@ -304,7 +313,6 @@ class RoundedBoxShape(Convex):
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distances, as specified by `Shape.signed_distance`."""
         away = np.abs(check_points(points)) - self._core()
         outside = np.linalg.norm(np.maximum(away, 0.0), axis=-1)
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
@@ -318,10 +326,12 @@ class RoundedBoxShape(Convex):
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
         """Return the face of the core that is nearest to each query (n, 3) inside the core.
 
-        before: previous nearest points (n, 3), or None; with them, only faces at these points are
-        considered. Otherwise the first of equally near faces in the order z, y, x, -z, -y, -x is
-        chosen. Returns the axis (n,) and the sign (n,) of its normal, the distance from the face
-        (n,), and whether the choice is ambiguous (n,).
+        before: previous nearest points (n, 3), or None. If given, only faces at these points are
+            considered. Otherwise, among equally near faces, the first in the order z, y, x, -z, -y,
+            -x is chosen.
+
+        Return the axis (n,) and the sign (n,) of the face's normal, the distance from the face
+        (n,), m, and whether the choice is ambiguous (n,).
         """
         core = self._core()
         # Columns z, y, x, -z, -y, -x.
@@ -348,10 +358,10 @@ def _outer(normal: Floats) -> Floats:
 def _directions(
     offsets: Floats, previous: ArrayLike | None, queries: Floats, *, across: tuple[int, ...]
 ) -> tuple[Floats, Floats, Bools]:
-    """Return unit directions and lengths of offsets from an axis or a centre, and which are zero.
+    """Return unit directions and lengths of offsets (..., 3), and whether each offset is zero.
 
     across: indices of the coordinates in which the offsets may differ from zero. For a zero offset,
-    the direction is that of the previous point, or else `FRONT`.
+        the direction is that of the previous point, or else `FRONT`.
     """
     before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)

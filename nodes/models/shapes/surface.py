@@ -1,11 +1,11 @@
 """Define the interface of shapes: nearest surface points with normals and curvature.
 
-Points are arrays (3,) or (n, 3) in the frame of the object, m; results have the same leading shape.
-A query is a point for which the nearest surface point is sought. Normals point out of the object.
-Curvature is given as the shape operator W, a symmetric 3x3 matrix. It maps a small displacement dp
-along the surface to the change of the unit normal n: dn = W dp, and W n = 0. Its two other
-eigenvalues are the principal curvatures, positive where the object is convex (do Carmo,
-Differential Geometry of Curves and Surfaces, ch. 3).
+Points are arrays (3,) or (n, 3) in the frame of the object, m. Results have the same leading shape.
+A query is a point for which the nearest surface point is searched. Normals point out of the object.
+The curvature is given as the shape operator W, a symmetric matrix (3, 3). For a small displacement
+dp along the surface, the unit normal n changes by dn = W dp, and W n = 0. The two other eigenvalues
+of W are the principal curvatures, positive where the object is convex (do Carmo, Differential
+Geometry of Curves and Surfaces, ch. 3).
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ from numpy.typing import ArrayLike
 from flexsheet.nodes.arrays import Bools, Floats
 
 EQUAL_DISTANCE_M = 1e-6
-"""Maximum difference between two distances that are considered equal."""
+"""The maximum difference between two distances that are considered equal."""
 
 MAX_QUERY_M = 1e6
-"""Maximum absolute coordinate of a query."""
+"""The maximum absolute coordinate of a query."""
 
 FRONT = np.array([0.0, 0.0, 1.0])
-"""Direction in which the nearest point is chosen if several surface points are equally near and
-there is no previous point. It points to the user if the object is not rotated."""
+"""The direction in which the nearest point is chosen if several surface points are equally near.
+
+It is used if there is no previous point. It points to the user if the object is not rotated.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Nearest:
-    """Touchable surface points nearest to queries; arrays have the leading shape of the queries.
+    """The touchable surface points that are nearest to queries.
 
-    point, normal: nearest point, m, and unit normal there (..., 3).
-    height_m: height of the query above the tangent plane at `point`, negative below it. It equals
-        the signed distance, except past an end of the surface.
+    point, normal: nearest point, m, and unit normal at this point (..., 3).
+    height_m: height (...) of the query above the tangent plane at `point`, negative below it. The
+        height equals the signed distance, except past an end of the surface.
     shape_operator: shape operator (..., 3, 3) at `point`, 1/m.
     on_edge: whether `point` is on the rim of the touchable surface and the query is past that rim,
         or `point` is on an edge of a mesh. A sheet can be tangent there but cannot roll over it.
@@ -54,15 +56,15 @@ class Nearest:
 
 
 class Shape(Protocol):
-    """Interface of a solid with a touchable surface."""
+    """The interface of a solid with a touchable surface."""
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the touchable surface points nearest to `points`.
+        """Find the touchable surface points that are nearest to `points`.
 
-        previous: nearest points of the previous queries, with the shape of `points`; None for a
-            new contact. They make the results continuous over time. The local nearest point that
-            continues a previous one is returned as long as it exists. This holds even if another
-            point is equally near, or, inside the object, nearer.
+        previous: nearest points of the previous queries, with the shape of `points`; None for a new
+            contact. They make the results continuous over time: the local nearest point that
+            continues a previous point is returned as long as it exists, even if another point is
+            equally near or, inside the object, nearer.
 
         Raises ValueError for points that are not finite, not of shape (3,) or (n, 3), or beyond
         `MAX_QUERY_M`.
@@ -70,16 +72,18 @@ class Shape(Protocol):
         ...
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distance (m) to the solid, negative inside.
+        """Return the signed distances (m) of points to the solid, which are negative inside.
 
-        Raises the errors of `closest`.
+        Raises ValueError for invalid points, like `closest`.
         """
         ...
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
         """Return how far the object rises above its tangent plane at a surface point (3,), m.
 
-        Only the surface within `radius_m` of the point, measured along the plane, is considered.
+        normal (3,): unit normal at the point. radius_m: maximum considered distance from the point,
+            measured along the plane.
+
         The result is 0 where the object is not concave. Heights near the limit of the radius are
         reduced, so that the result changes continuously with the point.
         """
@@ -87,7 +91,7 @@ class Shape(Protocol):
 
 
 class Convex:
-    """Base class of convex solids."""
+    """The base class of convex solids."""
 
     __slots__ = ()
 
@@ -99,8 +103,8 @@ class Convex:
 def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats, Floats]:
     """Return the principal curvatures (..., 2), ascending, 1/m, and their directions (..., 2, 3).
 
-    The directions are unit tangents. Where both curvatures are equal, they are any perpendicular
-    pair.
+    normal (..., 3): unit normal. The directions are unit tangents. If both curvatures are equal,
+        any two perpendicular directions are returned.
     """
     # The eigenvalue of the normal is zero; shift it above the principal curvatures.
     bound = 1.0 + np.linalg.norm(shape_operator, axis=(-2, -1))
@@ -112,8 +116,8 @@ def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats
 def tightest_curvature(shape_operator: Floats) -> float:
     """Return the larger principal curvature (1/m) of a shape operator (3, 3).
 
-    It is computed from the sum of both curvatures (trace) and the sum of their squares (squared
-    Frobenius norm).
+    The trace of the operator is the sum of both curvatures, and its squared Frobenius norm is the
+    sum of their squares.
     """
     total = float(np.einsum("ii", shape_operator))
     squares = float(np.einsum("ij,ij", shape_operator, shape_operator))
@@ -133,29 +137,29 @@ def projection_jacobian(found: Nearest) -> Floats:
 
 
 def check_points(points: ArrayLike, name: str = "points") -> Floats:
-    """Return points as a float array (3,) or (n, 3); raise ValueError if they are invalid.
+    """Return points as a float array. Raises ValueError if they are invalid.
 
     name: name of the argument in error texts.
     """
     array = np.asarray(points, dtype=np.float64)
     if array.ndim not in (1, 2) or array.shape[-1] != 3:
-        raise ValueError(f"{name}: expected shape (3,) or (n, 3), found {array.shape}")
+        raise ValueError(f"{name}: the shape is {array.shape}, expected (3,) or (n, 3)")
     # A comparison with NaN is false, hence the double negation.
     if array.size and not (np.abs(array) <= MAX_QUERY_M).all():
         raise ValueError(
-            f"{name}: contains NaN, infinity or positions beyond {MAX_QUERY_M:g} m; give finite "
-            "coordinates in metres"
+            f"{name}: the array contains NaN, infinity or coordinates beyond {MAX_QUERY_M:g} m; "
+            "give finite coordinates in metres"
         )
     return array
 
 
 def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
-    """Return previous points as floats; raise ValueError if their shape differs from `points`."""
+    """Return previous points as floats. Raises ValueError if their shape differs from `points`."""
     if previous is None:
         return None
     array = check_points(previous, "previous")
     if array.shape != points.shape:
-        raise ValueError(f"previous: expected shape {points.shape}, found {array.shape}")
+        raise ValueError(f"previous: the shape is {array.shape}, expected {points.shape}")
     return array
 
 
@@ -167,19 +171,21 @@ def check_positive(**lengths_m: float) -> None:
 
 
 LevelSet = Callable[[Floats], tuple[Floats, Floats, Floats, Floats]]
-"""Function f of points (n, 3) that describes a surface by f = 0 and increases outwards.
+"""A function f of points (n, 3) that describes a surface by f = 0 and increases outwards.
 
 It returns values (n,), gradients (n, 3), Hessians (n, 3, 3) and support (n,). The support is a
-measure of how well f is defined at a point; 0 means that the surface is far away."""
+measure of how well f is defined at a point; 0 means that the surface is far away.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceProjections:
-    """Results of n projections of queries onto a surface.
+    """The results of projecting n queries onto a surface.
 
-    point, normal (n, 3): surface points, m, and normals. shape_operator (n, 3, 3): 1/m. steepness,
-    support (n,): length of the gradient of the `LevelSet`, and its support. is_nearest (n,):
-    whether the projection converged to a local minimum of the distance.
+    point, normal (n, 3): surface points, m, and unit normals.
+    shape_operator (n, 3, 3): shape operators, 1/m.
+    steepness, support (n,): length of the gradient of the `LevelSet`, and its support.
+    is_nearest (n,): whether the projection converged to a local minimum of the distance.
     """
 
     point: Floats
@@ -192,22 +198,26 @@ class SurfaceProjections:
 
 MAX_STEPS = 25
 MIN_EIGENVALUE = 0.02
-"""Lower bound on the absolute eigenvalues of the reduced Hessian, which are 1 on a flat surface.
-They approach 0 near a centre of curvature, where a Newton step would be too long; beyond it, they
-are negative."""
+"""The lower bound on the absolute eigenvalues of the reduced Hessian, which are 1 on a flat
+surface.
+
+The eigenvalues approach 0 near a centre of curvature, where a Newton step would be too long. Beyond
+it, they are negative.
+"""
 
 
 def descend(
     level: LevelSet, queries: Floats, starts: Floats, *, stride_m: float, rest_m: float
 ) -> SurfaceProjections:
-    """Project `queries` (n, 3) to their nearest surface points, starting at `starts` (n, 3).
+    """Project `queries` (n, 3) to their nearest surface points, starting at `starts` (n, 3), m.
+
+    stride_m: maximum step. rest_m: step below which the method has converged.
 
     Newton's method minimises |x - q|^2 for each query q on the surface f(x) = 0 (Nocedal and
     Wright, Numerical Optimization, ch. 18). A step has a part along the gradient, towards the
     surface, and a part along the surface. The latter solves the reduced system with the Hessian of
     the Lagrangian, I + lambda H (H: Hessian of f, lambda: multiplier). Its eigenvalues are made
-    positive, so that each step is a descent. stride_m: maximum step. rest_m: step below which the
-    method has converged.
+    positive, so that each step reduces the distance.
     """
     count = len(queries)
     point = np.array(starts, dtype=np.float64)
@@ -254,13 +264,13 @@ _IDENTITY = np.eye(3)
 
 Triple = tuple[float, float, float]
 LevelAt = Callable[[Triple], tuple[float, Sequence[float], Sequence[Sequence[float]], float]]
-"""Variant of `LevelSet` that is evaluated at a single point and uses Python numbers."""
+"""A variant of `LevelSet` that is evaluated at a single point and uses Python numbers."""
 
 
 def descend_one(
     level: LevelAt, query: Floats, start: Floats, *, stride_m: float, rest_m: float
 ) -> SurfaceProjections:
-    """Project one query (3,) by the method of `descend`; the results have length one.
+    """Project one query (3,) by the method of `descend`. The results have length one.
 
     The method is written out for the two tangent directions with Python numbers, which is faster
     than operations on small arrays.
@@ -325,10 +335,10 @@ def _tangents(x: float, y: float, z: float) -> tuple[Triple, Triple]:
 def _downhill(
     b11: float, b12: float, b22: float, slope: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """Solve the symmetric 2x2 system of a Newton step, with its eigenvalues made positive.
+    """Solve the symmetric 2x2 system of a Newton step, whose eigenvalues are made positive.
 
-    b11, b12, b22: entries of the matrix. slope: right-hand side. Returns the two components of the
-    step and the smaller eigenvalue of the original matrix.
+    b11, b12, b22: entries of the matrix. slope: right-hand side. Return the two components of the
+        step and the smaller eigenvalue of the original matrix.
     """
     middle, spread = 0.5 * (b11 + b22), hypot(0.5 * (b11 - b22), b12)
     angle = 0.5 * atan2(2.0 * b12, b11 - b22)

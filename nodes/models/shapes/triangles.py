@@ -1,7 +1,7 @@
 """Check and refine triangle meshes, and compute their normals and nearest points.
 
-A mesh consists of vertices (v, 3), m, and triangles (t, 3), which contain the indices of their
-vertices, counter-clockwise seen from outside.
+A mesh consists of vertices (v, 3), m, and triangles (t, 3). A triangle contains the indices of its
+vertices, counter-clockwise when seen from outside.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ Indices32 = NDArray[np.int32]
 
 MAX_TRIANGLES = 100_000
 MIN_HEIGHT_RATIO = 1e-6
-"""Ratio of its height to its longest edge below which a triangle counts as degenerate."""
+"""The ratio of its height to its longest edge below which a triangle counts as degenerate."""
 MAX_DIHEDRAL_RAD = np.radians(175.0)
-"""Angle between the normals of neighbouring triangles above which they count as folded."""
+"""The angle between the normals of neighbouring triangles above which they count as folded."""
 
 
 class MeshError(FlexsheetError, ValueError):
@@ -34,12 +34,14 @@ class MeshError(FlexsheetError, ValueError):
 
 
 def check_mesh(vertices: Floats, triangles: Indices) -> None:
-    """Raise MeshError unless the mesh is the closed, consistently wound surface of a solid.
+    """Raise MeshError unless a mesh is the closed, consistently wound surface of a solid.
 
-    The errors found are wrong array shapes, size and vertex indices, degenerate and repeated
-    triangles, and holes. They also include edges of more than two triangles, inconsistent winding,
-    parts that share a single vertex, folded neighbours and wrong orientation. Intersections are not
-    searched, because that is slow; see `count_intersections`.
+    vertices (v, 3), m; triangles (t, 3).
+
+    The check covers array shapes, size and vertex indices, degenerate and repeated triangles, and
+    holes. It also covers edges of more than two triangles, inconsistent winding, parts that share a
+    single vertex, folded neighbours, and wrong orientation. It does not search for intersections,
+    because that is slow; see `count_intersections`.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise MeshError(
@@ -80,9 +82,9 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
 
 
 def triangulate_grid(rows: int, columns: int) -> Indices32:
-    """Return the triangles (t, 3) that connect a grid of points, numbered row by row.
+    """Return triangles (t, 3) that connect a grid of points, which are numbered row by row.
 
-    They are counter-clockwise if columns follow each other along +x and rows along +y.
+    The triangles are counter-clockwise if columns are along +x and rows along +y.
     """
     corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     right, above = corner + 1, corner + columns
@@ -91,7 +93,7 @@ def triangulate_grid(rows: int, columns: int) -> Indices32:
 
 
 def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
-    """Return whether each triangle (t,) is degenerate: has repeated or collinear vertices."""
+    """Return whether each triangle (t,) has repeated or collinear vertices."""
     corners = vertices[triangles]
     sides = np.roll(corners, -1, axis=1) - corners
     longest = np.square(sides).sum(-1).max(-1)
@@ -100,9 +102,9 @@ def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
 
 
 def half_edges(triangles: Indices) -> Indices:
-    """Return the directed edges (3 t, 2) of the triangles, as pairs of vertex indices.
+    """Return the directed edges (3 t, 2) of triangles (t, 3), as pairs of vertex indices.
 
-    The first edges of all triangles are followed by their second, then by their third edges.
+    The array contains the first edges of all triangles, then the second and then the third edges.
     """
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
@@ -131,7 +133,7 @@ def _check_edges(triangles: Indices) -> None:
 def _check_fans(triangles: Indices) -> None:
     """Raise MeshError unless the triangles around each vertex form a single closed fan.
 
-    Otherwise, parts of the surface touch each other at that vertex only.
+    Otherwise, parts of the surface touch each other only at that vertex.
     """
     count = len(triangles)
     first, second = _neighbours(triangles)
@@ -153,7 +155,7 @@ def _check_fans(triangles: Indices) -> None:
 
 
 def unify_winding(triangles: Indices) -> Indices:
-    """Reverse some triangles (t, 3) so that neighbours across edges have the same winding.
+    """Reverse triangles (t, 3) where necessary so that neighbours have the same winding.
 
     In each connected part, the winding of the majority is kept. If no consistent winding exists, as
     on a Möbius strip, `check_mesh` fails afterwards.
@@ -202,17 +204,17 @@ def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
 
 
 def triangle_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Return the unit normals (t, 3) of the triangles."""
+    """Return the unit normals (t, 3) of triangles (t, 3) with vertices (v, 3)."""
     corners = vertices[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
 def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Return unit normals (v, 3) at the vertices, to approximate a smooth surface.
+    """Return unit normals (v, 3) at the vertices, which approximate those of a smooth surface.
 
-    They are means of the normals of the adjacent triangles, weighted by the angles of these
-    triangles at the vertex (Thürmer and Wüthrich, 1998).
+    A normal is the mean of the adjacent triangles' normals, weighted by the triangles' angles at
+    the vertex (Thürmer and Wüthrich, 1998).
     """
     corners, normal = vertices[triangles], triangle_normals(vertices, triangles)
     total = np.zeros_like(vertices)
@@ -226,9 +228,10 @@ def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
 
 
 def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
-    """Return the edges (e, 2) of a closed mesh and the angles (e,) across them, rad.
+    """Return the edges (e, 2) of a closed mesh, and the angles (e,) between adjacent triangles,
+    rad.
 
-    The angle is that between the normals of the two adjacent triangles.
+    The angle is that between the normals of the two triangles.
     """
     normal, count = triangle_normals(vertices, triangles), len(triangles)
     first, second = _neighbours(triangles)
@@ -238,16 +241,16 @@ def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats
 
 
 def volume_m3(vertices: Floats, triangles: Indices) -> float:
-    """Return the volume that a closed mesh encloses, m^3; negative for clockwise triangles."""
+    """Return the volume (m^3) that a closed mesh encloses; negative for clockwise triangles."""
     corners = vertices[triangles] - vertices[triangles].mean(axis=(0, 1))
     return float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
 
 def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
-    """Divide the triangles until no edge is longer than `longest_m`.
+    """Divide triangles (t, 3) until no edge is longer than `longest_m`.
 
-    A long edge is halved in both adjacent triangles, so that a closed mesh remains closed. Returns
-    the new vertices and triangles. Raises MeshError if there are more than `MAX_TRIANGLES`.
+    A long edge is halved in both adjacent triangles, so a closed mesh remains closed. Return the
+    new vertices and triangles. Raises MeshError if there are more than `MAX_TRIANGLES`.
     """
     while True:
         run = np.sort(half_edges(triangles), axis=1)
@@ -273,7 +276,7 @@ def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tup
 
 
 def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
-    """Split the triangles at the midpoints of some of their edges; yield the parts.
+    """Split triangles (t, 3) at the midpoints of some of their edges, and yield the parts.
 
     middle (t, 3): vertex index of the midpoint of each edge; -1 if the edge is not split.
     """
@@ -300,9 +303,9 @@ def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
 def count_intersections(vertices: Floats, triangles: Indices) -> int:
     """Count the pairs of triangles that intersect.
 
-    A pair is counted if an edge of one triangle passes through the interior of the other. The ends
-    of this edge must not be vertices of the other. Triangles that only touch, or overlap in one
-    plane, are not counted.
+    A pair intersects if an edge of one triangle passes through the interior of the other triangle,
+    and the ends of this edge are not vertices of the other triangle. Triangles that only touch, or
+    overlap in one plane, are not counted.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)
@@ -327,8 +330,8 @@ def count_intersections(vertices: Floats, triangles: Indices) -> int:
 def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indices]]:
     """Yield the pairs of overlapping balls in batches, as two arrays of ball indices.
 
-    centre (n, 3), radius (n,): balls. Balls of similar size are searched together, because the
-    search radius must be that of the largest ball.
+    centre (n, 3), radius (n,): balls, m. Balls of similar size are searched together, because the
+        search radius must be that of the largest ball.
     """
     from scipy.spatial import cKDTree
 
@@ -349,9 +352,9 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
 
 def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return whether each segment from `start` to `end` (n, 3) passes through its triangle.
+    """Return whether each segment (n,) passes through the interior of its triangle.
 
-    corners (n, 3, 3): one triangle for each segment, of which only the interior counts.
+    start, end (n, 3): ends of the segments. corners (n, 3, 3): one triangle for each segment.
 
     Source: Möller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997.
     """
@@ -372,10 +375,11 @@ def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
-    """Find the point of a triangle that is nearest to a given point, for n points (n, 3).
+    """Return the point of a triangle that is nearest to a given point, for n points (n, 3).
 
-    corners (n, 3, 3): one triangle for each point. Returns barycentric coordinates (n, 3). Source:
-    Ericson, Real-Time Collision Detection, sec. 5.1.5.
+    corners (n, 3, 3): one triangle for each point. The results are barycentric coordinates (n, 3).
+
+    Source: Ericson, Real-Time Collision Detection, sec. 5.1.5.
     """
     a = corners[:, 0]
     first, second = corners[:, 1] - a, corners[:, 2] - a

@@ -1,10 +1,10 @@
 """Compute the force of the pushed sheet with interchangeable models.
 
-Inputs of a model are depths of a fingertip below the flat sheet, and a `SheetPush`: the stretch
-ratio, the position on the stretched sheet (x, y from its centre, m) and the fingertip's radius.
-Outputs are the normal force, its derivative with respect to the depth, and the force on each clamp.
+A model receives depths of a fingertip below the flat sheet, and a `SheetPush`: the stretch ratio,
+the position on the stretched sheet (x, y from its centre, m) and the fingertip's radius. It returns
+the normal force, the derivative of this force with respect to depth, and the force on each clamp.
 
-In order of increasing cost, the models are `ScaledSheetModel`,
+In order of increasing computing time, the models are `ScaledSheetModel`,
 `nodes.models.sheet.tabulated.TabulatedSheetModel` and `MembraneSheetModel`.
 """
 
@@ -27,7 +27,9 @@ CENTRE: SheetPosition = (0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class SheetPush:
-    """Conditions of a push, apart from its depth.
+    """The conditions of a push, apart from its depth.
+
+    position_m: (x, y) of the fingertip on the stretched sheet, from its centre.
 
     Raises ValueError for values that are not finite, and for a ratio or radius of 0 or less.
     """
@@ -38,14 +40,18 @@ class SheetPush:
 
     def __post_init__(self) -> None:
         if not np.isfinite((self.stretch_ratio, *self.position_m, self.finger_radius_m)).all():
-            raise ValueError(f"{self}: all values must be finite")
+            raise ValueError(f"{self}: every value must be a finite number")
         if self.stretch_ratio <= 0.0 or self.finger_radius_m <= 0.0:
             raise ValueError(f"{self}: stretch ratio and finger radius must be above 0")
 
 
 @dataclass(frozen=True, slots=True)
 class SheetForce:
-    """Result of a force model at depths (n,): normal force, stiffness, and force on each clamp."""
+    """The result of a force model at depths (n,).
+
+    force_n (n,): normal force. stiffness_n_per_m (n,): derivative of the normal force with respect
+        to depth. edge_force_n (n,): force on each clamp.
+    """
 
     force_n: Floats
     stiffness_n_per_m: Floats
@@ -53,7 +59,7 @@ class SheetForce:
 
 
 class SheetForceModel(Protocol):
-    """Interface of the sheet's force models."""
+    """The interface of the sheet's force models."""
 
     @property
     def name(self) -> str: ...
@@ -62,44 +68,47 @@ class SheetForceModel(Protocol):
     def rubber(self) -> Rubber: ...
 
     def evaluate(self, push: SheetPush, depths_m: Floats) -> SheetForce:
-        """Return the forces at depths (n,), m; the force is zero for depths <= 0.
+        """Return the forces at depths (n,), m. The force is zero for depths <= 0.
 
         Raises ValueError for depths that are not finite.
         """
         ...
 
     def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
-        """Return why the model is inaccurate for these inputs, or "" if they are in its range."""
+        """Return why the model is inaccurate for a push, or "" if the push is in its range."""
         ...
 
 
 def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
-    """Return the force (N) on each clamp of the sheet if nothing pushes it."""
+    """Return the force (N) on each clamp of a sheet that nothing touches."""
     return edge_force_n(stretch_ratio, rubber, mooney_ratio=rubber.mooney_ratio)
 
 
 def _check_depths(depths_m: Floats) -> Floats:
-    """Return the depths with negative ones set to 0; raise ValueError if one is not finite."""
+    """Return the depths (n,), m, with negative depths set to 0.
+
+    Raises ValueError for NaN or infinity.
+    """
     depths = np.asarray(depths_m, dtype=np.float64)
     if not np.isfinite(depths).all():
-        raise ValueError(f"push of {depths} m: all depths must be finite")
+        raise ValueError(f"the depths of a push are {depths} m; all of them must be finite")
     return np.maximum(depths, 0.0)
 
 
 def relative_position(
     rubber: Rubber, stretch_ratio: float, position_m: SheetPosition
 ) -> tuple[float, float]:
-    """Return relative coordinates (|x|, |y|): 0 at the centre, 1 at the clamp and the free edge."""
+    """Return coordinates (|x|, |y|) of a position (m), scaled from 0 (centre) to 1 (edge)."""
     half_width = 0.5 * rubber.width_m * max(stretch_ratio, 1.0)
     return abs(position_m[0]) / half_width, abs(position_m[1]) / (0.5 * rubber.height_m)
 
 
 MAX_RELATIVE_X = 0.98
-"""Upper limit of the relative x in closed-form models, whose force is infinite at the clamp."""
+"""The upper limit of the relative x in closed-form models, whose force is infinite at the clamp."""
 
 
 MAX_STRETCH_RATIO = 1.13
-"""Maximum stretch ratio at which the closed-form models are valid."""
+"""The maximum stretch ratio at which the closed-form models are valid."""
 
 
 def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
@@ -111,8 +120,10 @@ def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
 
 
 CUBIC_FACTOR = 2.43
-"""Factor c of the force F = c E t W (d/W)^3 of a slack square sheet under a fingertip of 7 mm; E is
-Young's modulus, t the thickness, W the width and d the depth."""
+"""The factor c of the force F = c E t W (d/W)^3 of a slack square sheet under a fingertip of 7 mm.
+
+E is Young's modulus, t the thickness, W the width and d the depth.
+"""
 
 
 # Fitted by least squares of the logarithms to `push_path` of a square neo-Hookean sheet: stretch 1
@@ -137,7 +148,10 @@ def _slack_position_factor(x: float, y: float) -> float:
 def _push_tension(
     rubber: Rubber, stretch_ratio: float, depths: Floats, relative: tuple[float, float]
 ) -> tuple[Floats, float]:
-    """Return the additional force (n,) on each clamp due to a push, N, and E t W, N."""
+    """Return the additional force (n,) on each clamp due to a push, N, and E t W, N.
+
+    depths (n,), m. relative: relative coordinates (x, y) of the push.
+    """
     modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
     depth_ratio = depths / rubber.width_m
     scaled = depth_ratio / max(strain_measure(stretch_ratio, rubber.mooney_ratio), 1e-12) ** 0.5
@@ -152,17 +166,18 @@ def _push_tension(
 
 @dataclass(frozen=True, slots=True)
 class ScaledSheetModel:
-    """Model with a power of the scaled depth, due to the tension, plus a cubic part.
+    """A closed-form model: a power of the scaled depth due to the tension, plus a cubic term.
 
-    With the symbols of CUBIC_FACTOR, the stretch ratio s, e = `strain_measure`(s), w = d/W and
-    u = w/sqrt(e) (the scaling of a membrane at small strains):
+    With the symbols of CUBIC_FACTOR, the stretch ratio s, e = `strain_measure`(s), w = d/W and u =
+    w/sqrt(e) (the scaling of a membrane at small strains):
 
         F = E t W (e^(3/2) s^a A u^p / (1 + (u/b)^q)^(r/q)  +  c s^-g w^3)
 
     a, b, c, g, p, q, r and A are fitted. A and c depend on position, fingertip radius and height.
 
-    cubic_ratio: ratio of the calibrated cubic part to that of ideal rubber.
-    stretch_scale: ratio of the calibrated to the nominal stretch ratio; corrects the slack width.
+    cubic_ratio: ratio of the calibrated cubic term to that of ideal rubber.
+    stretch_scale: ratio of the calibrated to the nominal stretch ratio, which corrects the slack
+        width.
     """
 
     rubber: Rubber
@@ -214,7 +229,7 @@ class ScaledSheetModel:
     def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
         rubber, stretch_ratio = self.rubber, self.stretch_scale * push.stretch_ratio
         if not 1.0 <= stretch_ratio <= MAX_STRETCH_RATIO:
-            return f"stretch {stretch_ratio:.3f} is not from 1 to {MAX_STRETCH_RATIO:g}"
+            return f"the stretch ratio {stretch_ratio:.3f} is not from 1 to {MAX_STRETCH_RATIO:g}"
         if not 0.008 <= depth_m / rubber.width_m <= 0.21:
             return "the depth is not 0.8 to 21 % of the sheet's width"
         x, y = relative_position(rubber, stretch_ratio, push.position_m)
@@ -225,7 +240,10 @@ class ScaledSheetModel:
 
 @dataclass(frozen=True, slots=True)
 class MembraneSheetModel:
-    """Model by finite elements of the membrane: the most accurate one, which takes seconds."""
+    """The most accurate model: finite elements of the membrane, which need seconds.
+
+    cells: number of elements along each side of the sheet.
+    """
 
     rubber: Rubber
     cells: int = CELLS
@@ -256,16 +274,17 @@ class MembraneSheetModel:
 
 
 _SLOPE_FRACTION = 0.96
-"""Fraction of the depth at which a second force is computed, for the stiffness."""
+"""The fraction of the depth at which a second force is computed, to determine the stiffness."""
 
 
 def depth_for_force(
     model: SheetForceModel, push: SheetPush, forces_n: Floats, *, max_depth_m: float
 ) -> Floats:
-    """Return the depths (n,) at which the model gives these forces (n,), at most `max_depth_m`.
+    """Return the depths (n,), m, at which a model gives these forces (n,), N, at most
+    `max_depth_m`.
 
-    The model is evaluated once on a geometric grid, and log force is interpolated linearly over log
-    depth. The relative error is below 1e-3.
+    The model is evaluated once on a geometric grid, and the logarithm of the force is interpolated
+    linearly over the logarithm of the depth. The relative error is below 1e-3.
     """
     grid = max_depth_m * _INVERSE_GRID
     grid_forces = model.evaluate(push, grid).force_n
@@ -278,9 +297,10 @@ _INVERSE_GRID = np.geomspace(1e-3, 1.0, 160)
 def interpolate_inverse(grid: Floats, values: Floats, targets: Floats) -> Floats:
     """Return the arguments (n,) at which an increasing function reaches the values `targets` (n,).
 
-    values: function values at the arguments `grid`; both are positive. The logarithms are
-    interpolated linearly. Below the grid, the power law of the first interval is extrapolated.
-    Above it, the result is the last grid point.
+    values: function values at the arguments `grid`. Both are positive.
+
+    The logarithms are interpolated linearly. Below the grid, the power law of the first interval is
+    extrapolated. Above it, the result is the last grid point.
     """
     logs = np.log(np.maximum(np.maximum.accumulate(values), 1e-300))
     keep = np.concatenate([[True], np.diff(logs) > 1e-12])
@@ -308,7 +328,7 @@ def make_model(
 ) -> ScaledSheetModel:
     """Make the scaled model from calibrated parameters.
 
-    Stretch ratios given to the model refer to the width of the nominal sheet.
+    nominal: sheet of the scene. Stretch ratios given to the model refer to its width.
     """
     rubber = replace(
         nominal,

@@ -9,14 +9,15 @@ from flexsheet.nodes.models.rigid import inverse, transform
 
 
 def edge_poses(world_from_sheet: Floats, edge_distance_m: float) -> tuple[Floats, Floats]:
-    """Return the poses world_from_edge of left and right clamped edge, parallel to the sheet."""
+    """Return the poses world_from_edge (4, 4) of the left and right edge of a flat sheet."""
     offset = 0.5 * edge_distance_m * world_from_sheet[:3, 0]
     rotation, centre = world_from_sheet[:3, :3], world_from_sheet[:3, 3]
     return transform(rotation, centre - offset), transform(rotation, centre + offset)
 
 
 def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats) -> Floats:
-    """Return the sheet's pose world_from_sheet between two edges, which need not be parallel.
+    """Return the sheet's pose world_from_sheet (4, 4) between two edges, which need not be
+    parallel.
 
     The origin is midway, x points from left to right, and y is the mean of the edges' y axes, made
     perpendicular to x. The result is not finite if the edges coincide.
@@ -32,7 +33,10 @@ def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats
 
 
 def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_m: float) -> Floats:
-    """Return the sheet's corners (4, 3) in the world: bottom left and right, top right and left."""
+    """Return the sheet's corners (4, 3), m, in the world frame.
+
+    Their order is bottom left, bottom right, top right, top left. height_m: length of an edge.
+    """
     half = 0.5 * height_m
     left, right = world_from_left_edge, world_from_right_edge
     return np.array(
@@ -46,5 +50,5 @@ def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_
 
 
 def flange_pose(world_from_edge: Floats, flange_from_edge: Floats) -> Floats:
-    """Return the flange's pose world_from_flange for a pose of the edge that the arm holds."""
+    """Return the pose world_from_flange (4, 4) for a pose of the edge that the flange holds."""
     return world_from_edge @ inverse(flange_from_edge)

@@ -2,10 +2,11 @@
 
 Finite-element solutions are precomputed over stretch, position and depth of the push. A proper
 orthogonal decomposition reduces the shapes to a dozen modes, and polynomials through Chebyshev
-points interpolate their coefficients. To compute a shape then takes about 0.1 ms.
+points interpolate their coefficients. Computing a shape then takes about 0.1 ms.
 
-The grid moves with the finger and is finest there, so that the tip of the indentation is always at
-the same nodes. Only one quadrant of positions is solved; the others follow by symmetry.
+The grid moves with the finger and is densest at the finger, so the tip of the indentation is always
+at the same nodes. Solutions are computed for positions in one quadrant; those in the other
+quadrants follow by symmetry.
 """
 
 from __future__ import annotations
@@ -21,24 +22,24 @@ from flexsheet.nodes.models.sheet.membrane import push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 HALF_CELLS = 14
-"""Number of grid cells from the finger to each side of the sheet."""
+"""The number of grid cells from the finger to each side of the sheet."""
 
 GRADING = 3.2
-"""Grading of the grid: distances from the finger are proportional to sinh(GRADING a), a in 0..1."""
+"""The grading of the grid: distances from the finger are proportional to sinh(GRADING a)."""
 
 MAX_TRUNCATION_RMS_M = 2e-5
-"""Maximum truncation error of the modes (root mean square)."""
+"""The maximum truncation error of the modes (root mean square)."""
 
 MAX_FRACTION_X, MAX_FRACTION_Y = 0.36, 0.40
-"""Maximum solved |x| and |y| of a push, as fractions of the sheet's width and height."""
+"""The maximum |x| and |y| of a precomputed push, as fractions of the sheet's width and height."""
 
 
 @dataclass(frozen=True, slots=True)
 class IndentationRange:
-    """Range of the solved pushes: stretch ratios and maximum depth (m).
+    """The range of the precomputed pushes: stretch ratios and maximum depth (m).
 
     stretch_nodes, place_nodes, depth_nodes: numbers of interpolation nodes over stretch, over each
-    coordinate of the position, and over depth. element_cells: finite elements along each side.
+        coordinate of the position, and over depth. element_cells: finite elements along each side.
     """
 
     min_stretch: float
@@ -52,11 +53,12 @@ class IndentationRange:
 
 @dataclass(frozen=True, slots=True)
 class IndentationBasis:
-    """Reduced-order model of the pushed sheet.
+    """A reduced-order model of the pushed sheet.
 
     stretches, xs_m, ys_m, roots: interpolation nodes; roots are sqrt(depth / maximum depth).
-    modes: displacement modes (modes, rows, columns, 3), m. coefficients: coefficients of the modes
-    at the interpolation nodes, (stretches, xs, ys, roots, modes).
+    modes: displacement modes (modes, rows, columns, 3), m.
+    coefficients: coefficients (stretches, xs, ys, roots, modes) of the modes at the interpolation
+        nodes.
     """
 
     rubber: Rubber
@@ -74,8 +76,8 @@ class IndentationBasis:
     ) -> Floats:
         """Return the displacement (rows, columns, 3), m, from the flat, uniformly stretched sheet.
 
-        position_m: (x, y) of the fingertip. Rows are along y and columns along x of the sheet
-        frame. Inputs are clamped to the solved range (see `invalid_reason`).
+        position_m: (x, y) of the fingertip in the sheet frame. Rows are along y and columns along
+            x. Inputs outside the precomputed range are clamped to this range.
         """
         mirrored = (position_m[0] < 0.0, position_m[1] < 0.0)
         weights = (
@@ -95,7 +97,10 @@ class IndentationBasis:
         return np.asarray(shape)
 
     def grid(self, stretch_ratio: float, position_m: tuple[float, float]) -> Floats:
-        """Return the points (rows, columns, 2), m, of the flat sheet that `offsets` displaces."""
+        """Return the points (rows, columns, 2), m, of the flat sheet that `offsets` displaces.
+
+        position_m: (x, y) of the fingertip in the sheet frame.
+        """
         sheet, most_x, most_y = self.rubber, self.xs_m[-1], self.ys_m[-1]
         focus_x = float(np.clip(position_m[0], -most_x, most_x)) / stretch_ratio
         x = _grade_coordinates(focus_x, 0.5 * sheet.width_m)
@@ -105,23 +110,27 @@ class IndentationBasis:
     def invalid_reason(
         self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
     ) -> str:
-        """Return why a push is outside the solved range, or an empty text."""
+        """Return why a push is outside the precomputed range, or "" if the push is inside.
+
+        position_m: (x, y) of the fingertip in the sheet frame.
+        """
         if not self.stretches[0] <= stretch_ratio <= self.stretches[-1]:
             return (
-                f"stretch {stretch_ratio:.3f} is not from {self.stretches[0]:.3f} to "
+                f"the stretch ratio {stretch_ratio:.3f} is not from {self.stretches[0]:.3f} to "
                 f"{self.stretches[-1]:.3f}"
             )
         if depth_m > self.deepest_m:
-            return f"push of {1e3 * depth_m:.0f} mm is deeper than {1e3 * self.deepest_m:.0f} mm"
+            deepest_mm = 1e3 * self.deepest_m
+            return f"the push of {1e3 * depth_m:.0f} mm is deeper than {deepest_mm:.0f} mm"
         if abs(position_m[0]) > self.xs_m[-1] or abs(position_m[1]) > self.ys_m[-1]:
             x, y = 1e3 * position_m[0], 1e3 * position_m[1]
-            return f"push at ({x:.0f}, {y:.0f}) mm is too close to the sheet's edge"
+            return f"the push at ({x:.0f}, {y:.0f}) mm is too close to the sheet's edge"
         return ""
 
 
 @dataclass(frozen=True, slots=True)
 class IndentationCase:
-    """Input of one finite-element solution: a position and ascending depths (n,), m."""
+    """The inputs of one finite-element solution: a position (m) and ascending depths (n,), m."""
 
     rubber: Rubber
     stretch_ratio: float
@@ -132,7 +141,7 @@ class IndentationCase:
 
 
 IndentationOffsets = Iterable[Floats]
-"""Displacements (depths, rows, columns, 3) of each case, in the order of the cases."""
+"""The displacements (depths, rows, columns, 3), m, of each case, in the order of the cases."""
 
 
 def solve_indentation_basis(
@@ -144,10 +153,12 @@ def solve_indentation_basis(
         solve_indentation, pushes
     ),
 ) -> IndentationBasis:
-    """Solve the membrane at all interpolation nodes and reduce the shapes (45 s on one core).
+    """Compute the membrane at all interpolation nodes, and reduce the shapes to modes.
 
-    solve_all: function that solves the cases, in this or in other processes.
-    Raises NoEquilibriumError.
+    solve_all: function that solves the cases, in this or in other processes. On one core, it takes
+        45 s.
+
+    Raises NoEquilibriumError if a solution does not converge.
     """
     stretches = _chebyshev_points(within.min_stretch, within.max_stretch, within.stretch_nodes)
     xs = _chebyshev_points(0.0, MAX_FRACTION_X * rubber.width_m, within.place_nodes)
@@ -182,7 +193,10 @@ def solve_indentation_basis(
 
 
 def solve_indentation(push: IndentationCase) -> Floats:
-    """Return finite-element displacements (depths, rows, columns, 3), m, at the model's grid."""
+    """Return finite-element displacements (depths, rows, columns, 3), m, at the model's grid.
+
+    Raises NoEquilibriumError if a solution does not converge.
+    """
     rubber, stretch = push.rubber, push.stretch_ratio
     pushed = push_path(
         rubber,
@@ -204,7 +218,7 @@ def solve_indentation(push: IndentationCase) -> Floats:
 def _decompose(samples: Floats) -> tuple[Floats, Floats]:
     """Decompose samples (n, size) into modes (m, size) with coefficients (n, m).
 
-    The number of modes is the smallest at which the error is below `MAX_TRUNCATION_RMS_M`.
+    The number of modes is the smallest number at which the error is below `MAX_TRUNCATION_RMS_M`.
     """
     left, values, modes = np.linalg.svd(samples, full_matrices=False)
     lost = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / samples.size)
@@ -217,7 +231,7 @@ def _decompose(samples: Floats) -> tuple[Floats, Floats]:
 
 
 def _grade_coordinates(focus_m: float, half_m: float) -> Floats:
-    """Return coordinates (2 HALF_CELLS + 1,) from -half_m to half_m, densest near the focus."""
+    """Return coordinates (2 HALF_CELLS + 1,), m, from -half_m to half_m, densest at focus_m."""
     fractions = np.sinh(GRADING * np.linspace(0.0, 1.0, HALF_CELLS + 1)) / np.sinh(GRADING)
     before = focus_m - (half_m + focus_m) * fractions[::-1]
     after = focus_m + (half_m - focus_m) * fractions
@@ -243,7 +257,7 @@ def _chebyshev_points(low: float, high: float, count: int) -> Floats:
 def _barycentric_weights(nodes: Floats, at: float) -> Floats:
     """Return the weights (n,) of polynomial interpolation at a point clamped to the nodes' range.
 
-    Barycentric form: Berrut and Trefethen, SIAM Review 46, 2004, equation (5.4).
+    Source: the barycentric form of Berrut and Trefethen, SIAM Review 46, 2004, equation (5.4).
     """
     clamped = float(np.clip(at, nodes[0], nodes[-1]))
     away = clamped - nodes

@@ -1,15 +1,16 @@
-"""Solve the pushed sheet as a finite-element membrane.
+"""Compute the shape and forces of the pushed sheet by finite elements of a membrane.
 
-The elements are bilinear cells with four integration points, of incompressible Mooney-Rivlin rubber
-in plane stress. Its energy W per volume has the constants C1, C2; E is Young's modulus:
+The elements are bilinear cells with four integration points. The material is incompressible
+Mooney-Rivlin rubber in plane stress. Its energy W per volume has the constants C1 and C2. E is
+Young's modulus, and C2 = 0 is a neo-Hookean material:
 
     W = C1 (I1 - 3) + C2 (I2 - 3),    E = 6 (C1 + C2)
 
-(neo-Hookean for C2 = 0). I1, I2 are the invariants of the Cauchy-Green tensor C = F'F, where F is
-the deformation gradient. A membrane wrinkles under compression (tension field theory: Pipkin, IMA
-J. Appl. Math. 36, 1986). If the smaller principal stretch l2 is below that of uniaxial tension,
-l1^-1/2, the energy is that of uniaxial tension. If l1 is below 1 too, the energy is zero. Stress
-and tangent (its derivative with respect to the strain) are computed in the principal frame of C.
+I1 and I2 are the invariants of the Cauchy-Green tensor C = F'F, where F is the deformation
+gradient. A membrane wrinkles under compression (tension field theory: Pipkin, IMA J. Appl. Math.
+36, 1986). If the smaller principal stretch l2 is below that of uniaxial tension, l1^-1/2, the
+energy is that of uniaxial tension. If l1 is below 1 too, the energy is zero. Stress and tangent
+(its derivative with respect to the strain) are computed in the principal frame of C.
 
 The fingertip is a rigid sphere that is pushed along the flat sheet's normal. Nodes that it touches
 stick to it. Newton's method computes each equilibrium from the previous equilibrium, with
@@ -33,21 +34,23 @@ Indices = NDArray[np.intp]
 
 CELLS = 32
 MIN_CELL_RADII = 0.3
-"""Cell size under the finger, as a multiple of the finger's radius."""
+"""The cell size under the finger, as a multiple of the finger's radius."""
 STEP_RADII = 0.4
-"""Maximum step of the finger's depth, as a multiple of its radius."""
+"""The maximum step of the finger's depth, as a multiple of its radius."""
 PENALTY_PER_MODULUS = 2e5
-"""Stiffness of the contact penalty, pressure per penetration, in units of E t / width^2, where E is
-Young's modulus and t the sheet's thickness."""
+"""The stiffness of the contact penalty (pressure per penetration), in units of E t / width^2.
+
+E is Young's modulus and t is the sheet's thickness.
+"""
 MAX_ITERATIONS = 120
 GAUSS = 0.5 / np.sqrt(3.0)
-"""Distance of the integration points from a cell's centre, as a fraction of its side."""
+"""The distance of the integration points from a cell's centre, as a fraction of its side."""
 TOLERANCE = 1e-7
-"""Maximum residual force of a solution, in units of E t width."""
+"""The maximum residual force of a solution, in units of E t width."""
 
 
 class NoEquilibriumError(FlexsheetError, ArithmeticError):
-    """The iteration for the membrane's equilibrium does not converge."""
+    """Raised if the iteration for the membrane's equilibrium does not converge."""
 
     code = "no-equilibrium"
     remedy = "Reduce the push or the tilt: it is beyond the sheet's range."
@@ -55,11 +58,12 @@ class NoEquilibriumError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class PushPath:
-    """Equilibria of the sheet at depths (n,) of one push.
+    """The equilibria of the sheet at depths (n,), m, of one push.
 
-    forces_n (n,): normal force of the sheet on the finger. edge_forces_n (n,): mean force on the
-    clamps along the line between them. positions (n, rows, columns, 3): mesh nodes in the sheet's
-    frame. rest_m (rows, columns, 2): the same nodes in the slack sheet, relative to its centre.
+    forces_n (n,): normal force of the sheet on the finger.
+    edge_forces_n (n,): mean force on the clamps along the line between them.
+    positions (n, rows, columns, 3): positions of the mesh nodes in the sheet's frame, m.
+    rest_m (rows, columns, 2): positions of these nodes in the slack sheet, relative to its centre.
     """
 
     depths_m: Floats
@@ -78,11 +82,14 @@ def push_path(
     finger_radius_m: float,
     cells: int = CELLS,
 ) -> PushPath:
-    """Solve the equilibria of a push to ascending depths (n,), m.
+    """Compute the equilibria of a push at ascending depths (n,), m.
 
-    stretch_ratio: ratio of the edges' distance to the slack width. position_m: (x, y) of the push
-    on the stretched sheet, from its centre. Raises NoEquilibriumError, and ValueError for a
-    position outside the sheet, or depths that are negative or not ascending.
+    stretch_ratio: ratio of the edges' distance to the slack width.
+    position_m: (x, y) of the push on the stretched sheet, from its centre.
+    cells: number of elements along each side of the sheet.
+
+    Raises NoEquilibriumError if the iteration does not converge, and ValueError for a position
+    outside the sheet, or for depths that are negative or not ascending.
     """
     depths = np.asarray(depths_m, dtype=np.float64)
     if (
@@ -90,10 +97,11 @@ def push_path(
         or not np.isfinite(depths).all()
         or (np.diff(depths, prepend=0.0) < 0).any()
     ):
-        raise ValueError(f"depths {depths} m must be at least 0 and ascending")
+        raise ValueError(f"the depths {depths} m must be at least 0 and ascending")
     if not stretch_ratio > 0.0 or not finger_radius_m > 0.0:
         raise ValueError(
-            f"stretch ratio {stretch_ratio} and finger radius {finger_radius_m} m must be above 0"
+            f"the stretch ratio {stretch_ratio} and the finger radius {finger_radius_m} m must be "
+            "above 0"
         )
     focus = np.array(
         [
@@ -102,7 +110,9 @@ def push_path(
         ]
     )
     if not (0.0 < focus[0] < rubber.width_m and 0.0 < focus[1] < rubber.height_m):
-        raise ValueError(f"position {position_m} m is not on the sheet")
+        raise ValueError(
+            f"the position {position_m} m is not on the sheet; give a position between the edges"
+        )
     grid = _Grid(rubber, focus, MIN_CELL_RADII * finger_radius_m, cells)
     state = _make_flat_state(grid, stretch_ratio)
     state = _solve_equilibrium(grid, state, None)
@@ -135,10 +145,10 @@ def push_path(
 
 
 def grade_coordinates(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floats:
-    """Return node coordinates (cells + 1,) from 0 to length_m, densest at the focus.
+    """Return node coordinates (cells + 1,) from 0 to length_m, which are densest at the focus.
 
-    On each side, distances from the focus are proportional to sinh(k u) with uniform u from 0 to 1.
-    The finest cell has the size `finest_m`, which determines k.
+    finest_m: size of the cells at the focus. On each side, distances from the focus are
+        proportional to sinh(k u) with uniform u from 0 to 1.
     """
     left_cells = int(np.clip(round(cells * focus_m / length_m), cells // 4, cells - cells // 4))
 
@@ -159,7 +169,7 @@ def grade_coordinates(length_m: float, focus_m: float, finest_m: float, cells: i
 
 
 class _Grid:
-    """Finite-element mesh of the sheet, with the sparsity pattern of its stiffness matrix."""
+    """A finite-element mesh of the sheet, with the sparsity pattern of its stiffness matrix."""
 
     def __init__(self, rubber: Rubber, focus: Floats, finest_m: float, cells: int) -> None:
         x = grade_coordinates(rubber.width_m, float(focus[0]), finest_m, cells)
@@ -202,7 +212,7 @@ class _Grid:
         self._diagonal = np.searchsorted(self._keys, np.arange(size) * (size + 1))
 
     def strain(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return F (points, 3, 2) and C (points, 2, 2) at the four integration points per cell."""
+        """Return F (points, 3, 2) and C (points, 2, 2) at four integration points per cell."""
         at_corners = np.repeat(positions[self.cells].transpose(0, 2, 1), 4, axis=0)
         deformed = at_corners @ self.shape_gradients
         return deformed, deformed.transpose(0, 2, 1) @ deformed
@@ -221,13 +231,13 @@ class _Grid:
         return self._assemble(local)
 
     def _assemble(self, local: Floats) -> Floats:
-        """Sum the forces (points, 4, 3) from the integration points to nodal forces (3 nodes,)."""
+        """Sum the forces (points, 4, 3) of the integration points to nodal forces (3 nodes,), N."""
         by_cell = local.reshape(-1, 4, 12).sum(axis=1)
         sums = np.bincount(self._coordinates.ravel(), by_cell.ravel(), minlength=self._size)
         return np.asarray(sums, dtype=np.float64)
 
     def _scatter(self, blocks: Floats) -> Floats:
-        """Sum the stiffnesses (points, ...) from the integration points to matrix entries."""
+        """Sum the stiffnesses (points, ...) of the integration points to matrix entries."""
         by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
         sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
         return np.asarray(sums, dtype=np.float64)
@@ -235,10 +245,11 @@ class _Grid:
     def system(
         self, positions: Floats, added: Floats, free: Bools, damping: float
     ) -> tuple[Floats, scipy.sparse.csc_array]:
-        """Return the energy gradient (3 nodes,) and the stiffness matrix of the free coordinates.
+        """Return the energy gradient (3 nodes,), N, and the stiffness matrix of the free
+        coordinates, N/m.
 
-        added (nodes, 3, 3): stiffness of the contact. free (3 nodes,): which coordinates are not
-        fixed. damping: added to the diagonal.
+        added (nodes, 3, 3): stiffness of the contact, N/m. free (3 nodes,): whether each coordinate
+            may move. damping: value that is added to the diagonal, N/m.
         """
         deformed, c = self.strain(positions)
         stress, tangent = stress_and_tangent(c, self.c1, self.c2, tangent=True)
@@ -272,7 +283,11 @@ class _Grid:
 
 
 def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return larger and smaller eigenvalue (n,) of C (n, 2, 2), and the direction of the larger."""
+    """Return the larger and smaller eigenvalues (n,) of C (n, 2, 2), and the larger one's
+    directions.
+
+    The directions (n, 2) are unit vectors.
+    """
     middle, half = 0.5 * (c[:, 0, 0] + c[:, 1, 1]), 0.5 * (c[:, 0, 0] - c[:, 1, 1])
     spread = np.hypot(half, c[:, 0, 1])
     angle = 0.5 * np.arctan2(c[:, 0, 1], half)
@@ -282,10 +297,11 @@ def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
 def relaxed_energy(
     large: Floats, small: Floats, c1: float, c2: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the tension-field energy W per rest volume and its derivatives.
+    """Return the energy W per rest volume according to tension field theory, and its derivatives.
 
-    large, small (n,): squared principal stretches p >= q. The results are W (n,), its first
-    derivatives [W_p, W_q] (2, n) and its second ones [W_pp, W_qq, W_pq] (3, n).
+    large, small (n,): squared principal stretches p >= q. c1, c2: material constants, Pa. The
+        results are W (n,), its first derivatives [W_p, W_q] (2, n) and its second derivatives
+        [W_pp, W_qq, W_pq] (3, n).
     """
     p = np.maximum(large, 1.0)
     taut = small > p**-0.5
@@ -316,10 +332,11 @@ def relaxed_energy(
 
 
 def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tuple[Floats, Floats]:
-    """Return the second Piola-Kirchhoff stress (n, 2, 2) and its tangent (n, 3, 3).
+    """Return the second Piola-Kirchhoff stress (n, 2, 2), Pa, and its tangent (n, 3, 3), Pa.
 
-    The tangent's rows and columns belong to the strains [E11, E22, 2 E12]. tangent: whether to
-    compute it; otherwise it is empty.
+    c (n, 2, 2): Cauchy-Green tensors. c1, c2: material constants, Pa. tangent: whether the tangent
+        is computed; otherwise it is empty. Its rows and columns belong to the strains [E11, E22, 2
+        E12].
     """
     large, small, direction = principal(c)
     _, first, second = relaxed_energy(large, small, c1, c2)
@@ -346,7 +363,7 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 
 
 class _FingerContact:
-    """Penalty contact of nodes inside the fingertip; nodes that stick to it have no penalty."""
+    """A penalty contact of nodes with the fingertip. Nodes that stick to it have no penalty."""
 
     def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
         self.centre, self.radius, self.sticking = centre, radius_m, sticking
@@ -365,7 +382,7 @@ class _FingerContact:
         return 0.5 * float(self._penalty @ self._penetration(positions)[0] ** 2)
 
     def gradient(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return gradient (nodes, 3) and positive part of the Hessian (nodes, 3, 3) of `energy`."""
+        """Return the gradient (nodes, 3) and a positive Hessian (nodes, 3, 3) of `energy`."""
         inside, outward = self._penetration(positions)
         stiff = np.where(inside > 0.0, self._penalty, 0.0)
         return -(stiff * inside)[:, None] * outward, np.einsum(
@@ -382,7 +399,7 @@ def _make_flat_state(grid: _Grid, stretch_ratio: float) -> Floats:
 def _predict_state(
     grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """Predict the next equilibrium as the indentation scaled to the new depth, or first as a cone.
+    """Predict the next equilibrium by scaling the indentation to the new depth, or first as a cone.
 
     push: current depth and its increase in this step, m.
     """
@@ -399,7 +416,10 @@ def _predict_state(
 
 
 def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None) -> Floats:
-    """Solve for the equilibrium near `start`, with clamped and sticking nodes fixed."""
+    """Compute the equilibrium near the positions `start`, with clamped and sticking nodes fixed.
+
+    Raises NoEquilibriumError if the iteration does not converge.
+    """
     fixed = grid.clamped if finger is None else grid.clamped | finger.sticking
     free = np.repeat(~fixed, 3)
     positions, damping = start, 1e-7
@@ -443,6 +463,6 @@ def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None
     if residual < 100.0 * TOLERANCE * grid.force_scale:
         return positions
     raise NoEquilibriumError(
-        f"membrane: no convergence, residual {residual:.2e} N, tolerance "
-        f"{TOLERANCE * grid.force_scale:.2e} N"
+        f"the membrane has no equilibrium: the residual is {residual:.2e} N, the tolerance "
+        f"is {TOLERANCE * grid.force_scale:.2e} N"
     )

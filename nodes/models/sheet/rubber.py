@@ -1,4 +1,4 @@
-"""Define the sheet's dimensions and material, the input of every force model."""
+"""Define the sheet's dimensions and material, which every force model needs."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Rubber:
-    """Dimensions and material of a slack sheet, clamped along two edges.
+    """The dimensions and material of an unstretched sheet that is clamped along two edges.
 
-    width_m: distance of the clamped edges. height_m: length of an edge. mooney_ratio: C2 / (C1 +
-    C2) of incompressible Mooney-Rivlin rubber with E = 6 (C1 + C2), 0 (neo-Hookean) to below 1.
+    width_m: distance between the clamped edges. height_m: length of an edge. mooney_ratio: C2 / (C1
+        + C2) of incompressible Mooney-Rivlin rubber with E = 6 (C1 + C2), from 0 (neo-Hookean) to
+        below 1.
+
+    Raises ValueError for a value outside its range.
     """
 
     width_m: float
@@ -22,7 +25,6 @@ class Rubber:
     mooney_ratio: float = 0.0
 
     def __post_init__(self) -> None:
-        """Raise ValueError for a size, modulus or Mooney fraction outside its range."""
         sizes = (self.width_m, self.height_m, self.thickness_m, self.young_modulus_pa)
         if not (np.isfinite(sizes).all() and min(sizes) > 0.0):
             raise ValueError(

@@ -1,6 +1,7 @@
 """Correct the scaled force model by a table of ratios of measured or computed to modelled force.
 
-The ratio varies slowly, so a coarse table suffices. It is also used for fingertips of other radii.
+The ratio varies slowly, so a coarse table is sufficient. The table is also used for fingertips of
+other radii.
 """
 
 from __future__ import annotations
@@ -21,17 +22,19 @@ from flexsheet.nodes.models.sheet.force_models import (
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 Measure = Callable[[float, Floats, SheetPosition], Floats]
-"""Function that returns forces (n,), N, at a stretch ratio, depths (n,), m, and a position."""
+"""A function that returns forces (n,), N, at a stretch ratio, depths (n,), m, and a position."""
 
 
 @dataclass(frozen=True, slots=True)
 class TabulatedSheetModel:
-    """Force of the scaled model, multiplied by ratios from a table.
+    """A model that multiplies the force of the scaled model by ratios from a table.
 
-    stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending axes of the table; positions are
+    stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending axes of the table. Positions are
         in one quadrant, because the sheet is symmetric.
-    ratios (a, b, c, d): interpolated linearly over stretches and positions, and by monotone cubics
-        over depths; beyond the ends of an axis they are constant.
+    ratios (a, b, c, d): ratios, interpolated linearly over stretches and positions, and by monotone
+        cubics over depths. Beyond the ends of an axis, they are constant.
+
+    Raises ValueError for axes that are not ascending, or for invalid ratios.
     """
 
     base: ScaledSheetModel
@@ -43,15 +46,18 @@ class TabulatedSheetModel:
     name: str = "table"
 
     def __post_init__(self) -> None:
-        """Raise ValueError for axes that are not ascending, or ratios that are invalid."""
         axes = (self.stretches, self.depths_m, self.xs_m, self.ys_m)
         shape = tuple(len(axis) for axis in axes)
         if 0 in shape or any((np.diff(axis) <= 0.0).any() for axis in axes):
-            raise ValueError("force table: stretches, depths and positions must be ascending")
+            raise ValueError(
+                "the stretches, depths and positions of the force table must be ascending"
+            )
         if self.ratios.shape != shape:
-            raise ValueError(f"force table: expected ratios {shape}, found {self.ratios.shape}")
+            raise ValueError(
+                f"the force table has ratios of shape {self.ratios.shape}, expected {shape}"
+            )
         if not (np.isfinite(self.ratios).all() and (self.ratios > 0.0).all()):
-            raise ValueError("force table: ratios must be finite and above 0")
+            raise ValueError("the ratios of the force table must be finite and above 0")
 
     @property
     def rubber(self) -> Rubber:
@@ -79,19 +85,25 @@ class TabulatedSheetModel:
     def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
         x, y = map(abs, push.position_m)
         inputs = {
-            "stretch": (push.stretch_ratio, self.stretches),
+            "stretch ratio": (push.stretch_ratio, self.stretches),
             "depth": (depth_m, self.depths_m),
             "position along x": (x, self.xs_m),
             "position along y": (y, self.ys_m),
         }
         for what, (value, axis) in inputs.items():
             if not axis[0] - 1e-9 <= value <= axis[-1] + 1e-9:
-                return f"{what} {value:.4g} is not in the table's {axis[0]:.4g} to {axis[-1]:.4g}"
+                return (
+                    f"the {what} {value:.4g} is outside the table, which contains {axis[0]:.4g} to "
+                    f"{axis[-1]:.4g}"
+                )
         return ""
 
 
 def _interpolate_linear(axis: Floats, value: float, entries: Floats) -> Floats:
-    """Interpolate entries (n, ...) linearly along their first axis; constant beyond the ends."""
+    """Interpolate entries (n, ...) linearly along their first axis.
+
+    They are constant beyond its ends.
+    """
     if len(axis) == 1:
         return np.asarray(entries[0])
     value = float(np.clip(value, axis[0], axis[-1]))
@@ -111,7 +123,10 @@ def make_tabulated_model(
     finger_radius_m: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TabulatedSheetModel:
-    """Make the table from forces that `measure` returns; call `progress` after each call of it."""
+    """Make the table of a model from the forces that `measure` returns.
+
+    progress: function that is called with the number of finished calls of `measure`, and the total.
+    """
     ratios = np.empty((len(stretches), len(depths_m), len(xs_m), len(ys_m)))
     total, done = len(stretches) * len(xs_m) * len(ys_m), 0
     for a, stretch in enumerate(stretches):
