@@ -26,7 +26,7 @@ from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.tracking import Gate
-from flexsheet.nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.truth import apply_apparatus
@@ -105,7 +105,6 @@ class MarkDetector:
                 window_half_px=given.window_half_px,
             ),
             refine=MARKER_METHODS["subpixel_fit"],
-            triangulate=TRIANGULATION_METHODS["dlt"],
             max_reprojection_px=given.max_reprojection_px,
         )
 

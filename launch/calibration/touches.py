@@ -19,11 +19,7 @@ from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
-from flexsheet.nodes.triangulator.triangulation import (
-    TRIANGULATION_METHODS,
-    StereoGeometry,
-    TriangulatedPoint,
-)
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
@@ -228,7 +224,6 @@ def _see_marker(
                 window_half_px=given.window_half_px,
             ),
             refine=MARKER_METHODS["subpixel_fit"],
-            triangulate=TRIANGULATION_METHODS["dlt"],
             max_reprojection_px=given.max_reprojection_px,
         ),
         volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
 FAMILIES: dict[str, str] = {
     "marker": "flexsheet.nodes.triangulator.benchmarks:MARKER",
-    "triangulation": "flexsheet.nodes.triangulator.benchmarks:TRIANGULATION",
     "tracking": "flexsheet.launch.methods.benchmarks:TRACKING",
     "soft-body": "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY",
     "correction": "flexsheet.launch.methods.benchmarks:CORRECTION",

@@ -26,7 +26,6 @@ from flexsheet.nodes.renderer.sheet_mesh import MAX_TRIANGLES_DEPTH_M
 
 NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
     "marker": ("triangulator", "marker"),
-    "triangulation": ("triangulator", "triangulation"),
     "tracking": ("triangulator", "tracking"),
     "sheet_force": ("planner", "sheet_force"),
     "sheet_shape": ("renderer", "sheet_shape"),
@@ -37,7 +36,6 @@ NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
 
 NODE_DEFAULTS = Methods(
     marker="subpixel_fit",
-    triangulation="dlt",
     tracking="adaptive",
     sheet_force="scaled",
     sheet_shape="reduced_order",
@@ -48,7 +46,6 @@ NODE_DEFAULTS = Methods(
 
 PAPER = Methods(
     marker="moments",
-    triangulation="dlt",
     tracking="none",
     sheet_force="scaled",
     sheet_shape="four_triangles",
@@ -132,7 +129,6 @@ def choose_cheapest(scene: Scene) -> Methods:
     return Methods.model_validate(
         {
             "marker": "moments",
-            "triangulation": "dlt",
             "tracking": "one_euro",
             "sheet_force": "scaled" if is_scaled else "table",
             "sheet_shape": "four_triangles" if is_flat else "reduced_order",

@@ -35,7 +35,6 @@ from flexsheet.messages.methods import (
     SheetForceMethod,
     SheetShapeMethod,
     TrackingMethod,
-    TriangulationMethod,
 )
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Family, Point, Trial
@@ -88,15 +87,11 @@ def _make_soft_body(method: str, skin_spacing_m: float) -> Setting:
     return {"method": method, "skin_spacing_m": skin_spacing_m}
 
 
-_BENCHMARKS, _TRIANGULATOR, _FEM_SOLVER = (
-    "flexsheet.launch.methods.benchmarks",
-    "flexsheet.nodes.triangulator.benchmarks",
-    "flexsheet.nodes.fem_solver.benchmarks",
-)
+_BENCHMARKS = "flexsheet.launch.methods.benchmarks"
+_FEM_SOLVER = "flexsheet.nodes.fem_solver.benchmarks"
 TUNABLES = (
-    Tunable("marker", (f"{_TRIANGULATOR}:MARKER",), _make_settings(MarkerMethod)),
     Tunable(
-        "triangulation", (f"{_TRIANGULATOR}:TRIANGULATION",), _make_settings(TriangulationMethod)
+        "marker", ("flexsheet.nodes.triangulator.benchmarks:MARKER",), _make_settings(MarkerMethod)
     ),
     Tunable("tracking", (f"{_BENCHMARKS}:TRACKING",), _make_settings(TrackingMethod)),
     Tunable(

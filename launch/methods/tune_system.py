@@ -110,8 +110,6 @@ def _make_option(
             rate_hz *= IMAGES
             took_ms *= IMAGES
             biases = {SystemMetric.TO_ARM: took_ms, SystemMetric.TO_LIGHT: took_ms}
-        case "triangulation":
-            biases = {SystemMetric.TO_ARM: took_ms, SystemMetric.TO_LIGHT: took_ms}
         case "sheet-force":
             biases = {SystemMetric.FORCE: one.error}
         case "correction":
