@@ -40,9 +40,9 @@ from flexsheet.nodes.models.camera import camera_matrix, project
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
+    pose_matrix,
     rotation_from_vector,
     transform,
-    transform_from_rpy,
     vector_from_rotation,
 )
 from flexsheet.nodes.twin.arms import ArmMechanics
@@ -90,7 +90,7 @@ def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRi
         _make_camera_lens(measured.left),
         _make_camera_lens(measured.right),
         measured.right_from_left,
-        transform_from_rpy(pose.position_m, pose.rpy_rad),
+        pose_matrix(pose),
     )
 
 
@@ -309,7 +309,7 @@ def _is_same_pose(pose: Floats, other: Floats) -> bool:
 def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
     """Return a random world_from_base (4, 4) for the simulated arm, near the pose in the scene."""
     pose: Pose = getattr(scene.arms, side).world_from_base
-    nominal = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    nominal = pose_matrix(pose)
     random = np.random.default_rng([seed, side == "left"])
     rotation = rotation_from_vector(random.normal(0.0, SIMULATED_BASE_RAD, 3))
     return transform(
@@ -333,7 +333,7 @@ class SimulatedArm:
             self._offsets_rad, self._backlash_rad = np.zeros(6), None
             return
         pose = getattr(apply_apparatus(scene, apparatus).arms, side).world_from_base
-        self.world_from_base = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self.world_from_base = pose_matrix(pose)
         truth = getattr(apparatus.arms, side)
         self._offsets_rad, self._backlash_rad = (
             np.array(truth.joint_offsets_rad),
@@ -377,7 +377,7 @@ def simulate_poses(
     arm = SimulatedArm(scene, side, apparatus, seed=seed)
     base = arm.world_from_base
     camera_pose = true_camera.world_from_left
-    world_from_left = transform_from_rpy(camera_pose.position_m, camera_pose.rpy_rad)
+    world_from_left = pose_matrix(camera_pose)
     middle = 0.5 * board.square_m * np.array([board.columns - 1.0, board.rows - 1.0, 0.0])
     # Put the board 60 mm in front of the flange; it faces the camera while the arm reaches forward.
     ready_rad = arm.mechanics.start_rad

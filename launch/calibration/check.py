@@ -36,6 +36,7 @@ from flexsheet.launch.calibration.corners import (
 )
 from flexsheet.launch.calibration.selection import MIN_PAIRS, PairSelection, fit_selection
 from flexsheet.messages.calibration import Board, StereoCalibration
+from flexsheet.nodes.models.camera import camera_matrix
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ class StereoRig:
     def from_calibration(calibration: StereoCalibration) -> StereoRig:
         """Make the rig from a calibration file."""
         left, right = (
-            np.array([[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
+            camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
             for lens in (calibration.left, calibration.right)
         )
         distortions = np.array(calibration.left.distortion), np.array(calibration.right.distortion)

@@ -27,10 +27,10 @@ from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import make_kinematics
 from flexsheet.nodes.models.rigid import (
     apply,
+    pose_matrix,
     rotation_from_vector,
     rpy_from_rotation,
     transform,
-    transform_from_rpy,
 )
 from flexsheet.nodes.models.sheet import edge_force_n
 
@@ -161,7 +161,10 @@ class _ArmModel:
     def __init__(self, arm: ArmSpec, rows: Sequence[_Row]) -> None:
         self._rows = rows
         self._kinematics = make_kinematics(arm.model)
-        self._base, self._clamp = _matrix(arm.world_from_base), _matrix(arm.flange_from_edge)
+        self._base, self._clamp = (
+            pose_matrix(arm.world_from_base),
+            pose_matrix(arm.flange_from_edge),
+        )
         self.prior = np.zeros(19)
         self.prior[JOINTS] = arm.joint_offsets_rad
         self.prior[COMPLIANCE] = arm.flange_compliance_m_per_n or PRIOR_COMPLIANCE_M_PER_N
@@ -239,10 +242,6 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
         marks=len(rows),
         poses=poses,
     )
-
-
-def _matrix(pose: Pose) -> Floats:
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def _pose(matrix: Floats) -> Pose:

@@ -91,22 +91,27 @@ def _make_mark(side: Side, values: dict[str, float]) -> EdgeMark:
     return EdgeMark(side, np.array([0.0, 1e-3 * values["along_mm"], 0.0]), position)
 
 
+def make_detector_config() -> DetectorConfig:
+    """Make the settings of a marker detector from the default parameters of the triangulator."""
+    given = TriangulatorParameters()
+    return DetectorConfig(
+        blob_filter=BlobFilter(
+            min_contrast=given.marker_min_contrast,
+            min_area_px=given.marker_min_area_px,
+            max_area_px=given.marker_max_area_px,
+            window_half_px=given.window_half_px,
+        ),
+        refine=MARKER_METHODS["subpixel_fit"],
+        max_reprojection_px=given.max_reprojection_px,
+    )
+
+
 class MarkDetector:
     """Detector of marks in stereo images, with the triangulator's methods."""
 
     def __init__(self, scene: Scene, calibration: StereoCalibration | None) -> None:
-        given = TriangulatorParameters()
         self._geometry = StereoGeometry.of(scene.camera, calibration)
-        self._config = DetectorConfig(
-            blob_filter=BlobFilter(
-                min_contrast=given.marker_min_contrast,
-                min_area_px=given.marker_min_area_px,
-                max_area_px=given.marker_max_area_px,
-                window_half_px=given.window_half_px,
-            ),
-            refine=MARKER_METHODS["subpixel_fit"],
-            max_reprojection_px=given.max_reprojection_px,
-        )
+        self._config = make_detector_config()
 
     def find(
         self,

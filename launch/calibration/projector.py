@@ -21,10 +21,10 @@ from flexsheet.nodes.models.camera import camera_matrix, normalize, project
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
+    pose_matrix,
     rotation_from_vector,
     rpy_from_rotation,
     transform,
-    transform_from_rpy,
     vector_from_rotation,
 )
 
@@ -140,14 +140,14 @@ def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tup
     on_a = ((bb * da - ab * db) / denominator)[:, None] * a
     on_b = base + ((ab * da - aa * db) / denominator)[:, None] * b
     pose = camera.world_from_left
-    world_from_left = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    world_from_left = pose_matrix(pose)
     return apply(world_from_left, 0.5 * (on_a + on_b)), np.linalg.norm(on_a - on_b, axis=1)
 
 
 def project_points(projector: Projector, world: Floats) -> Floats:
     """Return the projector pixels (n, 2) that light world points (n, 3)."""
     lens, pose = projector.lens, projector.world_from_projector
-    local = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), world)
+    local = apply(inverse(pose_matrix(pose)), world)
     matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
     return project(local, matrix, np.array(lens.distortion))
 
@@ -226,7 +226,7 @@ def _rms(values: Floats) -> float:
 def _measure_depth_range(points: ProjectorPoints, guess: Projector) -> float:
     """Return the depth range (m) of the central 90 % of the points, along the projector's axis."""
     pose = guess.world_from_projector
-    along = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), points.world)[:, 2]
+    along = apply(inverse(pose_matrix(pose)), points.world)[:, 2]
     return float(np.ptp(np.quantile(along, [0.05, 0.95]))) if len(along) else 0.0
 
 
@@ -246,7 +246,7 @@ def _fit_projector(
     """
     world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
-    from_world = inverse(transform_from_rpy(pose.position_m, pose.rpy_rad))
+    from_world = inverse(pose_matrix(pose))
     aspect, k3 = lens.fy_px / lens.fx_px, lens.distortion[4]
     start = [
         *vector_from_rotation(from_world[:3, :3]),
@@ -316,7 +316,7 @@ def fit_keystone(
             "bottom right, top right, top left, as the user sees them"
         )
     lens, pose = guess.lens, guess.world_from_projector
-    start = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    start = pose_matrix(pose)
 
     def build_projector(numbers: Floats) -> Projector:
         x = numbers * TYPICAL_ERRORS

@@ -12,7 +12,7 @@ from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, Fingertip, Force
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.models.rigid import pose_matrix
 
 Floats = NDArray[np.float64]
 
@@ -98,10 +98,7 @@ def select_pushes(
     forces: times (ns) and forces (N). tips: positions (3,) of the fingertip; left, right: flange
     poses as rows (16,).
     """
-    clamps = [
-        transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)
-        for arm in (scene.arms.left, scene.arms.right)
-    ]
+    clamps = [pose_matrix(arm.flange_from_edge) for arm in (scene.arms.left, scene.arms.right)]
     half_height_m = 0.5 * scene.sheet.height_m
     pushes: list[MeasuredPush] = []
     unloading, extreme_m = False, 0.0

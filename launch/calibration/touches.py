@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.calibration.edge_marks import make_detector_config
 from flexsheet.launch.calibration.marker_fit import Touch
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.messages.apparatus import Apparatus
@@ -16,9 +17,7 @@ from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import rotation_from_vector
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
-from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
-from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
+from flexsheet.nodes.triangulator.fingertip import detect_all
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
@@ -211,21 +210,11 @@ def _see_marker(
 ) -> TriangulatedPoint | None:
     """Return the detected marker for a pad position; None if it is not accepted."""
     left, right = camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s)
-    given = TriangulatorParameters()
     found = detect_all(
         left,
         right,
         geometry=geometry,
-        config=DetectorConfig(
-            blob_filter=BlobFilter(
-                min_contrast=given.marker_min_contrast,
-                min_area_px=given.marker_min_area_px,
-                max_area_px=given.marker_max_area_px,
-                window_half_px=given.window_half_px,
-            ),
-            refine=MARKER_METHODS["subpixel_fit"],
-            max_reprojection_px=given.max_reprojection_px,
-        ),
+        config=make_detector_config(),
         volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),
         gate=None,
     )
