@@ -65,13 +65,14 @@ BOARD_COLUMNS = (
 )
 
 MAX_STILL_RAD, MIN_STILL_S = 0.0005, 0.7
-"""Maximum joint motion of an arm that counts as resting, and minimum duration of the rest."""
+"""The maximum joint motion of an arm that counts as resting, and minimum duration of the rest."""
 
 MIN_NEW_ROTATION_RAD, MIN_NEW_SHIFT_M = 0.05, 0.01
-"""Minimum rotation or translation of the board between two recorded poses."""
+"""The minimum rotation or translation of the board between two recorded poses."""
 
 SIMULATED_BASE_M, SIMULATED_BASE_RAD, SIMULATED_JOINT_RAD = 0.005, 0.01, 2e-4
-"""Standard deviations of the simulated bases from those in the scene, and of the joint errors."""
+"""The standard deviations of the simulated bases from those in the scene, and of the joint errors.
+"""
 
 
 class ArmPosesError(FlexsheetError, ValueError):
@@ -102,7 +103,7 @@ def _make_camera_lens(lens: SceneLens) -> CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class PoseRow:
-    """Row of a table of arm poses, with either image files or a board pose.
+    """A row of a table of arm poses, with either image files or a board pose.
 
     joints_rad: (6,). images: left and right image file. left_from_board: board pose (4, 4).
     """
@@ -231,7 +232,7 @@ def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
 
 
 class PoseRecorder:
-    """Recorder that stores a pose to a folder whenever the arm rests and the board's pose is new.
+    """A recorder that stores a pose to a folder whenever the arm rests and the board's pose is new.
 
     Joint angles and images must be added in the order of their times (s, on one clock).
     """
@@ -318,7 +319,7 @@ def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
 
 
 class SimulatedArm:
-    """Simulated arm without a sheet: true pose of its base, and true errors of its joints.
+    """A simulated arm without a sheet: true pose of its base, and true errors of its joints.
 
     Without an apparatus (true hardware parameters), the base deviates at random from the scene's,
     and each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, its base pose and

@@ -43,7 +43,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class StereoRig:
-    """Stereo camera in OpenCV's form: matrices (3, 3), distortions (5,), transform (4, 4)."""
+    """A stereo camera in OpenCV's form: matrices (3, 3), distortions (5,), transform (4, 4)."""
 
     matrices: tuple[Floats, Floats]
     distortions: tuple[Floats, Floats]
@@ -68,7 +68,7 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class BoardMeasurement:
-    """Errors of a board that was measured with a stereo camera, m and px.
+    """The errors of a board that was measured with a stereo camera, m and px.
 
     squares_m: errors of the distances between neighbouring corners. diagonals_m: errors of the
     lengths of the diagonals. rigid_fit_m: distances of the corners from the fitted board. The

@@ -37,27 +37,27 @@ Image = NDArray[np.uint8]
 SIDES: tuple[Side, Side] = ("left", "right")
 JOINT_COLUMNS = tuple(f"{side}_j{number}_deg" for side in SIDES for number in range(1, 7))
 COLUMNS = ("pose", "side", "along_mm", "x_mm", "y_mm", "z_mm", *JOINT_COLUMNS)
-"""Columns of the CSV file, which has one row for each mark in each pose: number of the pose, arm,
-position of the mark along the clamped edge from its centre, measured position in the world, and
-the joint angles of both arms."""
+"""The columns of the CSV file, which has one row for each mark in each pose: number of the pose,
+arm, position of the mark along the clamped edge from its centre, measured position in the world,
+and the joint angles of both arms."""
 
 MAX_PROBLEMS = 20
 
 ALONG = (-0.45, 0.0, 0.45)
-"""Positions of the simulated marks along the edge, as fractions of its length."""
+"""The positions of the simulated marks along the edge, as fractions of its length."""
 
 SIMULATED_POSES = 24
 MAX_TRIES = 400
 TILT_RAD = np.array([0.5, 0.35, 0.1])
 CENTRE_MIN_M, CENTRE_MAX_M = np.array([-0.02, -0.03, -0.02]), np.array([0.02, 0.03, 0.03])
 MIN_STRETCH, STRETCH_RANGE = 1.005, 0.9
-"""Minimum stretch ratio, and fraction of the range from there to the maximum that is used."""
+"""The minimum stretch ratio, and fraction of the range from there to the maximum that is used."""
 
 SEARCH_M = 0.02
-"""Maximum distance of a mark from its expected position."""
+"""The maximum distance of a mark from its expected position."""
 
 MIN_NEW_JOINT_RAD = 0.02
-"""Minimum rotation of a joint between two recorded poses."""
+"""The minimum rotation of a joint between two recorded poses."""
 
 
 def read_edge_marks(path: Path) -> list[HeldPose]:
@@ -107,7 +107,7 @@ def make_detector_config() -> DetectorConfig:
 
 
 class MarkDetector:
-    """Detector of marks in stereo images, with the triangulator's methods."""
+    """A detector of marks in stereo images, with the triangulator's methods."""
 
     def __init__(self, scene: Scene, calibration: StereoCalibration | None) -> None:
         self._geometry = StereoGeometry.of(scene.camera, calibration)
@@ -142,7 +142,7 @@ class MarkDetector:
 
 
 class EdgeMarkRecorder:
-    """Recorder that appends the marks to a CSV file whenever both arms rest in a new pose.
+    """A recorder that appends the marks to a CSV file whenever both arms rest in a new pose.
 
     Joint angles and images must be added in the order of their times (s, on one clock).
     """

@@ -1,4 +1,4 @@
-"""Calibrate the projector's optics and pose from the points that its pixels light.
+"""Calibrate the optics and the pose of the projector from the points that its pixels light.
 
 A projector is an inverse camera: each of its pixels lights a point, whose position two cameras
 measure. The poses of the sheet on which the points lie therefore need not be known.
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 GRID_PX = 20
-"""Distance between the sampled projector pixels, px."""
+"""The distance between the sampled projector pixels, px."""
 
 MIN_POSES, MIN_POINTS = 3, 200
 MIN_DEPTH_RANGE_M = 0.03
@@ -41,7 +41,7 @@ MAX_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
 OUTLIER_RATIO = 4.0
 TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
-"""Typical errors of a projector in a scene that was measured by tape; only their ratios matter.
+"""The typical errors of a projector in a scene that was measured by tape; only their ratios matter.
 
 Rotation (rad), position (m), focal length (relative), principal point (px).
 """
@@ -57,7 +57,7 @@ class ProjectorError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ProjectorPoints:
-    """Points that projector pixels light.
+    """The points that projector pixels light.
 
     world: positions (n, 3), m. pixels: projector pixels (n, 2). pose: index (n,) of the sheet's
     pose. skew_m: distance (n,) between the rays of the two cameras.
@@ -71,7 +71,7 @@ class ProjectorPoints:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorFit:
-    """Calibrated projector and its residuals, in projector pixels and in metres on the sheet.
+    """A calibrated projector and its residuals, in projector pixels and in metres on the sheet.
 
     held_out_rms_px: rms residual of poses that were excluded from the fit. before_rms_px: rms
     residual of the initial projector. coverage_ratio: fraction of the image's cells that contain

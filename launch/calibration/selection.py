@@ -34,14 +34,14 @@ MISFIT_RATIO = 5.0
 MIN_MISFIT_PX = 5.0
 MISFIT = "inconsistent with the other pairs:"
 CORNER_RATIO = 6.0
-"""Residual above which a corner is an outlier, in standard deviations."""
+"""The residual above which a corner is an outlier, in standard deviations."""
 
 CORNER_ROUNDS = 2
 MAX_OUTLIER_FRACTION = 0.15
-"""Maximum fraction of outlier corners in a pair; a pair with more is excluded."""
+"""The maximum fraction of outlier corners in a pair; a pair with more is excluded."""
 
 REPEAT_PX = 1.0
-"""Maximum distance of corners (px) between two pairs that count as the same board pose."""
+"""The maximum distance of corners (px) between two pairs that count as the same board pose."""
 
 
 def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) -> Floats:
@@ -147,7 +147,7 @@ def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
 
 
 def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
-    """Return the median distance between common corners, px; the larger one of both views."""
+    """Return the larger of both views' median distances between common corners, px."""
     medians = []
     for here, there in ((pair.left, other.left), (pair.right, other.right)):
         _, a, b = np.intersect1d(here.ids, there.ids, assume_unique=True, return_indices=True)
@@ -158,7 +158,7 @@ def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
 
 
 class PairSelection:
-    """Pairs that remain in a calibration, and the reasons for which others were excluded.
+    """The pairs that remain in a calibration, and the reasons for which others were excluded.
 
     good: indices of the remaining pairs. reasons: reason for each excluded pair, by index.
     residuals: rms (2,) px of the left and right view by index, including excluded pairs.
@@ -208,7 +208,9 @@ class PairSelection:
                 self.good[i] = pair
 
     def stray_corners(self, number: int) -> int:
-        """Return how many corners were removed from both views of the pair with index `number`."""
+        """Return the number of corners that were removed from both views of the pair with index
+        `number`.
+        """
         whole = self.found[number]
         if isinstance(whole, str) or number not in self.good:
             return 0

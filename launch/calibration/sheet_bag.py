@@ -17,19 +17,19 @@ from flexsheet.nodes.models.rigid import pose_matrix
 Floats = NDArray[np.float64]
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""Time before and after a measured force, and maximum change of the depth in this time.
+"""The time before and after a measured force, and maximum change of the depth in this time.
 
 Gauges lag, so that forces during a motion cannot be used.
 """
 
 MAX_GAP_S = 0.05
-"""Maximum time between a force and the nearest messages of fingertip and arms."""
+"""The maximum time between a force and the nearest messages of fingertip and arms."""
 
 MIN_DEPTH_M = 0.003
-"""Minimum depth; below it, errors of the fingertip's position dominate the force."""
+"""The minimum depth; below it, errors of the fingertip's position dominate the force."""
 
 REVERSAL_M = 0.001
-"""Change of the depth that counts as loading or unloading."""
+"""The minimum change of the depth that counts as loading or unloading, in metres."""
 
 MAX_ROWS = 300
 
@@ -144,7 +144,9 @@ def _gap_s(motion: SampledMotion, at_ns: int) -> float:
 
 
 def _locate(tip: Floats, left: Floats, right: Floats) -> tuple[float, tuple[float, float], float]:
-    """Return depth behind the plane of the sheet, position on it, and edge distance, m."""
+    """Return the depth of a fingertip behind the plane of the sheet, its position (x, y) on the
+    sheet, and the distance of the edges, m.
+    """
     across = right[:3, 3] - left[:3, 3]
     distance_m = float(np.linalg.norm(across))
     x_axis = across / distance_m

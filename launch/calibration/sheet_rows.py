@@ -22,10 +22,11 @@ OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm", "unloading")
 COLUMNS = (*STRETCH, *REQUIRED, *OPTIONAL)
 
 MAX_PROBLEMS = 20
-"""Maximum number of problems that are listed; further problems are only counted."""
+"""The maximum number of problems that are listed; further problems are only counted."""
 
 MAX_LENGTH_RATIO = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
-"""Maximum plausible length divided by the sheet's width; a larger one has probably another unit."""
+"""The maximum plausible length divided by the sheet's width, by column. A larger length probably
+has another unit."""
 
 
 def read_rows(
@@ -192,7 +193,7 @@ def _make_push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: floa
 SIMULATED_DEPTHS_M = (0.002, 0.004, 0.007, 0.012, 0.020, 0.030, 0.040, 0.050)
 SIMULATED_STRETCHES = 4
 SIMULATED_XS, SIMULATED_YS = (0.0, 0.13, 0.25), (0.0, 0.19, 0.36)
-"""Pushed points from the sheet's centre, as fractions of its width (x) and height (y)."""
+"""The pushed points from the sheet's centre, as fractions of its width (x) and height (y)."""
 
 
 def simulate_rows(

@@ -34,7 +34,7 @@ COLUMNS = (*REQUIRED, *NORMAL)
 MAX_PROBLEMS = 20
 MAX_TILT_DEG = 120.0
 MAX_LENGTH_MM = 5000.0
-"""Maximum plausible coordinate; a larger number is probably in another unit."""
+"""The maximum plausible coordinate; a larger number is probably in another unit."""
 
 
 def read_touches(path: Path, scene: Scene) -> list[Touch]:
@@ -143,13 +143,16 @@ SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20),
                        (10, -10), (-10, -10), (-10, 0), (25, 10), (25, -10), (0, 18),
                        (30, 0), (20, 20), (-25, 10), (8, 25), (40, 0), (35, 20),
                        (35, -20))  # fmt: skip
-"""Orientations in which the marker is looked at, like a person would, before the touches."""
+"""The orientations of the finger, as tilts about x and y in degrees, in which the marker is
+measured before the touches."""
 TOUCHED_ORIENTATIONS = 6
-"""Number of these orientations, those in which the camera sees the marker best, for the touches."""
+"""The number of orientations in which points are touched. These are the orientations with the
+smallest uncertainty of the marker."""
 SIMULATED_POINTS_M = np.array([[x, y, 0.01] for y in (0.0, 0.04) for x in (-0.03, 0.01, 0.05)])
-"""Corners of a board that are touched, (n, 3)."""
+"""The touched corners of a simulated board (n, 3), in metres."""
 SIMULATED_CORNER_M, SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, 1e-4, math.radians(1.0)
-"""Standard deviations per axis of the measured corners, of the pad's position, and of angles."""
+"""The standard deviations per axis of the measured corners, of the pad's position, and of angles.
+"""
 
 
 def simulate_touches(

@@ -119,7 +119,7 @@ def make_push_series(along_mm: float, tilt_deg: float) -> Series:
 
 
 RAMPS: tuple[Pattern, ...] = ("coordinate_ramp_x", "coordinate_ramp_y")
-"""Patterns whose brightness encodes x or y on the screen plane, for errors at all points."""
+"""The patterns whose brightness encodes x or y on the screen plane, for errors at all points."""
 
 
 def make_pattern_label(label: str, pattern: Pattern) -> str:
@@ -139,7 +139,7 @@ def make_eye_key(label: str, viewpoint: Viewpoint) -> str:
 
 @dataclass(frozen=True, slots=True)
 class EyeImage:
-    """Image that the simulated eye sees, with the image that it should see (`expected`)."""
+    """An image that the simulated eye sees, with the image that it should see (`expected`)."""
 
     label: str
     correction: Correction

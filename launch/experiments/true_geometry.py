@@ -32,7 +32,9 @@ def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Fl
 
 @dataclass(frozen=True, slots=True)
 class ArmModel:
-    """Geometry of one arm: its mechanics, and the poses (4, 4) of its base and its clamped edge."""
+    """The geometry of one arm: its mechanics, and the poses (4, 4) of its base and its clamped
+    edge.
+    """
 
     mechanics: ArmMechanics
     world_from_base: Floats

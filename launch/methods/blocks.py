@@ -30,8 +30,8 @@ def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[s
 def bootstrap_median(values: Floats) -> Interval | None:
     """Return the median of values (n,), one per block, with its confidence interval.
 
-    NaN marks a failed run. None if there are no finite values. If only one block has a value, the
-    limits are infinite.
+    NaN marks a failed run. Return None if there are no finite values. If only one block has a
+    value, the limits are infinite.
     """
     known = values[np.isfinite(values)]
     if len(known) == 0:
@@ -48,7 +48,7 @@ def bootstrap_median(values: Floats) -> Interval | None:
 def compare_paired(values: Floats, control: Floats) -> Interval | None:
     """Return the median ratio of positive values (n,) to the control's values in the same blocks.
 
-    It is computed from logarithms, so that a ratio and its inverse have the same weight.
+    The median is computed from logarithms, so that a ratio and its inverse have the same weight.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = bootstrap_median(np.log(values / control))

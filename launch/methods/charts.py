@@ -37,7 +37,7 @@ FAMILIES: dict[str, str] = {
     "sheet-force": "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
     "sheet-shape": "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
 }
-"""Location `module:NAME` of each method family, by its name on the command line."""
+"""The location `module:NAME` of each method family, by its name on the command line."""
 
 REPEATS = 30
 PROGRESS_PERIOD_S = 1.0

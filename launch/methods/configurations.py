@@ -32,7 +32,7 @@ NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
     "correction": ("renderer", "correction"),
     "compliance": ("planner", "compliance_mode"),
 }
-"""Node type, and its parameter that selects the method, for each key of `Methods`."""
+"""The node type, and its parameter that selects the method, for each key of `Methods`."""
 
 NODE_DEFAULTS = Methods(
     marker="subpixel_fit",
@@ -42,7 +42,7 @@ NODE_DEFAULTS = Methods(
     correction="two_pass",
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.003),
 )
-"""Methods that the nodes use if the scene contains no choice."""
+"""The methods that the nodes use if the scene contains no choice."""
 
 PAPER = Methods(
     marker="moments",
@@ -53,12 +53,12 @@ PAPER = Methods(
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.0045),
     compliance="stiffness",
 )
-"""Methods of Furukawa et al. 2007, sections III and IV: no filter, linear FEM, four triangles, and
-stiffness rendered by the sheet's stretch only."""
+"""The methods of Furukawa et al. 2007, sections III and IV: no filter, linear FEM, four triangles,
+and stiffness rendered by the sheet's stretch only."""
 
 PAPER_PLANNER = {"prediction_horizon_s": 0.0}
-"""Parameters of the planner for the same paper, which does not compensate the delay (section V-C).
-"""
+"""The parameters of the planner for the same paper, which does not compensate the delay (section
+V-C)."""
 
 FINEST = NODE_DEFAULTS.model_copy(
     update={
@@ -96,7 +96,7 @@ class Configuration:
         ]
 
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
-        """Compute and cache the tables of the sheet that the methods need, so that no run has to.
+        """Compute and cache the tables of the sheet that the methods need.
 
         A missing table of the soft body is not computed; the linear method then replaces it.
         """
@@ -113,7 +113,7 @@ class Configuration:
 def choose_cheapest(scene: Scene) -> Methods:
     """Return the cheapest method of each family whose range contains the scene's working range.
 
-    Errors are not considered. If no method of a family has a sufficient range, the one with the
+    Errors are not considered. If no method of a family has a sufficient range, the method with the
     largest range is returned.
     """
     depth_m, tilt_deg = scene.working_range.push_depth_m, np.degrees(scene.working_range.tilt_rad)
@@ -149,7 +149,7 @@ def choose_tuned(scene: Scene) -> Methods:
 TUNED = "tuned"
 NAMES = ("paper", "cheapest in range", "default", TUNED, "most exact")
 CONTROL = TUNED
-"""Configuration with which the others are compared; it runs twice in each block."""
+"""The configuration with which the others are compared; it runs twice in each block."""
 
 CONTROL_AGAIN = "tuned, again"
 

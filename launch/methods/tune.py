@@ -41,9 +41,9 @@ from flexsheet.nodes.methods import Family, Point, Trial
 
 REPEATS = 10
 MARGIN = 0.2
-"""Fraction of a tolerance that is reserved for errors in cases that are not measured."""
+"""The fraction of a tolerance that is reserved for errors in cases that are not measured."""
 TIE_RATIO = 1.1
-"""Maximum ratio of a method's time to the fastest time at which both count as equally fast.
+"""The maximum ratio of a method's time to the fastest time at which both count as equally fast.
 
 Of equally fast methods, the most accurate one is chosen.
 """
@@ -61,11 +61,11 @@ class UnknownTunableError(FlexsheetError, KeyError):
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """Method family whose method can be chosen in a scene.
+    """A method family whose method can be chosen in a scene.
 
-    families: families of which it consists, as `module:NAME`, in the order of measurement. Later
-    ones take minutes to prepare and are measured only if no earlier method is sufficient. settings:
-    value to write into the scene for each method, by the method's name in the family's chart.
+    families: locations `module:NAME` of its parts, in the order of measurement. Later parts take
+    minutes to prepare, and are measured only if no earlier method is sufficient. settings: value to
+    write into the scene for each method, by the method's name in the family's chart.
     """
 
     name: str
@@ -127,7 +127,7 @@ TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
     "reduced_order": "two_pass",
 }
-"""Names of the two-pass image correction in its chart, by method of the sheet shape."""
+"""The names of the two-pass image correction in its chart, by method of the sheet shape."""
 
 
 def find_tunables(names: Sequence[str]) -> list[Tunable]:
@@ -141,7 +141,7 @@ def find_tunables(names: Sequence[str]) -> list[Tunable]:
 
 @dataclass(frozen=True, slots=True)
 class MethodEvaluation:
-    """Evaluation of one method over a scene's working range.
+    """The evaluation of one method over a scene's working range.
 
     median_s, slowest_s: median and maximum of the time per call over the cases. error: maximum
     error within the method's stated range, found at `worst_case`; infinite if no reference is
@@ -171,7 +171,7 @@ class MethodEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Choice of one method of a family, with the evaluations of all its measured methods."""
+    """The choice of one method of a family, with the evaluations of all its measured methods."""
 
     family: str
     key: str
@@ -444,7 +444,7 @@ def _make_line(choice: Choice, indent: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Block `methods` of a scene file, with the indices of its lines.
+    """The block `methods` of a scene file, with the indices of its lines.
 
     start: first line, including the generated comment above it. end: line after the block. If the
     file has no such block, both are the end of the file. header: the line `methods:`, if it can be
@@ -498,7 +498,7 @@ def _format_flow(item: Any) -> str:
 
 
 FILES = (("object", "geometry", "file"), ("object", "appearance", "image_file"))
-"""Keys of a scene file whose values are paths relative to the file's folder."""
+"""The keys of a scene file whose values are paths relative to the file's folder."""
 
 
 def relocate_paths(text: str, source: Path, target: Path) -> str:

@@ -43,10 +43,10 @@ from flexsheet.nodes.methods import Point, Trial
 from flexsheet.nodes.triangulator.tracking_benchmark import make_tracking_family
 
 RENDERED_HZ = 30.0
-"""Maximum frame rate of the renderer in `launch/demo.yaml`."""
+"""The maximum frame rate of the renderer in `launch/demo.yaml`."""
 
 IMAGES = 2
-"""Number of images per exposure in which the marker is searched."""
+"""The number of images per exposure in which the marker is searched."""
 
 STROKE_S = 10.0
 LEAD = "lead_ms"
