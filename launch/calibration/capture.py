@@ -1,4 +1,4 @@
-"""Select image pairs of a board during live capture, so that they cover what a calibration needs.
+"""Select image pairs of a board during live capture for a stereo calibration.
 
 A pair is accepted if the board is at rest in a new pose and adds coverage: cells of the image,
 tilts, distances, or the number of pairs.

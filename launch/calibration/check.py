@@ -1,7 +1,8 @@
 """Evaluate a stereo calibration by measuring a board of known size.
 
-On image pairs that were used to calibrate, errors are underestimated. `check_stereo` is therefore
-for other pairs, and `cross_check` measures each pair with a calibration from the remaining pairs.
+On image pairs that were used to calibrate, errors are underestimated. Therefore `check_stereo`
+needs further pairs, and `cross_check` measures each pair with a calibration from the remaining
+pairs.
 """
 
 from __future__ import annotations
@@ -161,7 +162,7 @@ def summarize(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | Non
     square_rms_mm: error of the distances between neighbouring corners. diagonal_rms_mm: error of
     the lengths of the board's diagonals. rigid_fit_rms_mm: distance of the corners from the board
     after a rigid fit. reprojection_rms_px: distance of the detected corners from the projections of
-    the triangulated ones.
+    the triangulated corners.
     """
     return {
         "pairs": len(boards),
@@ -268,7 +269,8 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Cross-validate: calibrate with `leave_out` pairs left out at a time, and measure those.
+    """Cross-validate: calibrate without `leave_out` pairs at a time, and measure the excluded
+    pairs.
 
     The pairs i, i+G, i+2G, ... form a group that is left out together, because consecutive images
     are similar. For chessboards, the same is done with plain OpenCV for comparison. Raises

@@ -1,9 +1,9 @@
 """Run all calibrations of a laboratory in sequence, and store their results in one folder.
 
 This is commissioning: `flexsheet commission`. The folder holds the state (`commission.json`), the
-calibration files, the scene and the launch file that use them, and a report. A step starts from
-the scene with the results of all steps before it. A repeated step therefore invalidates the later
-ones, which must be run again.
+calibration files, the scene and the launch file that use them, and a report. A step starts from the
+scene with the results of all steps before it. Therefore a repeated step invalidates all later
+steps, which must be run again.
 """
 
 from __future__ import annotations

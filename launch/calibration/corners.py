@@ -280,7 +280,7 @@ def read_gray(path: Path) -> Image:
 
 
 def compute_digest(left: Path, right: Path) -> str:
-    """Return a digest that distinguishes a pair of files from others with the same names."""
+    """Return a digest of the contents of two image files, 16 hexadecimal digits."""
     return hashlib.sha256(left.read_bytes() + right.read_bytes()).hexdigest()[:16]
 
 

@@ -202,9 +202,9 @@ def simulate_edge_marks(
 ) -> list[HeldPose]:
     """Simulate marks on the clamps that the simulated stereo camera measures.
 
-    The arms hold the stretched sheet in random poses. In each pose every joint rests at a
-    random angle within its backlash. Marks that the triangulator's detector rejects are left out.
-    calibration: camera parameters that the detector uses; None: those of the scene.
+    The arms hold the stretched sheet in random poses. In each pose every joint rests at a random
+    angle within its backlash. Marks that the triangulator's detector rejects are left out.
+    calibration: camera parameters that the detector uses; None: the scene's parameters.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)

@@ -217,7 +217,7 @@ def simulate_alignments(
     The arms hold the flat sheet at the screen. An alignment is omitted if the viewer does not see
     the sheet behind the bead, or if the detector rejects one of the points. apparatus: true
     parameters of the simulated hardware. calibration: camera parameters that the detector uses;
-    None: those of the scene.
+    None: the scene's parameters.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)

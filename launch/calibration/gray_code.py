@@ -29,7 +29,8 @@ MIN_STRIPE_PX = 4
 """The width of the finest stripes that are decoded, projector pixels."""
 
 WINDOW_HALF_PX = 22.0
-"""Half the side length of the window of the fit around a projector pixel, projector pixels."""
+"""The half side length, in projector pixels, of the window that is fitted around a projector pixel.
+"""
 
 MIN_CELLS = 60
 MAX_FIT_RMS_PX = 0.6
@@ -104,7 +105,10 @@ def _bits(size_px: int) -> int:
 
 
 def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
-    """Return the camera pixels (n, 2) of projector pixels (n, 2), and a mask (n,) of valid ones."""
+    """Find the camera pixels (n, 2) of projector pixels (n, 2).
+
+    Return the camera pixels, and a mask (n,) that is true for valid pixels.
+    """
     found, valid = np.zeros((len(projector_px), 2)), np.zeros(len(projector_px), np.bool_)
     order = np.argsort(view.lit_by[:, 0], kind="stable")
     lit_by, pixels = view.lit_by[order], view.pixels[order]

@@ -137,7 +137,7 @@ class CornerView:
 
 @dataclass(frozen=True, slots=True)
 class BoardDetection:
-    """One pose of the arm: joint angles (6,), rad, and the board's corners in both images."""
+    """A pose of the arm: joint angles (6,), rad, and the board's corners in both images."""
 
     name: str
     joints_rad: Floats
@@ -171,8 +171,8 @@ class BaseFit:
 
     corner_sigma_px: standard deviation of one corner coordinate. arm_sigma_rad, arm_sigma_m:
     standard deviations of one component of the flange's pose error. jackknife_ratio: ratio of the
-    standard deviations from the jackknife to those from the fit (rms over six). leave_one_out:
-    motions (n, 6) of the base when one inlier is excluded.
+    standard deviations from the jackknife to the standard deviations from the fit (rms over the six
+    components). leave_one_out: motions (n, 6) of the base when one inlier is excluded.
     """
 
     world_from_base: Floats

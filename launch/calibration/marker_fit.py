@@ -67,7 +67,7 @@ class MarkerFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """One touch of a known point or plane, during which the finger was at rest.
+    """A touch of a known point or plane, during which the finger was at rest.
 
     marker_m, point_m: measured marker and touched point (3,), world. normal: (3,) of a touched
     plane; None: the pad was at the point. world_from_finger: rotation (3, 3).

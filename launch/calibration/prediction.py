@@ -272,7 +272,10 @@ def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: R
 
 
 def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
-    """Draw random modulus and slack width of the sheet; empty without a sheet calibration."""
+    """Draw a random modulus and slack width of the sheet.
+
+    Return an empty mapping without a sheet calibration.
+    """
     sheet = known.calibrations.sheet
     if sheet is None:
         return {}
@@ -285,8 +288,8 @@ def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
 
 
 def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Random) -> Apparatus:
-    """Return a copy of the apparatus with a random hysteresis that is consistent with the
-    calibration.
+    """Draw a random hysteresis that is consistent with the calibration; return the changed
+    apparatus.
 
     The calibration measures how much smaller the force is while unloading than while loading, at
     the same depth. Creep explains a part of this difference, and the hysteresis the remainder.

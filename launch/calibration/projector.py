@@ -241,8 +241,8 @@ def _fit_projector(
 ) -> Projector:
     """Fit a projector by least squares: one focal length, principal point, k1, k2, p1, p2.
 
-    Aspect ratio and k3 are those of the guess. OpenCV's fit is not used, because it rejects a
-    principal point outside the image, which lens shift causes.
+    The aspect ratio and k3 are fixed to the values of the guess. OpenCV's fit is not used, because
+    it rejects a principal point outside the image, which lens shift causes.
     """
     world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector

@@ -65,7 +65,7 @@ def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) 
 def compute_misfits(
     pairs: Sequence[BoardPair], points: Floats, left: Floats, right: Floats
 ) -> tuple[Floats, Floats]:
-    """Measure how much each pair contradicts the others, to find wrongly matched images.
+    """Measure the deviation of each pair from a reference pair, to find wrongly matched images.
 
     Each pair alone determines the relative pose of the cameras. The reference is the pair whose
     pose has the smallest median deviation over all pairs (least median of squares, Rousseeuw 1984).
@@ -128,7 +128,7 @@ def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardP
 
 
 def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
-    """Find pairs that repeat an earlier board pose; map their indices to the earlier ones.
+    """Map the index of each pair that repeats a board pose to the index of the earlier pair.
 
     Repeated pairs have the same errors, so they must not count as independent measurements.
     """
@@ -185,7 +185,10 @@ class PairSelection:
         return list(self.good.values())
 
     def exclude_pairs(self, errors_px: Floats, ratio: float, min_px: float, what: str) -> bool:
-        """Exclude pairs with errors above `min_px` and `ratio` medians; return whether any was."""
+        """Exclude pairs with errors above `min_px` and `ratio` medians.
+
+        Return whether a pair was excluded.
+        """
         limit_px = max(ratio * float(np.median(errors_px)), min_px)
         bad = [
             (i, error) for i, error in zip(self.good, errors_px, strict=True) if error > limit_px
@@ -218,7 +221,7 @@ class PairSelection:
 
 
 def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int]) -> RigFit:
-    """Fit the rig to the reliable pairs and corners, and exclude the others from the selection.
+    """Fit the rig to the reliable pairs and corners, and exclude unreliable pairs.
 
     Excludes pairs that contradict the others (`compute_misfits`), corners with residuals above six
     standard deviations, and pairs whose residual exceeds half a pixel and three times the median.

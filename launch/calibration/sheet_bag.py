@@ -37,8 +37,8 @@ MAX_ROWS = 300
 def read_pushes(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
     """Return the scene of a bag, and the pushes in which the finger rested in the sheet.
 
-    Fingertip and arm poses are those that the nodes measured. Raises SheetModelFitError if the bag
-    has no scene, or no pushes with a valid contact force.
+    The pushes are computed from the fingertip and arm poses that the nodes measured. Raises
+    SheetModelFitError if the bag has no scene, or no pushes with a valid contact force.
     """
     scene: Scene | None = None
     tips: list[tuple[int, Floats]] = []

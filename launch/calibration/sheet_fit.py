@@ -48,7 +48,7 @@ class SheetModelFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPush:
-    """One measured push.
+    """A measured push of a finger into the sheet; lengths in metres, forces in newtons.
 
     position_m: contact on the stretched sheet, from its centre. edge_force_n: force on a clamped
     edge; None if not measured. unloading: whether the finger was deeper before; None if unknown.
@@ -312,8 +312,8 @@ def tabulate_pushes(
     """Tabulate the measured corrections of the model, from the used rows.
 
     Every combination of stretch, x and y must occur; points are identified by their distance from
-    the sheet's centre. Depths may differ; they are interpolated to the range that all combinations
-    have. Raises SheetModelFitError for an incomplete grid.
+    the sheet's centre. Depths may differ. Corrections are interpolated at depths that all combinations
+    cover. Raises SheetModelFitError for an incomplete grid.
     """
     cells: dict[tuple[float, float, float], list[tuple[float, float]]] = {}
     ratios = _force_ratios(law, pushes, nominal_width_m) + 1.0

@@ -208,7 +208,7 @@ def simulate_rows(
     """Simulate pushes over the scene's stretches and depths, with the noise of a force gauge.
 
     places: whether to push at points all over the sheet, not only at its centre. apparatus: true
-    parameters of arms and sheet; None: those of the scene. Rubber with hysteresis gives one row
+    parameters of arms and sheet; None: the scene's parameters. Rubber with hysteresis gives one row
     for loading and one for unloading.
     """
     rng = np.random.default_rng(seed)

@@ -29,7 +29,7 @@ class ExperimentInterruptedError(ExperimentError):
 
 
 def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
-    """Check names and remove duplicates; without names, return all known ones.
+    """Check names and remove duplicates; without names, return all known names.
 
     kind: noun for the names in the error text. Raises ExperimentError for an unknown name.
     """

@@ -161,7 +161,7 @@ def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_t
     async def procedure(driver: Driver, scene: Scene) -> None:
         await driver.wait_for_table(scene, method, progress)
         for press in make_presses(scene):
-            progress(press.path.label)
+            progress(f"pushing along the finger path {press.path.label}")
             await driver.follow(press.path)
 
     return procedure

@@ -83,7 +83,8 @@ SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
 
 @dataclass(frozen=True, slots=True)
 class LimitedMotion:
-    """m limited quantities of a mechanism at n time steps, linear in k deviations from a motion.
+    """The m limited quantities of a mechanism at n time steps, linear in k deviations from a
+    motion.
 
     values: (n, m), quantities in the nominal motion. slopes: (n, m, k), derivatives with respect to
     the deviations. max_rate, max_acceleration, low, high: (m,), limits; infinite if there is none.

@@ -2,7 +2,7 @@
 
 `benchmarks.force_reference` computes the curves and describes the method. They are dimensionless:
 lengths are in finger radii, forces in Young's modulus times the squared finger radius. Therefore
-they are valid for every scene of the same proportions.
+each curve is valid for all scenes with the same proportions.
 """
 
 from __future__ import annotations

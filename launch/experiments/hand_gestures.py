@@ -291,7 +291,7 @@ def run_gestures(
     async def procedure(driver: Driver, _: Scene) -> None:
         await driver.wait_for_table(scene, "quick_table", progress)
         for name, (make_path, _touches) in HAND_GESTURES.items():
-            progress(name)
+            progress(f"performing the gesture {name}")
             await driver.follow(make_path(scene, depth_m))
 
     bag = folder / "gestures.mcap"

@@ -78,7 +78,7 @@ def push_path(
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One of the two image experiments.
+    """An image experiment, in which one quantity varies.
 
     key: result column of the varied value. name: format of a case's name with the value. path:
     function that makes the finger path for a value. sizes: function that measures sizes of the

@@ -171,7 +171,7 @@ class PairAnswer:
 
 @dataclass(frozen=True, slots=True)
 class TrialRow:
-    """One line of the CSV file, with the result of a trial; unmeasured quantities are empty."""
+    """A line of the CSV file, with the result of a trial; unmeasured quantities are empty."""
 
     participant: str
     seed: int

@@ -1,13 +1,13 @@
 """Evaluate an apparatus without running the nodes.
 
 An apparatus is a set of true parameters of the simulated hardware. The nodes' methods get the
-parameters of the scene, and the simulator's models those of the apparatus. The errors of fingertip,
-sheet, image and felt force are computed at rest. Those of fingertip and sheet can also be computed
-for a constant speed of the finger, at which wrong exposure times cause errors. Only the force model
-of the rubber depends on time: it simulates a push in and out. Therefore servo lag, delays, frame
-rate, tremor and backlash have no effect. An experiment with running nodes measures these effects.
-Images have no noise. The references for the errors have their own models of camera, arms, membrane
-and eye, not those of the nodes.
+parameters of the scene, and the simulator's models get the parameters of the apparatus. The errors
+of fingertip, sheet, image and felt force are computed at rest. Those of fingertip and sheet can
+also be computed for a constant speed of the finger, at which wrong exposure times cause errors.
+Only the force model of the rubber depends on time: it simulates a push in and out. Therefore servo
+lag, delays, frame rate, tremor and backlash have no effect. An experiment with running nodes
+measures these effects. Images have no noise. The references for the errors have their own models of
+camera, arms, membrane and eye, not those of the nodes.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class Evaluation:
         """Summarize the errors in one number per metric.
 
         The image error is a root mean square, the force error a mean absolute relative error. The
-        others are mean lengths.
+        errors of sheet and fingertip are mean lengths.
         """
         return {
             Metric.SHEET: _mean_length_mm(self.sheet_m),
@@ -169,8 +169,8 @@ class CrossErrors:
     """The errors of crosses that are projected at expected contact points.
 
     All positions are projected from a viewpoint onto the screen plane. places_m (n, 2): expected
-    contact points, seen from the midpoint between the true eyes. errors_m (n, 2, 2): positions
-    (x, y) at which the left and the right eye see the cross, minus those of the actual contact.
+    contact points, seen from the midpoint between the true eyes. errors_m (n, 2, 2): positions (x,
+    y) at which the left and the right eye see the cross, minus the positions of the actual contact.
     """
 
     places_m: Floats

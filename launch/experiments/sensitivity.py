@@ -37,9 +37,9 @@ SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 class EvaluationKind(StrEnum):
     """The method by which the effect of a parameter was evaluated.
 
-    offline: without running nodes; sheet and fingertip at the working speed, others at rest. graph:
-    in motion, with running nodes. not_measured: the effect occurs only in motion, and no graph was
-    run. not_simulated: no simulator node uses the parameter.
+    offline: without running nodes; errors of sheet and fingertip at the working speed, errors of
+    image and force at rest. graph: in motion, with running nodes. not_measured: the effect occurs
+    only in motion, and no graph was run. not_simulated: no simulator node uses the parameter.
     """
 
     OFFLINE = "offline"

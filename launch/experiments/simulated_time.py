@@ -353,7 +353,7 @@ class SimulatedSheet:
 
 
 class SimulatedLoop:
-    """Camera, tracking, planner, arms and sheet in simulated time, optionally with a hand."""
+    """A simulation of camera, tracking, planner, arms and sheet in simulated time."""
 
     def __init__(
         self,

@@ -103,7 +103,7 @@ class DrawnFrames:
             self.deformation_ages.append((frame.light_ns, np.array([age_s])))
 
     def shifted(self, late_ns: int) -> DrawnFrames:
-        """Return the contents at the true display times, `late_ns` after the recorded ones.
+        """Return the contents at the true display times, `late_ns` after the recorded times.
 
         The ages of the drawn deformation increase by the same time.
         """
@@ -213,9 +213,10 @@ class StrokeRecording:
     fingertip, measured, finger: filtered, measured and true position of the fingertip.
     measured_edges, true_edges: left and right clamped edge of the sheet. A row (9,) is the centre,
     y axis and z axis of an edge in the world frame. delays_s: delays from the centre of an exposure
-    to the events that it caused, by event. drops: number of lost or refused messages, except those
-    that a `latest` reader skipped. apparatus: origin of the true parameters of the simulated
-    hardware. surface, true_surface: shape of the unloaded sheet, by the scene and by the apparatus.
+    to the events that it caused, by event. drops: number of lost or refused messages, without
+    messages that a `latest` reader skipped. apparatus: origin of the true parameters of the
+    simulated hardware. surface, true_surface: shape of the unloaded sheet, by the scene and by the
+    apparatus.
     """
 
     scene: Scene
@@ -386,7 +387,7 @@ def apply_compliance(
 ) -> tuple[SampledMotion, SampledMotion]:
     """Displace the reported motions of both edges by the compliance of the flanges.
 
-    The arms report poses as if they were rigid, but the tension of the sheet displaces them.
+    The arms report poses of rigid flanges, but the tension of the sheet displaces the flanges.
     """
     limits = ArmGeometry(scene, "left").sheet_limits
     moved = []

@@ -86,7 +86,7 @@ def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
-    """Return errors with a random apparatus: sheet and finger in motion, others at rest."""
+    """Return errors with a random apparatus: sheet and finger moving, image and force at rest."""
     if trial.get("commission_folder"):
         return _run_commissioned_trial(trial)
     apparatus_file, launch_file = trial["apparatus"], Path(trial["launch_file"])

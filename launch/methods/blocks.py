@@ -18,7 +18,7 @@ from flexsheet.nodes.methods import Interval, dominates
 CONFIDENCE = 0.95
 RESAMPLES = 2000
 SEED = 20261123
-"""Fixed random seed of the bootstrap, so that equal data give equal intervals."""
+"""The fixed random seed of the bootstrap, which makes intervals reproducible."""
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
@@ -62,7 +62,7 @@ def attribute_error(parts: Floats) -> Floats:
     """Return the fractions (k,) of a mean square error that k parts of the error cause.
 
     parts: (k, n, d), error vectors that add up to the whole error. The fractions add up to one. A
-    part that compensates others has a negative fraction.
+    part that compensates other parts has a negative fraction.
     """
     whole = parts.sum(axis=0)
     total = float(np.square(whole).sum())
@@ -72,7 +72,7 @@ def attribute_error(parts: Floats) -> Floats:
 
 
 def find_front(points: Mapping[str, Sequence[Interval]]) -> list[str]:
-    """Return the names of the points on the Pareto front: those that no other point dominates.
+    """Return the names of the points that no other point dominates (the Pareto front).
 
     points: costs of each point, smaller is better. A point dominates another if one of its costs is
     lower and none is higher. Costs with overlapping confidence intervals count as equal.

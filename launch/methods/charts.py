@@ -303,7 +303,7 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
 
 
 def read_charts(folder: Path) -> list[dict[str, Any]]:
-    """Read the chart results in a folder: those of `FAMILIES` in order, then other benchmarks."""
+    """Read the chart results in a folder: `FAMILIES` in their order, then other benchmarks."""
     order = list(FAMILIES)
     paths = sorted(
         folder.glob("*.json"),

@@ -70,7 +70,7 @@ FINEST = NODE_DEFAULTS.model_copy(
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """Methods of all nodes, with further parameters of the planner by name."""
+    """The methods of all nodes, with further parameters of the planner by name."""
 
     name: str
     methods: Methods
@@ -141,7 +141,7 @@ def choose_cheapest(scene: Scene) -> Methods:
 
 
 def choose_tuned(scene: Scene) -> Methods:
-    """Return the methods that the scene names, and the nodes' default methods for the others."""
+    """Return the methods that the scene names, and the nodes' default methods of other families."""
     chosen = scene.methods.model_dump(exclude_none=True)
     return Methods.model_validate(NODE_DEFAULTS.model_dump() | chosen)
 

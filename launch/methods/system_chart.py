@@ -3,8 +3,8 @@
 Processor use and latency are measured in the running graph (`experiments/system_run.py`). A block
 contains all configurations; results are medians over blocks with their confidence intervals. Errors
 are 95 % values, computed in simulated time (`experiments/system_errors.py`) for the nominal
-apparatus (true parameters of the simulated hardware) and for random ones. Each trial is a separate
-process.
+apparatus (true parameters of the simulated hardware) and for random apparatuses. Each trial is a
+separate process.
 """
 
 from __future__ import annotations

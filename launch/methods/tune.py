@@ -120,8 +120,8 @@ TUNABLES = (
         },
     ),
 )
-"""All tunable families in the order of tuning. The sheet shape precedes the image correction,
-whose settings depend on it."""
+"""The tunable families in the order of tuning. The sheet shape precedes the image correction, whose
+settings depend on it."""
 
 TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
@@ -372,7 +372,7 @@ def _tune_family(
         }
         if not left:
             continue
-        progress(", ".join(left))
+        progress(f"measuring {', '.join(left)}")
         select = partial(_is_selected, left)
         if measure is not None:
             points = measure(family, scene, select)

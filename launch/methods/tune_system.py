@@ -195,7 +195,7 @@ def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> lis
 
 
 def make_methods(scene: Scene, choices: Sequence[Choice]) -> Methods:
-    """Return the methods of the choices; for other families those of the scene or the defaults."""
+    """Return the chosen methods; for other families the methods of the scene or the defaults."""
     chosen = {choice.key: choice.chosen.setting for choice in choices}
     return Methods.model_validate(choose_tuned(scene).model_dump() | chosen)
 
