@@ -312,8 +312,8 @@ def tabulate_pushes(
     """Tabulate the measured corrections of the model, from the used rows.
 
     Every combination of stretch, x and y must occur; points are identified by their distance from
-    the sheet's centre. Depths may differ. Corrections are interpolated at depths that all combinations
-    cover. Raises SheetModelFitError for an incomplete grid.
+    the sheet's centre. Depths may differ. Corrections are interpolated at depths that all
+    combinations cover. Raises SheetModelFitError for an incomplete grid.
     """
     cells: dict[tuple[float, float, float], list[tuple[float, float]]] = {}
     ratios = _force_ratios(law, pushes, nominal_width_m) + 1.0

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.calibration.csv_rows import list_missing, read_table
 from flexsheet.launch.calibration.edge_marks import make_detector_config
 from flexsheet.launch.calibration.marker_fit import Touch
-from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
+from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Scene
@@ -42,28 +43,11 @@ def read_touches(path: Path, scene: Scene) -> list[Touch]:
 
     Raises BadInputError with file, line, column, value and remedy.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInputError(
-            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
-        ) from error
-    numbered = [
-        (number, line)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not numbered:
-        remedy = f"start with a line of columns: {', '.join(COLUMNS)}"
-        raise BadInputError([Problem(str(path), (), "is empty", remedy)])
-    first, header = numbered[0]
-    names = [name.strip() for name in next(csv.reader([header]))]
-    _check_header(f"{path}:{first}", names)
     problems: list[Problem] = []
     touches = []
-    for number, line in numbered[1:]:
+    for number, cells in read_table(path, COLUMNS, _check_header, problems):
         found: list[Problem] = []
-        values = _parse_row(f"{path}:{number}", names, next(csv.reader([line])), found)
+        values = _parse_row(f"{path}:{number}", cells, found)
         if not found:
             touches.append(_make_touch(values, scene))
         problems += found
@@ -72,36 +56,15 @@ def read_touches(path: Path, scene: Scene) -> list[Touch]:
     return touches
 
 
-def _check_header(where: str, names: list[str]) -> None:
+def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
     wanted = COLUMNS if any(name in names for name in NORMAL) else REQUIRED
-    problems = [
-        Problem(where, (name,), "unknown column", did_you_mean(name, COLUMNS))
-        for name in names
-        if name not in COLUMNS
-    ]
-    problems += [
-        Problem(where, (name,), "missing column", "add it") for name in wanted if name not in names
-    ]
-    problems += [
-        Problem(where, (name,), "duplicate column", "remove one")
-        for name in dict.fromkeys(names)
-        if names.count(name) > 1
-    ]
-    if problems:
-        raise BadInputError(problems)
+    return list_missing(where, names, wanted)
 
 
-def _parse_row(
-    where: str, names: list[str], cells: list[str], problems: list[Problem]
-) -> dict[str, float]:
+def _parse_row(where: str, cells: Mapping[str, str], problems: list[Problem]) -> dict[str, float]:
     """Return the values of a row by column; append errors in the row to `problems`."""
-    if len(cells) != len(names):
-        what = f"expected {len(names)} values, found {len(cells)}"
-        problems.append(Problem(where, (), what, "give one value per column"))
-        return {}
     values: dict[str, float] = {}
-    for name, cell in zip(names, cells, strict=True):
-        text = cell.strip()
+    for name, text in cells.items():
         if not text and name in NORMAL:
             continue
         try:
