@@ -33,7 +33,7 @@ from flexsheet.launch.running.runs import root as runs_root
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, SheetTarget, TwinFinger
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.models.rigid import pose_matrix
 from tests.lab import ROOT, Network, missing
 
 PAGE = ROOT / "docs" / "deploy.md"
@@ -247,7 +247,7 @@ def evaluate_stroke(bag: Path) -> Stroke:
     edges, follow = [], np.ones(len(times), dtype=bool)
     for side, printed in states.items():
         mount = getattr(scene.arms, side).flange_from_edge
-        flange_from_edge = transform_from_rpy(mount.position_m, mount.rpy_rad)
+        flange_from_edge = pose_matrix(mount)
         at = np.array([stamp for stamp, _ in printed])
         edge = np.array([(one.world_from_flange @ flange_from_edge)[:3, 3] for _, one in printed])
         edges.append(np.column_stack([np.interp(times, at, edge[:, k]) for k in range(3)]))

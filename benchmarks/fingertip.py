@@ -28,7 +28,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.tracking import Gate
-from flexsheet.nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.pixels import TwinCamera
 
@@ -91,7 +91,6 @@ def measure(scene: Scene, method: str, taken: list[TestShot]) -> tuple[Run, Run]
     config = DetectorConfig(
         blob_filter=BlobFilter(),
         refine=MARKER_METHODS[method],
-        triangulate=TRIANGULATION_METHODS["dlt"],
         max_reprojection_px=1.5,
     )
     volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)

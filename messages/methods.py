@@ -14,7 +14,6 @@ from pydantic import BaseModel, ConfigDict, Field
 T = TypeVar("T", bound=str | float)
 
 MarkerMethod = Literal["moments", "subpixel_fit"]
-TriangulationMethod = Literal["dlt"]
 TrackingMethod = Literal["none", "one_euro", "adaptive"]
 SheetForceMethod = Literal["scaled", "table"]
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]
@@ -38,7 +37,6 @@ class Methods(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     marker: MarkerMethod | None = None
-    triangulation: TriangulationMethod | None = None
     tracking: TrackingMethod | None = None
     sheet_force: SheetForceMethod | None = None
     sheet_shape: SheetShapeMethod | None = None

@@ -69,7 +69,6 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("NodeProcess", "state"): {"away": "exited"},
     ("Methods", "sheet_shape"): {"dents": "reduced_order", "flat": "four_triangles"},
     ("Methods", "marker"): {"weighted_centroid": "subpixel_fit"},
-    ("Methods", "triangulation"): {"midpoint": "dlt", "optimal": "dlt"},
     ("Methods", "tracking"): {
         "hand": "adaptive",
         "singer_tremor": "adaptive",
@@ -114,7 +113,7 @@ TEXTS_TO_LITERALS: dict[tuple[str, str], Callable[[str], str]] = {
 
 REMOVED_FIELDS: dict[str, frozenset[str]] = {
     "FingerTruth": frozenset({"hand_damping_ns_per_m"}),
-    "Methods": frozenset({"kinematics"}),
+    "Methods": frozenset({"kinematics", "triangulation"}),
 }
 """The names of removed fields, by model."""
 

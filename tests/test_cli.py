@@ -664,14 +664,14 @@ def test_calibrating_with_real_images(flexsheet: Command, tmp_path: Path) -> Non
 
 def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
     """The test measures, draws, writes and prints the fastest family."""
-    printed = flexsheet("chart", "triangulation", "--output", tmp_path)
+    printed = flexsheet("chart", "marker", "--output", tmp_path)
     assert printed.code == 0
-    assert [line.split()[0] for line in printed.out.splitlines()][:2] == ["method", "dlt"]
+    assert [line.split()[0] for line in printed.out.splitlines()][:2] == ["method", "moments"]
     assert {one.name for one in tmp_path.iterdir()} == {
-        "triangulation.svg", "triangulation.json", "README.md"
+        "marker.svg", "marker.json", "README.md"
     }  # fmt: skip
     again = flexsheet("chart", "--redraw", "--output", tmp_path, "--json").json()
-    assert [one["family"] for one in again] == ["triangulation"]
+    assert [one["family"] for one in again] == ["marker"]
 
 
 def test_a_command_of_ros_2_names_its_replacement(flexsheet: Command) -> None:

@@ -175,7 +175,7 @@ def test_looking_into_a_graph_loads_little() -> None:
     [
         ("flexsheet topic echo finger", "fingertip"),
         ("flexsheet node info pla", "planner"),
-        ("flexsheet chart triang", "triangulation"),
+        ("flexsheet chart mark", "marker"),
         ("flexsheet bag ver", "verify"),
         ("flexsheet topic echo --on", "--once"),
         ("flexsheet bag verify a.mcap tri", "triangulator"),

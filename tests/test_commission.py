@@ -703,7 +703,9 @@ def test_lags_are_read_from_the_bag_of_a_stroke(tmp_path: Path) -> None:
     ]
     found = read_measured_lags(write(tmp_path / "stroke.mcap", *states))
     assert found == {"left": MeasuredLag(0.041, 0.001), "right": MeasuredLag(0.052, 0.001)}
-    with pytest.raises(DelaysError, match="the right arm's bridge measured no servo lag"):
+    with pytest.raises(
+        DelaysError, match="the bridge of the right arm did not measure a servo lag"
+    ):
         read_measured_lags(write(tmp_path / "short.mcap", *states[:3]))
 
 

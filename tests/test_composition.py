@@ -251,6 +251,7 @@ def test_a_shipped_scene_keeps_its_choice_and_an_interrupted_tuning_continues(
         ]
         evaluations[0] = replace(evaluations[0], setting=setting)
         choices.append(Choice(one.name, one.key, "mm", 1.0, evaluations[0], tuple(evaluations)))
+    (tracking,) = (one for one in choices if one.family == "tracking")
     limits = tune_system.list_tolerances(scene)
     ran: list[Mapping[str, Any]] = []
 
@@ -267,7 +268,7 @@ def test_a_shipped_scene_keeps_its_choice_and_an_interrupted_tuning_continues(
     def tune() -> tuple[Any, tuple[Choice, ...]]:
         composition, chosen = tune_system.tune_system(
             scene_file, choices, tmp_path, lambda text: None, margin=0.2, runs=3,
-            measure=lambda *_: choices[2].evaluations,
+            measure=lambda *_: tracking.evaluations,
         )  # fmt: skip
         return composition, tuple(chosen)
 

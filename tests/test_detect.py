@@ -19,7 +19,7 @@ from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.tracking import Gate
-from flexsheet.nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint, dlt
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint
 from flexsheet.nodes.twin.clutter import (
     CLUTTER,
     Clutter,
@@ -45,7 +45,7 @@ LAB = CLUTTER["lab"]
 
 
 def config(name: str = "subpixel_fit", **changes: object) -> DetectorConfig:
-    inputs = DetectorConfig(BlobFilter(), MARKER_METHODS[name], dlt, max_reprojection_px=1.5)
+    inputs = DetectorConfig(BlobFilter(), MARKER_METHODS[name], max_reprojection_px=1.5)
     return replace(inputs, **changes)
 
 

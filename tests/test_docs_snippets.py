@@ -99,7 +99,7 @@ def test_python_runs(page: Path, clone: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setitem(sys.modules, module.__name__, module)
     with (
         patch.dict("flexsheet.nodes.models.shapes.GEOMETRIES"),
-        patch.dict("flexsheet.nodes.triangulator.triangulation.TRIANGULATION_METHODS"),
+        patch.dict("flexsheet.nodes.triangulator.marker.MARKER_METHODS"),
     ):
         for block in with_language("python")[page]:
             # Its lines count as the page's, for the trace of what fails.

@@ -34,7 +34,6 @@ from flexsheet.messages.methods import (
     SheetShapeMethod,
     SoftBodyMethod,
     TrackingMethod,
-    TriangulationMethod,
 )
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import (
@@ -237,7 +236,6 @@ def test_what_numpy_answers_can_be_written(tmp_path: Path) -> None:
 
 CHOICES = {
     "marker": MarkerMethod,
-    "triangulation": TriangulationMethod,
     "tracking": TrackingMethod,
     "sheet-force": SheetForceMethod,
     "sheet-shape": SheetShapeMethod,
@@ -278,8 +276,8 @@ def test_charts_are_collected_on_a_page_and_drawn_again(
 
 
 def test_an_unknown_family_gets_a_suggestion() -> None:
-    with pytest.raises(UnknownFamilyError, match='did you mean "triangulation"'):
-        find_family("triangulaton")
+    with pytest.raises(UnknownFamilyError, match='did you mean "correction"'):
+        find_family("corection")
 
 
 def test_the_front_holds_what_nothing_beats_and_ignores_what_is_out_of_range() -> None:

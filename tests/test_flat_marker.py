@@ -27,7 +27,7 @@ from flexsheet.nodes.triangulator.marker import (
 )
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
 from flexsheet.nodes.triangulator.tracking import Gate
-from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
@@ -258,7 +258,7 @@ def test_the_marker_of_an_apparatus_is_measured(profile: Profile, seed: int) -> 
         found = detect_all(
             *views,
             geometry=StereoGeometry.of(scene.camera, calibration),
-            config=DetectorConfig(FILTER, subpixel_fit, dlt, max_reprojection_px=1.5),
+            config=DetectorConfig(FILTER, subpixel_fit, max_reprojection_px=1.5),
             volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),
             gate=None if number % 2 else Gate(marker, 0.009),
         )

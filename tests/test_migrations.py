@@ -58,11 +58,17 @@ def test_a_recorded_scene_is_read_with_todays_methods_and_without_removed_ones(
 ) -> None:
     recorded = next(message for name, message, *_ in BagReader(OLD_BAG) if name == "scene")
     fields = recorded.model_dump()
-    fields["methods"] = {"kinematics": kinematics, "mark": "moments", "tracking": "hand"}
+    fields["methods"] = {
+        "kinematics": kinematics,
+        "mark": "moments",
+        "triangulation": "midpoint",
+        "tracking": "hand",
+    }
     migration = find_migration(Scene, "d7307561a5180666", recorded_schema("Scene"))
     assert migration is not None
     methods = Scene.model_validate(migration(fields)).methods
     assert not hasattr(methods, "kinematics")
+    assert not hasattr(methods, "triangulation")
     assert (methods.marker, methods.tracking) == ("moments", "adaptive")
 
 

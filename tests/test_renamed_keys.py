@@ -231,12 +231,13 @@ def test_an_old_topic_gets_an_error_that_names_the_new_one(old: str, new: str) -
         find_topic(old)
 
 
-def test_a_removed_method_in_a_scene_gets_an_error_with_a_remedy(tmp_path: Path) -> None:
+@pytest.mark.parametrize("key", sorted(renamed_keys.REMOVED_KEYS))
+def test_a_removed_method_in_a_scene_gets_an_error_with_a_remedy(tmp_path: Path, key: str) -> None:
     content = load_values()
-    content["methods"] = {"kinematics": "closed_form_continuous"}
+    content["methods"] = {key: "any"}
     file = tmp_path / "scene.yaml"
     YAML().dump(content, file)
-    with pytest.raises(BadInputError, match='unknown key "kinematics"; remove it'):
+    with pytest.raises(BadInputError, match=f'unknown key "{key}"; remove it'):
         load_scene(file)
 
 

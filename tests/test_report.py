@@ -195,9 +195,9 @@ def test_a_nodes_methods_are_those_of_its_parameters_else_of_its_scene() -> None
         {"marker": "moments", "soft_body": {"method": "linear", "skin_spacing_m": 0.006}}
     )
     tuned = sessions.SCENE.model_copy(update={"methods": chosen})
-    eye = {"marker": "auto", "triangulation": "dlt", "tracking": "auto", "rate_hz": 60.0}
-    assert describe_methods(eye, tuned) == "marker moments, triangulation dlt, tracking default"
-    assert describe_methods(eye, None) == "marker default, triangulation dlt, tracking default"
+    eye = {"marker": "auto", "tracking": "auto", "rate_hz": 60.0}
+    assert describe_methods(eye, tuned) == "marker moments, tracking default"
+    assert describe_methods(eye, None) == "marker default, tracking default"
     assert describe_methods({"method": "auto"}, tuned) == "linear"
     assert describe_methods({"side": "left"}, tuned) is None
 

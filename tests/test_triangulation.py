@@ -1,4 +1,4 @@
-"""Test triangulation: methods against an optimiser, and their failures."""
+"""Test triangulation: `dlt` against an optimiser, and its failures."""
 
 from __future__ import annotations
 
@@ -12,14 +12,12 @@ from scipy.optimize import least_squares
 from flexsheet.messages.calibration import Board, StereoCalibration
 from flexsheet.messages.calibration_file import CalibrationMismatchError
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.methods import measure as measure_trial
 from flexsheet.nodes.models import camera, rigid
-from flexsheet.nodes.triangulator.benchmarks import TRIANGULATION
 from flexsheet.nodes.triangulator.triangulation import (
-    TRIANGULATION_METHODS,
     ClosestApproach,
     StereoGeometry,
     TriangulatedPoint,
+    dlt,
     measure,
     project_with_jacobian,
     undistort_pixel,
@@ -27,7 +25,6 @@ from flexsheet.nodes.triangulator.triangulation import (
 from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
-METHODS = sorted(TRIANGULATION_METHODS)
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +43,13 @@ def turned_rig() -> Floats:
 
 
 def found_behind(
-    geometry: StereoGeometry, left: Floats, right: Floats, name: str, noise_px: float = 0.1
+    geometry: StereoGeometry, left: Floats, right: Floats, noise_px: float = 0.1
 ) -> TriangulatedPoint | None:
     return measure(
         geometry,
         left,
         right,
         covariance=noise_px**2 * np.eye(2),
-        method=TRIANGULATION_METHODS[name],
     )
 
 
@@ -70,18 +66,16 @@ def seen(points: Floats, right_from_left: Floats) -> tuple[Floats, Floats]:
     return points[:, :2] / points[:, 2:], right[:, :2] / right[:, 2:]
 
 
-@pytest.mark.parametrize("name", METHODS)
 @given(point=st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(0.2, 3.0)))
 @settings(max_examples=60, deadline=None)
-def test_exact_pixels_give_the_exact_point(name: str, point: tuple[float, float, float]) -> None:
+def test_exact_pixels_give_the_exact_point(point: tuple[float, float, float]) -> None:
     truth = np.array([point])
     for rig in (rigid.transform(np.eye(3), [-0.12, 0.0, 0.0]), turned_rig()):
-        found = TRIANGULATION_METHODS[name](*seen(truth, rig), rig)
+        found = dlt(*seen(truth, rig), rig)
         assert np.allclose(found, truth, rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_marker_noise_leaves_no_more_error_than_the_least_image_error(name: str) -> None:
+def test_marker_noise_leaves_no_more_error_than_the_least_image_error() -> None:
     """Compare with the maximum-likelihood point, which SciPy finds from the four coordinates."""
     rig, generator = turned_rig(), np.random.default_rng(2)
     truth = generator.uniform([-0.2, -0.2, 0.4], [0.2, 0.2, 1.0], (40, 3))
@@ -98,30 +92,26 @@ def test_marker_noise_leaves_no_more_error_than_the_least_image_error(name: str)
         least_squares(image_error, start, args=(i,), xtol=1e-14, ftol=1e-14, gtol=1e-14).x
         for i, start in enumerate(truth)
     ]
-    found = TRIANGULATION_METHODS[name](left, right, rig)
+    found = dlt(left, right, rig)
     reference_m = np.linalg.norm(np.array(likeliest) - truth)
     assert np.linalg.norm(found - truth) == pytest.approx(reference_m, rel=0.01)
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_parallel_rays_give_no_finite_point(name: str) -> None:
+def test_parallel_rays_give_no_finite_point() -> None:
     rig = rigid.transform(np.eye(3), [-0.12, 0.0, 0.0])
     pixel = np.array([[0.1, 0.05]])
-    point = TRIANGULATION_METHODS[name](pixel, pixel, rig)[0]
+    point = dlt(pixel, pixel, rig)[0]
     assert not np.isfinite(point).all() or np.linalg.norm(point) > 1e6
 
 
-@given(
-    point=st.tuples(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12), st.floats(-0.1, 0.15)),
-    name=st.sampled_from(METHODS),
-)
+@given(point=st.tuples(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12), st.floats(-0.1, 0.15)))
 @settings(max_examples=60, deadline=None)
 def test_pixels_through_the_lenses_and_back(
-    geometry: StereoGeometry, point: tuple[float, float, float], name: str
+    geometry: StereoGeometry, point: tuple[float, float, float]
 ) -> None:
     truth = np.array(point)
     left, right = geometry.project(truth)
-    found = found_behind(geometry, left, right, name)
+    found = found_behind(geometry, left, right)
     assert found is not None
     assert np.allclose(found.point_world, truth, atol=1e-8)
     assert found.reprojection_px < 1e-6
@@ -133,7 +123,7 @@ def test_the_covariance_is_that_of_noisy_pixels(geometry: StereoGeometry) -> Non
     points, stated, squares = [], None, []
     for _ in range(1500):
         noise = noise_px * generator.standard_normal((2, 2))
-        found = found_behind(geometry, left + noise[0], right + noise[1], "dlt", noise_px)
+        found = found_behind(geometry, left + noise[0], right + noise[1], noise_px)
         assert found is not None
         points.append(found.point_world)
         stated = found.covariance
@@ -153,23 +143,21 @@ def test_mismatched_markers_have_a_large_reprojection_error(
     geometry: StereoGeometry,
 ) -> None:
     left, right = geometry.project(np.array([0.0, 0.0, 0.0]))
-    found = found_behind(geometry, left, right + np.array([0.0, 8.0]), "dlt")
+    found = found_behind(geometry, left, right + np.array([0.0, 8.0]))
     assert found is not None
     assert found.reprojection_px == pytest.approx(4.0, rel=0.05)
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_a_point_behind_the_cameras_is_none(geometry: StereoGeometry, name: str) -> None:
+def test_a_point_behind_the_cameras_is_none(geometry: StereoGeometry) -> None:
     left, right = geometry.project(np.array([0.0, 0.0, 0.0]))
-    far_apart = found_behind(geometry, left, right + np.array([200.0, 0.0]), name)
+    far_apart = found_behind(geometry, left, right + np.array([200.0, 0.0]))
     assert far_apart is None
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_a_pixel_that_is_no_number_is_none(geometry: StereoGeometry, name: str) -> None:
+def test_a_pixel_that_is_no_number_is_none(geometry: StereoGeometry) -> None:
     right = np.array([300.0, 200.0])
     for bad in (np.array([np.nan, 200.0]), np.array([np.inf, 200.0])):
-        assert found_behind(geometry, bad, right, name) is None
+        assert found_behind(geometry, bad, right) is None
 
 
 def calibration_of(scene: Scene, **changes: object) -> StereoCalibration:
@@ -263,11 +251,11 @@ def test_a_covariance_grows_as_the_rays_become_parallel(
     """Depth errors grow with the square of the depth; reported ones must grow at least as fast."""
     truth = rigid.apply(geometry.world_from_left, np.array([0.0, 0.0, depth_m]))
     left, right = geometry.project(truth)
-    exact = found_behind(geometry, left, right, "dlt", 0.01)
+    exact = found_behind(geometry, left, right, 0.01)
     assert exact is not None
     rule_m = depth_m**2 / (540.0 * 0.1205) * np.sqrt(2.0) * 0.01
     assert exact.deviation_m == pytest.approx(rule_m, rel=0.15)
-    moved = found_behind(geometry, left, right + np.array([0.01, 0.0]), "dlt", 0.01)
+    moved = found_behind(geometry, left, right + np.array([0.01, 0.0]), 0.01)
     assert moved is not None
     assert np.linalg.norm(moved.point_world - truth) < 1.5 * exact.deviation_m
 
@@ -291,13 +279,3 @@ def test_uneven_noise_is_carried_to_the_point(geometry: StereoGeometry) -> None:
         error = found.point_world - truth
         normalised.append(error @ np.linalg.solve(found.covariance, error))
     assert np.mean(normalised) == pytest.approx(3.0, rel=0.15)
-
-
-def test_the_triangulation_family_meets_the_scenes_tolerance_in_its_range(scene: Scene) -> None:
-    trials = list(TRIANGULATION.trials(scene))
-    assert {trial.method for trial in trials} == set(TRIANGULATION.methods)
-    points = [measure_trial(trial, repeats=1) for trial in trials]
-    certain = [point for point in points if float(point.case["noise_px"]) <= 0.025]
-    inside = [point.error for point in certain if point.in_range]
-    outside = [point.error for point in points if not point.in_range]
-    assert max(inside) < TRIANGULATION.tolerance(scene) < max(outside)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
@@ -34,7 +34,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
 from flexsheet.nodes.methods import Case, Family, Point, Trial
 from flexsheet.nodes.planner.force_table import load_force_model
-from flexsheet.nodes.triangulator.benchmarks import TRIANGULATION
+from flexsheet.nodes.triangulator.benchmarks import MARKER
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 
@@ -371,14 +371,14 @@ def run(*arguments: object) -> Any:
 
 def test_a_real_family_is_tuned_by_the_command(tmp_path: Path) -> None:
     out = tmp_path / "tuned.yaml"
-    command = [SCENES / "light-touch.yaml", "--family", "triangulation", "--output", out, "--json"]
+    command = [SCENES / "light-touch.yaml", "--family", "marker", "--output", out, "--json"]
     outcome = run(*command)
     assert outcome.exit_code == 0, outcome.output
     result = json.loads(outcome.stdout)
     assert result["met"]
     (only,) = result["families"]
-    assert only["chosen"] == "dlt"
-    assert load_scene(out).methods.triangulation == only["setting"]
+    assert only["chosen"] == "moments"
+    assert load_scene(out).methods.marker == only["setting"]
 
 
 def test_an_insufficient_method_has_a_separate_exit_code(
@@ -409,17 +409,17 @@ def test_every_choice_has_a_scene_key() -> None:
 
 
 def test_families_ask_for_the_scenes_own_cases_only() -> None:
-    asked_for = [trial for trial in TRIANGULATION.trials(SCENE) if trial.in_scene]
-    assert {trial.case["baseline_mm"] for trial in asked_for} == {120.5}
-    assert {trial.case["noise_px"] for trial in asked_for} == {0.01, 0.025}
-    translation = np.diag([0.13 / 0.1205, 1.0, 1.0]) @ SCENE.camera.right_from_left[:3, 3]
-    right_from_left = SCENE.camera.right_from_left.copy()
-    right_from_left[:3, 3] = translation
-    camera = SCENE.camera.model_copy(update={"right_from_left": right_from_left})
-    wider = SCENE.model_copy(update={"camera": camera})
-    asked_for = [trial for trial in TRIANGULATION.trials(wider) if trial.in_scene]
-    assert {trial.case["baseline_mm"] for trial in asked_for} == {130.0}
-    assert all(trial.in_range for trial in asked_for)
+    def motions_px(scene: Scene) -> set[object]:
+        trials = list(takewhile(lambda trial: trial.in_scene, MARKER.trials(scene)))
+        assert all(trial.in_range for trial in trials)
+        assert len(trials) == 8, "two motions, two backgrounds and two methods"
+        return {trial.case["motion_px"] for trial in trials}
+
+    assert motions_px(SCENE) == {0.0, 0.15}
+    working_range = SCENE.working_range.model_copy(
+        update={"speed_m_per_s": 4.0 * SCENE.working_range.speed_m_per_s}
+    )
+    assert motions_px(SCENE.model_copy(update={"working_range": working_range})) == {0.0, 0.6}
 
 
 @pytest.mark.parametrize(("name", "missed"), [("light-touch", False), ("demanding", True)])
@@ -446,12 +446,12 @@ async def test_a_node_follows_the_scene_if_set_to_auto() -> None:
     for each in (follows, set_by_hand):
         await each.setup()
         await each.step("scene", SCENE, header_at(0))
-    assert follows.methods == "subpixel_fit, dlt, adaptive"
+    assert follows.methods == "subpixel_fit, adaptive"
     for each in (follows, set_by_hand):  # another scene, at run time
-        changed = with_methods(marker="moments", triangulation="dlt", tracking="one_euro")
+        changed = with_methods(marker="moments", tracking="one_euro")
         await each.step("scene", changed, header_at(1))
-    assert follows.methods == "moments, dlt, one_euro"
-    assert set_by_hand.methods == "moments, dlt, none"
+    assert follows.methods == "moments, one_euro"
+    assert set_by_hand.methods == "moments, none"
 
 
 def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path: Path) -> None:

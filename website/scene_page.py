@@ -67,7 +67,6 @@ EFFECTS: Mapping[str, str] = {
     "tolerances.sheet_position_m": "distance between the sheet and the finger",
     "tolerances.latency_s": "time from the exposure to a frame",
     "methods.marker": "detection of the marker in an image",
-    "methods.triangulation": "triangulation of the marker",
     "methods.tracking": "motion model of the fingertip",
     "methods.sheet_force": "model of the sheet's force",
     "methods.sheet_shape": "model of the sheet's shape for the image correction",

@@ -40,9 +40,9 @@ from flexsheet.nodes.models.camera import camera_matrix, project
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
+    pose_matrix,
     rotation_from_vector,
     transform,
-    transform_from_rpy,
     vector_from_rotation,
 )
 from flexsheet.nodes.twin.arms import ArmMechanics
@@ -65,13 +65,14 @@ BOARD_COLUMNS = (
 )
 
 MAX_STILL_RAD, MIN_STILL_S = 0.0005, 0.7
-"""Maximum joint motion of an arm that counts as resting, and minimum duration of the rest."""
+"""The maximum joint motion of an arm that counts as resting, and minimum duration of the rest."""
 
 MIN_NEW_ROTATION_RAD, MIN_NEW_SHIFT_M = 0.05, 0.01
-"""Minimum rotation or translation of the board between two recorded poses."""
+"""The minimum rotation or translation of the board between two recorded poses."""
 
 SIMULATED_BASE_M, SIMULATED_BASE_RAD, SIMULATED_JOINT_RAD = 0.005, 0.01, 2e-4
-"""Standard deviations of the simulated bases from those in the scene, and of the joint errors."""
+"""The standard deviations of the simulated bases from those in the scene, and of the joint errors.
+"""
 
 
 class ArmPosesError(FlexsheetError, ValueError):
@@ -90,7 +91,7 @@ def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRi
         _make_camera_lens(measured.left),
         _make_camera_lens(measured.right),
         measured.right_from_left,
-        transform_from_rpy(pose.position_m, pose.rpy_rad),
+        pose_matrix(pose),
     )
 
 
@@ -102,7 +103,7 @@ def _make_camera_lens(lens: SceneLens) -> CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class PoseRow:
-    """Row of a table of arm poses, with either image files or a board pose.
+    """A row of a table of arm poses, with either image files or a board pose.
 
     joints_rad: (6,). images: left and right image file. left_from_board: board pose (4, 4).
     """
@@ -231,7 +232,7 @@ def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
 
 
 class PoseRecorder:
-    """Recorder that stores a pose to a folder whenever the arm rests and the board's pose is new.
+    """A recorder that stores a pose to a folder whenever the arm rests and the board's pose is new.
 
     Joint angles and images must be added in the order of their times (s, on one clock).
     """
@@ -309,7 +310,7 @@ def _is_same_pose(pose: Floats, other: Floats) -> bool:
 def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
     """Return a random world_from_base (4, 4) for the simulated arm, near the pose in the scene."""
     pose: Pose = getattr(scene.arms, side).world_from_base
-    nominal = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    nominal = pose_matrix(pose)
     random = np.random.default_rng([seed, side == "left"])
     rotation = rotation_from_vector(random.normal(0.0, SIMULATED_BASE_RAD, 3))
     return transform(
@@ -318,7 +319,7 @@ def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
 
 
 class SimulatedArm:
-    """Simulated arm without a sheet: true pose of its base, and true errors of its joints.
+    """A simulated arm without a sheet: true pose of its base, and true errors of its joints.
 
     Without an apparatus (true hardware parameters), the base deviates at random from the scene's,
     and each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, its base pose and
@@ -333,7 +334,7 @@ class SimulatedArm:
             self._offsets_rad, self._backlash_rad = np.zeros(6), None
             return
         pose = getattr(apply_apparatus(scene, apparatus).arms, side).world_from_base
-        self.world_from_base = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self.world_from_base = pose_matrix(pose)
         truth = getattr(apparatus.arms, side)
         self._offsets_rad, self._backlash_rad = (
             np.array(truth.joint_offsets_rad),
@@ -377,7 +378,7 @@ def simulate_poses(
     arm = SimulatedArm(scene, side, apparatus, seed=seed)
     base = arm.world_from_base
     camera_pose = true_camera.world_from_left
-    world_from_left = transform_from_rpy(camera_pose.position_m, camera_pose.rpy_rad)
+    world_from_left = pose_matrix(camera_pose)
     middle = 0.5 * board.square_m * np.array([board.columns - 1.0, board.rows - 1.0, 0.0])
     # Put the board 60 mm in front of the flange; it faces the camera while the arm reaches forward.
     ready_rad = arm.mechanics.start_rad

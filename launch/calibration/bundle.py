@@ -27,13 +27,13 @@ PARAMETERS = (
     *(f"right.{name}" for name in LENS),
     *(f"right_from_left.{name}" for name in ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")),
 )
-"""Names of the rig's parameters, in their order; rx, ry, rz are a rotation vector."""
+"""The names of the rig's parameters, in their order; rx, ry, rz are a rotation vector."""
 
 LEFT, RIGHT, STAND = slice(0, 8), slice(8, 16), slice(16, 22)
 
 MAX_STEPS = 50
 CONVERGED_COST_CHANGE = 1e-9
-"""Relative change of the cost (sum of squared residuals) below which the iteration ends."""
+"""The relative change of the cost (sum of squared residuals) below which the iteration ends."""
 
 
 class NotDeterminedError(FlexsheetError, ValueError):
@@ -45,7 +45,7 @@ class NotDeterminedError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RigFit:
-    """Fitted stereo rig and its residuals.
+    """A fitted stereo rig and its residuals.
 
     rig: parameters (22,). poses: poses of the board (pairs, 6), rotation vector and position in the
     left camera's frame. residuals: for each pair, detected minus projected corners (n, 2) of the
@@ -117,7 +117,7 @@ def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """Linearized residuals of one image pair.
+    """The linearized residuals of one image pair.
 
     shifts: residuals (m,), px. by_rig, by_pose: derivatives (m, 22) by the rig and (m, 6) by the
     pose.
@@ -153,7 +153,7 @@ def linearize(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Line
 
 @dataclass(frozen=True, slots=True)
 class _Reduced:
-    """Normal equations of the rig after elimination of the poses.
+    """The normal equations of the rig after elimination of the poses.
 
     matrix, side: matrix (22, 22) and right-hand side (22,). poses: for each pose, the inverse of
     its block (6, 6), its gradient (6,) and its coupling to the rig (22, 6).
@@ -187,11 +187,17 @@ def _scaled_inverse(matrix: Floats) -> Floats:
     """
     scale = np.sqrt(np.diag(matrix))
     if not (np.isfinite(scale).all() and (scale > 0).all()):
-        raise NotDeterminedError("one parameter of the rig has no effect on the corner positions")
+        raise NotDeterminedError(
+            "a parameter of the stereo rig has no effect on the corners; add image pairs with a "
+            "tilted board"
+        )
     values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
     if values[0] < 1e-12:
         weakest = PARAMETERS[int(np.argmax(np.abs(vectors[:, 0] / scale) * scale))]
-        raise NotDeterminedError(f"{weakest} cannot be separated from the other parameters")
+        raise NotDeterminedError(
+            f"the image pairs do not determine {weakest} separately from the other parameters; add "
+            "pairs with other tilts and distances"
+        )
     inverse = (vectors / values) @ vectors.T
     return np.asarray(inverse / np.outer(scale, scale), dtype=np.float64)
 

@@ -1,4 +1,4 @@
-"""Select image pairs of a board during live capture, so that they cover what a calibration needs.
+"""Select image pairs of a board during live capture for a stereo calibration.
 
 A pair is accepted if the board is at rest in a new pose and adds coverage: cells of the image,
 tilts, distances, or the number of pairs.
@@ -21,25 +21,26 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 COLUMNS, ROWS = 4, 3
-"""Number of columns and rows of the cells into which an image is divided to count coverage."""
+"""The number of columns and rows of the cells into which an image is divided to count coverage."""
 
 MIN_CELL_CORNERS = 2
 UPRIGHT_RAD = np.radians(12.0)
 STILL_PX = 0.5
-"""Maximum motion of the corners between images of a board that counts as resting, px."""
+"""The maximum motion of the corners between images of a board that counts as resting, px."""
 
 NEW_POSE_PX = 12.0
-"""Minimum distance of the corners between a new board pose and every accepted one, px."""
+"""The minimum distance of the corners between a new board pose and every accepted one, px."""
 
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
 NEAR, FAR = 0.55, 0.35
-"""Limits of near and far distances, as length of the board's diagonal over the image's diagonal."""
+"""The limits of near and far distances, as length of the board's diagonal over the image's
+diagonal."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """Condition (such as an image cell or a tilt) that a minimum number of image pairs must meet.
+    """A condition (such as an image cell or a tilt) that a minimum number of image pairs must meet.
 
     group: "left cell", "right cell", "tilt", "distance" or "pairs". name: column and row of a cell,
     or the name of the range.
@@ -70,7 +71,7 @@ def compute_required_counts(pairs: int) -> dict[Bin, int]:
 
 @dataclass(frozen=True, slots=True)
 class PairAssessment:
-    """Assessment of one image pair.
+    """The assessment of one image pair.
 
     hint: instruction to the user for the next board pose.
     """
@@ -80,7 +81,7 @@ class PairAssessment:
 
 
 class Capture:
-    """Selector of image pairs for a calibration, which keeps count of the coverage."""
+    """A selector of image pairs for a calibration, which keeps count of the coverage."""
 
     def __init__(
         self,

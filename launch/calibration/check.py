@@ -1,7 +1,8 @@
 """Evaluate a stereo calibration by measuring a board of known size.
 
-On image pairs that were used to calibrate, errors are underestimated. `check_stereo` is therefore
-for other pairs, and `cross_check` measures each pair with a calibration from the remaining pairs.
+On image pairs that were used to calibrate, errors are underestimated. Therefore `check_stereo`
+needs further pairs, and `cross_check` measures each pair with a calibration from the remaining
+pairs.
 """
 
 from __future__ import annotations
@@ -36,13 +37,14 @@ from flexsheet.launch.calibration.corners import (
 )
 from flexsheet.launch.calibration.selection import MIN_PAIRS, PairSelection, fit_selection
 from flexsheet.messages.calibration import Board, StereoCalibration
+from flexsheet.nodes.models.camera import camera_matrix
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class StereoRig:
-    """Stereo camera in OpenCV's form: matrices (3, 3), distortions (5,), transform (4, 4)."""
+    """A stereo camera in OpenCV's form: matrices (3, 3), distortions (5,), transform (4, 4)."""
 
     matrices: tuple[Floats, Floats]
     distortions: tuple[Floats, Floats]
@@ -58,7 +60,7 @@ class StereoRig:
     def from_calibration(calibration: StereoCalibration) -> StereoRig:
         """Make the rig from a calibration file."""
         left, right = (
-            np.array([[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
+            camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
             for lens in (calibration.left, calibration.right)
         )
         distortions = np.array(calibration.left.distortion), np.array(calibration.right.distortion)
@@ -67,7 +69,7 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class BoardMeasurement:
-    """Errors of a board that was measured with a stereo camera, m and px.
+    """The errors of a board that was measured with a stereo camera, m and px.
 
     squares_m: errors of the distances between neighbouring corners. diagonals_m: errors of the
     lengths of the diagonals. rigid_fit_m: distances of the corners from the fitted board. The
@@ -160,7 +162,7 @@ def summarize(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | Non
     square_rms_mm: error of the distances between neighbouring corners. diagonal_rms_mm: error of
     the lengths of the board's diagonals. rigid_fit_rms_mm: distance of the corners from the board
     after a rigid fit. reprojection_rms_px: distance of the detected corners from the projections of
-    the triangulated ones.
+    the triangulated corners.
     """
     return {
         "pairs": len(boards),
@@ -267,7 +269,8 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Cross-validate: calibrate with `leave_out` pairs left out at a time, and measure those.
+    """Cross-validate: calibrate without `leave_out` pairs at a time, and measure the excluded
+    pairs.
 
     The pairs i, i+G, i+2G, ... form a group that is left out together, because consecutive images
     are similar. For chessboards, the same is done with plain OpenCV for comparison. Raises

@@ -1,9 +1,9 @@
 """Run all calibrations of a laboratory in sequence, and store their results in one folder.
 
 This is commissioning: `flexsheet commission`. The folder holds the state (`commission.json`), the
-calibration files, the scene and the launch file that use them, and a report. A step starts from
-the scene with the results of all steps before it. A repeated step therefore invalidates the later
-ones, which must be run again.
+calibration files, the scene and the launch file that use them, and a report. A step starts from the
+scene with the results of all steps before it. Therefore a repeated step invalidates all later
+steps, which must be run again.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class CommissionError(FlexsheetError, ValueError):
 
 
 class StepName(StrEnum):
-    """Steps of a commissioning (calibration of a whole laboratory), in their order.
+    """The steps of a commissioning (calibration of a whole laboratory), in their order.
 
     camera: optics of the stereo camera. arms: poses of the arm bases in the frame of the camera.
     edges: pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of
@@ -64,7 +64,7 @@ STEPS = tuple(StepName)
 
 
 class NodeValue(LimitedModel):
-    """Measured value of a node parameter, for all nodes of a type or for that of one arm."""
+    """A measured value of a node parameter, for all nodes of a type or for that of one arm."""
 
     node_type: str
     parameter: str
@@ -73,13 +73,13 @@ class NodeValue(LimitedModel):
 
 
 class StepResult(LimitedModel):
-    """Result of one step of a commissioning.
+    """The result of one step of a commissioning.
 
     residual: error of the fit in `unit`. advice: remedy if the residual exceeds `limit`.
     uncertainty: standard deviations, whose names end in their units. scene_values: new values of
     the scene by dotted path. parameters: names of calibration files in the folder, by node type and
     parameter (TYPE.PARAMETER). figures: further results. covariances: covariance matrices by name,
-    from which errors are predicted. node_values: other measured parameters of nodes.
+    from which errors are predicted. node_values: further measured values of node parameters.
     """
 
     residual: float
@@ -99,7 +99,7 @@ class StepResult(LimitedModel):
 
 
 class StepRecord(LimitedModel):
-    """Entry of one finished or skipped step in the state file."""
+    """The entry of one finished or skipped step in the state file."""
 
     name: StepName
     date: str
@@ -110,7 +110,7 @@ class StepRecord(LimitedModel):
 
 
 class State(LimitedModel):
-    """Content of the state file: input files of the commissioning, and finished steps."""
+    """The content of the state file: input files of the commissioning, and finished steps."""
 
     version: Literal[1] = 1
     launch_file: str
@@ -135,7 +135,8 @@ Step = Callable[["Commissioning"], StepResult]
 
 @dataclass(slots=True)
 class Commissioning:
-    """Commissioning of one laboratory; an existing folder is continued from its stored state.
+    """The commissioning of one laboratory, which continues from the state in its folder if there is
+    one.
 
     launch_file, scene_file: files to start from. apparatus: value of --apparatus for a simulated
     laboratory, or None. Raises CommissionError if the folder belongs to other files.
@@ -296,7 +297,7 @@ def _now() -> str:
 MEASURED_IN_OPERATION = (
     "The actuation delay of each arm, the camera's rate and the age of its images are measured "
     "while the graph runs. The positions of a head tracker replace the measured eyes. No step "
-    "measures the delay of the projector and the time between exposure and timestamp."
+    "measures the delay of the projector."
 )
 
 

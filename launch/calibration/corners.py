@@ -22,10 +22,10 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Ids = NDArray[np.int64]
 Progress = Callable[[int, int, str], None]
-"""Progress callback with (steps done, total number of steps, description of the last step)."""
+"""A progress callback with (steps done, total number of steps, description of the last step)."""
 
 SCALE = 2
-"""Enlargement of the image for the refinement of corners.
+"""The enlargement of the image for the refinement of corners.
 
 OpenCV's refinement interpolates linearly between pixels. Without enlargement this would shift
 corners by 0.015 px and change the measured size of the board by 3e-5. More markers are detected in
@@ -33,17 +33,20 @@ enlarged images, too.
 """
 
 MIN_CORNERS = 8
-"""Minimum number of ChArUco corners in a view; fewer do not determine the board's pose well."""
+"""The minimum number of ChArUco corners in a view. Fewer corners do not determine the board's pose
+well."""
 
 MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 15
-"""Bounds of half the side of the refinement window, in pixels of the enlarged image."""
+"""The bounds of half the side of the refinement window, in pixels of the enlarged image."""
 
 MAX_REFINEMENT_PX = 1.0
-"""Maximum shift of a ChArUco corner by the refinement, px; a larger shift ends at another edge."""
+"""The maximum shift of a ChArUco corner by the refinement, px. A larger shift indicates that the
+refinement found another edge."""
 
 CHESSBOARD_SMOOTHING_PX = 1.0
 CHARUCO_SMOOTHING_PX = 0.7
-"""Standard deviation of the smoothing of ChArUco images, px; markers are close to the corners."""
+"""The standard deviation of the smoothing of ChArUco images, px; markers are close to the corners.
+"""
 
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 
@@ -61,7 +64,7 @@ class CalibrationError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """Detected board corners in one image: ids (n,), ascending, and pixel positions (n, 2)."""
+    """The detected board corners in one image: ids (n,), ascending, and pixel positions (n, 2)."""
 
     ids: Ids
     pixels: Floats
@@ -69,7 +72,7 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True)
 class BoardPair:
-    """Corners of one board pose in both images; the ids may differ for a ChArUco board."""
+    """The corners of one board pose in both images; the ids may differ for a ChArUco board."""
 
     left: BoardView
     right: BoardView
@@ -137,7 +140,7 @@ def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
 
 
 class CornerFinder:
-    """Detector of the corners of one calibration board.
+    """A detector of the corners of one calibration board.
 
     quick: whether to use OpenCV's fast check, which rejects images without a board early.
     """
@@ -277,7 +280,7 @@ def read_gray(path: Path) -> Image:
 
 
 def compute_digest(left: Path, right: Path) -> str:
-    """Return a digest that distinguishes a pair of files from others with the same names."""
+    """Return a digest of the contents of two image files, 16 hexadecimal digits."""
     return hashlib.sha256(left.read_bytes() + right.read_bytes()).hexdigest()[:16]
 
 

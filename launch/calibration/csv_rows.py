@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from flexsheet.launch.plans.documents import BadInputError, Problem
+from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
@@ -24,10 +24,70 @@ def read_rows(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, s
         raise BadInputError(
             [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
         ) from error
-    missing = [name for name in columns if name not in found]
+    missing = list_missing(str(path), found, columns)
     if missing:
-        raise BadInputError([Problem(str(path), (x,), "missing column", "add it") for x in missing])
+        raise BadInputError(missing)
     return rows
+
+
+def read_table(
+    path: Path,
+    columns: Sequence[str],
+    check_header: Callable[[str, Sequence[str]], list[Problem]],
+    problems: list[Problem],
+) -> list[tuple[int, dict[str, str]]]:
+    """Return the line number and the texts by column of each row of a CSV file.
+
+    Empty lines and lines that start with # are skipped. Rows with a wrong number of values are
+    omitted, and appended to `problems`. columns: all valid columns. check_header: function of the
+    header's location and its columns that returns further problems. Raises BadInputError for an
+    unreadable or empty file, and for wrong columns.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInputError(
+            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
+        ) from error
+    lines = [
+        (number, [cell.strip() for cell in next(csv.reader([line]))])
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if not lines:
+        remedy = f"start with a line of columns: {', '.join(columns)}"
+        raise BadInputError([Problem(str(path), (), "is empty", remedy)])
+    (first, names), *rows = lines
+    where = f"{path}:{first}"
+    wrong = [
+        Problem(where, (name,), "unknown column", did_you_mean(name, columns))
+        for name in names
+        if name not in columns
+    ]
+    wrong += [
+        Problem(where, (name,), "duplicate column", "remove one")
+        for name in dict.fromkeys(names)
+        if names.count(name) > 1
+    ]
+    wrong += check_header(where, names)
+    if wrong:
+        raise BadInputError(wrong)
+    for number, cells in rows:
+        if len(cells) != len(names):
+            what = f"expected {len(names)} values, found {len(cells)}"
+            problems.append(Problem(f"{path}:{number}", (), what, "give one value per column"))
+    return [
+        (number, dict(zip(names, cells, strict=True)))
+        for number, cells in rows
+        if len(cells) == len(names)
+    ]
+
+
+def list_missing(where: str, names: Sequence[str], wanted: Sequence[str]) -> list[Problem]:
+    """Return a problem for each wanted column that the header does not contain."""
+    return [
+        Problem(where, (name,), "missing column", "add it") for name in wanted if name not in names
+    ]
 
 
 def parse_finite(where: str, name: str, text: str, problems: list[Problem]) -> float:

@@ -48,19 +48,20 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 SIDES: tuple[Side, Side] = ("left", "right")
 STROKE_S = 5.0
-"""Duration of the simulated stroke."""
+"""The duration of the simulated stroke."""
 
 BLOCK_S, MIN_BLOCKS = 2.0, 4
-"""Duration of the parts of a recording whose stamp offsets are averaged, and their least number."""
+"""The duration of the parts of a recording whose stamp offsets are averaged, in seconds, and the
+minimum number of these parts."""
 
 STAMP_MODEL_STD_S = 1.5e-4
-"""Standard deviation of the stamp offset that backlash and elasticity of the arms cause, s.
+"""The standard deviation of the stamp offset that backlash and elasticity of the arms cause, s.
 
 The error was 0.1 ms rms in the simulated laboratories 0 to 9.
 """
 
 MARK_SWING_M, MARK_FREQUENCY_HZ, MARK_SECONDS = 0.02, 1.0, 8.0
-"""Simulated motion of the sheet for the stamp offset: amplitude, frequency and duration."""
+"""The simulated motion of the sheet for the stamp offset: amplitude, frequency and duration."""
 
 
 class DelaysError(FlexsheetError, ValueError):
@@ -72,7 +73,7 @@ class DelaysError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredLag:
-    """Delay, such as the servo lag of an arm, and its standard deviation (s)."""
+    """A measured delay, such as the servo lag of an arm, and its standard deviation, in seconds."""
 
     lag_s: float
     uncertainty_s: float
@@ -80,10 +81,10 @@ class MeasuredLag:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredDelays:
-    """Measured delays; None for one that the data do not contain.
+    """The measured delays, in seconds.
 
     servo: lag of each arm, including the command latency. stamp_offset: exposure time minus
-    timestamp.
+    timestamp; None if the data do not contain it.
     """
 
     servo: dict[Side, MeasuredLag]
@@ -100,7 +101,10 @@ def read_measured_lags(bag: Path) -> dict[Side, MeasuredLag]:
             found[message.side] = MeasuredLag(message.servo_lag_s, message.servo_lag_uncertainty_s)
     for side in SIDES:
         if side not in found:
-            raise DelaysError(f"{bag}: the {side} arm's bridge measured no servo lag")
+            raise DelaysError(
+                f"{bag}: the bridge of the {side} arm did not measure a servo lag; record a "
+                "stroke in which this arm moves for several seconds"
+            )
     return found
 
 
@@ -223,7 +227,10 @@ def measure_lags_in_simulation(scene: Scene, apparatus: Apparatus) -> dict[Side,
     lags = {}
     for side, lag_ms, uncertainty_ms in zip(SIDES, lags_ms, uncertainties_ms, strict=True):
         if uncertainty_ms is None:
-            raise DelaysError(f"simulated stroke: the {side} arm's lag could not be measured")
+            raise DelaysError(
+                f"the servo lag of the {side} arm could not be measured in the simulated stroke; "
+                f"check arms.{side} in the apparatus"
+            )
         lags[side] = MeasuredLag(1e-3 * lag_ms, 1e-3 * uncertainty_ms)
     return lags
 
@@ -231,7 +238,7 @@ def measure_lags_in_simulation(scene: Scene, apparatus: Apparatus) -> dict[Side,
 def measure_in_simulation(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> MeasuredDelays:
-    """Measure all delays of a simulated laboratory."""
+    """Measure the servo lags and the stamp offset of a simulated laboratory."""
     servo = measure_lags_in_simulation(scene, apparatus)
     stamp = simulate_stamp_offset(scene, apparatus, calibration=calibration, seed=seed)
     return MeasuredDelays(servo, stamp)
@@ -240,7 +247,7 @@ def measure_in_simulation(
 def swing_sheet(
     scene: Scene, apparatus: Apparatus, *, swing_m: float, frequency_hz: float, seconds: float
 ) -> tuple[tuple[SampledMotion, ...], tuple[SampledMotion, ...]]:
-    """Simulate arms that move the sheet along its y axis, after one second at rest.
+    """Simulate arms that move the sheet periodically along its y axis, after one second at rest.
 
     Return the true motion of both clamps, and that from measured joints.
     """
@@ -301,7 +308,7 @@ def simulate_stamp_offset(
                 left, right = camera.picture(place, exposure_s=scene.camera.exposure_s)
                 yield stamp_ns, StereoPair.model_construct(left=left, right=right)
 
-        # One mark after the other is simulated, as the simulated camera shows one.
+        # The marks are simulated in sequence, because the simulated camera shows only one mark.
         detector = MarkDetector(scene, calibration)
         offsets.append(estimate_stamp_offset(see(), (reported[number],), detector))
     known = [one for one in offsets if one is not None]

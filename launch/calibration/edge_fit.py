@@ -1,4 +1,4 @@
-"""Fit where each arm holds its edge of the sheet, from marks on the clamps that the camera sees.
+"""Fit the pose of the sheet's edge on each arm to marks on the clamps, which the camera measures.
 
 A mark with the position m in the frame of the clamped edge is measured at the world position
 
@@ -27,37 +27,37 @@ from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import make_kinematics
 from flexsheet.nodes.models.rigid import (
     apply,
+    pose_matrix,
     rotation_from_vector,
     rpy_from_rotation,
     transform,
-    transform_from_rpy,
 )
 from flexsheet.nodes.models.sheet import edge_force_n
 
 Floats = NDArray[np.float64]
 
 BASE, JOINTS, EDGE, COMPLIANCE = slice(0, 6), slice(6, 12), slice(12, 18), 18
-"""Indices of the unknowns: error of the base, joint offsets, error of the edge, compliance."""
+"""The indices of the unknowns: error of the base, joint offsets, error of the edge, compliance."""
 
 PRIOR_SIGMA = np.array([*[0.02] * 3, *[0.005] * 3, *[5e-4] * 6, *[0.005] * 3, *[1e-3] * 3, 5e-5])
-"""Standard deviations of the unknowns before the measurement: rad, m, and m/N."""
+"""The standard deviations of the unknowns before the measurement: rad, m, and m/N."""
 
 PRIOR_COMPLIANCE_M_PER_N = 7.5e-5
 MAX_COMPLIANCE_M_PER_N = 1e-2
 
 INITIAL_SIGMA_M, MIN_SIGMA_M = 2e-4, 1e-6
-"""Standard deviation of a measured coordinate: initial value and minimum of the estimate."""
+"""The standard deviation of a measured coordinate: initial value and minimum of the estimate."""
 
 OUTLIER_SIGMAS = 3.0
-"""Deviation above which a coordinate's influence on the fit no longer grows (Huber 1964)."""
+"""The deviation above which a coordinate's influence on the fit no longer grows (Huber 1964)."""
 
 MIN_POSES = 8
 MAX_RESIDUAL_M = 1e-3
-"""Maximum root mean square of the residuals; a larger one indicates wrong marks or joints."""
+"""The maximum root mean square of the residuals; a larger one indicates wrong marks or joints."""
 
 
 class EdgeFitError(FlexsheetError, ValueError):
-    """Raised for marks that do not determine where an arm holds its edge."""
+    """Raised for marks that do not determine the pose of the sheet's edge on an arm."""
 
     code = "edge-fit"
     remedy = (
@@ -68,7 +68,7 @@ class EdgeFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class EdgeMark:
-    """Mark on a clamp of an arm.
+    """A mark on a clamp of an arm.
 
     mark_edge_m: known position (3,) in the frame of the edge. position_world_m: measured position.
     """
@@ -80,7 +80,7 @@ class EdgeMark:
 
 @dataclass(frozen=True, slots=True)
 class HeldPose:
-    """Pose of the sheet at rest, with the reported joint angles (6,) of both arms, rad."""
+    """A pose of the sheet at rest, with the reported joint angles (6,) of both arms, rad."""
 
     left_rad: Floats
     right_rad: Floats
@@ -92,7 +92,7 @@ class HeldPose:
 
 @dataclass(frozen=True, slots=True)
 class EdgeFit:
-    """Fitted arm, and the errors of the fit.
+    """A fitted arm, and the errors of the fit.
 
     residual_rms_m: root mean square distance of a mark from its fitted position.
     edge_std_m: root sum square over the axes of the standard deviation of a mark's fitted
@@ -111,7 +111,7 @@ class EdgeFit:
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """Measured mark, joint angles, and force (3,) of the sheet on the edge in the world frame."""
+    """A measured mark, joint angles, and force (3,) of the sheet on the edge in the world frame."""
 
     joints_rad: Floats
     mark_edge_m: Floats
@@ -156,12 +156,15 @@ def _make_rows(poses: Sequence[HeldPose], side: Side, sheet: SheetSpec) -> list[
 
 
 class _ArmModel:
-    """Positions of the marks of one arm as a function of the unknowns (19,)."""
+    """The positions of the marks of one arm as a function of the unknowns (19,)."""
 
     def __init__(self, arm: ArmSpec, rows: Sequence[_Row]) -> None:
         self._rows = rows
         self._kinematics = make_kinematics(arm.model)
-        self._base, self._clamp = _matrix(arm.world_from_base), _matrix(arm.flange_from_edge)
+        self._base, self._clamp = (
+            pose_matrix(arm.world_from_base),
+            pose_matrix(arm.flange_from_edge),
+        )
         self.prior = np.zeros(19)
         self.prior[JOINTS] = arm.joint_offsets_rad
         self.prior[COMPLIANCE] = arm.flange_compliance_m_per_n or PRIOR_COMPLIANCE_M_PER_N
@@ -239,10 +242,6 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
         marks=len(rows),
         poses=poses,
     )
-
-
-def _matrix(pose: Pose) -> Floats:
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def _pose(matrix: Floats) -> Pose:

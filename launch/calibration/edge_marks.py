@@ -26,7 +26,7 @@ from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.tracking import Gate
-from flexsheet.nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.truth import apply_apparatus
@@ -37,27 +37,27 @@ Image = NDArray[np.uint8]
 SIDES: tuple[Side, Side] = ("left", "right")
 JOINT_COLUMNS = tuple(f"{side}_j{number}_deg" for side in SIDES for number in range(1, 7))
 COLUMNS = ("pose", "side", "along_mm", "x_mm", "y_mm", "z_mm", *JOINT_COLUMNS)
-"""Columns of the CSV file, which has one row for each mark in each pose: number of the pose, arm,
-position of the mark along the clamped edge from its centre, measured position in the world, and
-the joint angles of both arms."""
+"""The columns of the CSV file, which has one row for each mark in each pose: number of the pose,
+arm, position of the mark along the clamped edge from its centre, measured position in the world,
+and the joint angles of both arms."""
 
 MAX_PROBLEMS = 20
 
 ALONG = (-0.45, 0.0, 0.45)
-"""Positions of the simulated marks along the edge, as fractions of its length."""
+"""The positions of the simulated marks along the edge, as fractions of its length."""
 
 SIMULATED_POSES = 24
 MAX_TRIES = 400
 TILT_RAD = np.array([0.5, 0.35, 0.1])
 CENTRE_MIN_M, CENTRE_MAX_M = np.array([-0.02, -0.03, -0.02]), np.array([0.02, 0.03, 0.03])
 MIN_STRETCH, STRETCH_RANGE = 1.005, 0.9
-"""Minimum stretch ratio, and fraction of the range from there to the maximum that is used."""
+"""The minimum stretch ratio, and fraction of the range from there to the maximum that is used."""
 
 SEARCH_M = 0.02
-"""Maximum distance of a mark from its expected position."""
+"""The maximum distance of a mark from its expected position."""
 
 MIN_NEW_JOINT_RAD = 0.02
-"""Minimum rotation of a joint between two recorded poses."""
+"""The minimum rotation of a joint between two recorded poses."""
 
 
 def read_edge_marks(path: Path) -> list[HeldPose]:
@@ -91,23 +91,27 @@ def _make_mark(side: Side, values: dict[str, float]) -> EdgeMark:
     return EdgeMark(side, np.array([0.0, 1e-3 * values["along_mm"], 0.0]), position)
 
 
+def make_detector_config() -> DetectorConfig:
+    """Make the settings of a marker detector from the default parameters of the triangulator."""
+    given = TriangulatorParameters()
+    return DetectorConfig(
+        blob_filter=BlobFilter(
+            min_contrast=given.marker_min_contrast,
+            min_area_px=given.marker_min_area_px,
+            max_area_px=given.marker_max_area_px,
+            window_half_px=given.window_half_px,
+        ),
+        refine=MARKER_METHODS["subpixel_fit"],
+        max_reprojection_px=given.max_reprojection_px,
+    )
+
+
 class MarkDetector:
-    """Detector of marks in stereo images, with the triangulator's methods."""
+    """A detector of marks in stereo images, with the triangulator's methods."""
 
     def __init__(self, scene: Scene, calibration: StereoCalibration | None) -> None:
-        given = TriangulatorParameters()
         self._geometry = StereoGeometry.of(scene.camera, calibration)
-        self._config = DetectorConfig(
-            blob_filter=BlobFilter(
-                min_contrast=given.marker_min_contrast,
-                min_area_px=given.marker_min_area_px,
-                max_area_px=given.marker_max_area_px,
-                window_half_px=given.window_half_px,
-            ),
-            refine=MARKER_METHODS["subpixel_fit"],
-            triangulate=TRIANGULATION_METHODS["dlt"],
-            max_reprojection_px=given.max_reprojection_px,
-        )
+        self._config = make_detector_config()
 
     def find(
         self,
@@ -138,7 +142,7 @@ class MarkDetector:
 
 
 class EdgeMarkRecorder:
-    """Recorder that appends the marks to a CSV file whenever both arms rest in a new pose.
+    """A recorder that appends the marks to a CSV file whenever both arms rest in a new pose.
 
     Joint angles and images must be added in the order of their times (s, on one clock).
     """
@@ -198,9 +202,9 @@ def simulate_edge_marks(
 ) -> list[HeldPose]:
     """Simulate marks on the clamps that the simulated stereo camera measures.
 
-    The arms hold the stretched sheet in random poses. In each pose every joint rests at a
-    random angle within its backlash. Marks that the triangulator's detector rejects are left out.
-    calibration: camera parameters that the detector uses; None: those of the scene.
+    The arms hold the stretched sheet in random poses. In each pose every joint rests at a random
+    angle within its backlash. Marks that the triangulator's detector rejects are left out.
+    calibration: camera parameters that the detector uses; None: the scene's parameters.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)

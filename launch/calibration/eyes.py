@@ -41,34 +41,34 @@ Floats = NDArray[np.float64]
 SIDES: tuple[Side, Side] = ("left", "right")
 POINTS = ("bead", "cross")
 COLUMNS = ("eye", *(f"{point}_{axis}_mm" for point in POINTS for axis in "xyz"))
-"""Columns of the CSV file with one row per alignment: the open eye (left or right), and the
+"""The columns of the CSV file with one row per alignment: the open eye (left or right), and the
 measured world positions of bead and cross, mm."""
 
 MIN_ALIGNMENTS = 6
 OUTLIER_RATIO = 2.0
-"""Multiple of the median distance above which the influence of an alignment on the fit no longer
-grows (Huber 1964)."""
+"""The multiple of the median distance above which the influence of an alignment on the fit no
+longer grows (Huber 1964)."""
 
 MAX_ANGLE_RAD = 0.02
-"""Maximum rms angle between bead and cross at the fitted eye.
+"""The maximum rms angle between bead and cross at the fitted eye.
 
 A larger angle indicates that the eyes, or bead and cross, have been exchanged in the file.
 """
 
 MAX_SHIFT_M = 0.3
-"""Maximum distance of a measured eye from its position in the scene."""
+"""The maximum distance of a measured eye from its position in the scene."""
 
 MIN_DISTANCE_M = 0.05
-"""Minimum distance between bead and cross."""
+"""The minimum distance between bead and cross."""
 
 BEADS_M = tuple((x, y, z) for z in (0.10, 0.15) for y in (-0.05, 0.0, 0.05)
                 for x in (-0.05, 0.0, 0.05))  # fmt: skip
-"""World positions (x, y, z) of the bead in a simulation, used with each eye."""
+"""The world positions (x, y, z) of the bead in a simulation, used with each eye."""
 ALIGNMENT_S = 6.0
-"""Time between two simulated alignments."""
+"""The time between two simulated alignments."""
 
 HEAD_REST_SWAY_M = 1.5e-3
-"""Maximum standard deviation of head motion on a chin rest, which the procedure requires."""
+"""The maximum standard deviation of head motion on a chin rest, which the procedure requires."""
 
 
 class EyesError(FlexsheetError, ValueError):
@@ -83,7 +83,7 @@ class EyesError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Measured world positions (3,) of a bead and a cross that coincide for one eye, m."""
+    """The measured world positions (3,) of a bead and a cross that coincide for one eye, m."""
 
     eye: Side
     bead_m: Floats
@@ -92,7 +92,7 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class EyesFit:
-    """Measured positions of both eyes, with their uncertainty.
+    """The measured positions of both eyes, with their uncertainty.
 
     angle_rms_rad: root mean square of the angle between bead and cross at the measured eye.
     covariance_m2: covariance (3, 3) of the midpoint between the eyes. interocular_std_m: standard
@@ -217,7 +217,7 @@ def simulate_alignments(
     The arms hold the flat sheet at the screen. An alignment is omitted if the viewer does not see
     the sheet behind the bead, or if the detector rejects one of the points. apparatus: true
     parameters of the simulated hardware. calibration: camera parameters that the detector uses;
-    None: those of the scene.
+    None: the scene's parameters.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)

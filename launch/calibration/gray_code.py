@@ -1,4 +1,4 @@
-"""Generate and decode structured light: Gray-code patterns, and camera images of them.
+"""Generate Gray-code patterns for structured light, and decode camera images of the patterns.
 
 A camera pixel is wider than a projector pixel, so the finest stripes are not resolved. Each image
 is decoded to cells of a few projector pixels. A smooth map is fitted to the cells around a
@@ -22,17 +22,20 @@ Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
 MIN_CONTRAST = 24
-"""Minimum difference (grey levels) between the white and the black image at a lit camera pixel."""
+"""The minimum difference (grey levels) between the white and the black image at a lit camera pixel.
+"""
 
 MIN_STRIPE_PX = 4
-"""Width of the finest stripes that are decoded, projector pixels."""
+"""The width of the finest stripes that are decoded, projector pixels."""
 
 WINDOW_HALF_PX = 22.0
-"""Half the side length of the window of the fit around a projector pixel, projector pixels."""
+"""The half side length, in projector pixels, of the window that is fitted around a projector pixel.
+"""
 
 MIN_CELLS = 60
 MAX_FIT_RMS_PX = 0.6
-"""Maximum rms residual of a fit, camera pixels; larger ones span an edge or fold of the sheet."""
+"""The maximum rms residual of a fit, camera pixels. A larger residual indicates an edge or a fold
+of the sheet in the window."""
 
 
 class DecodeError(FlexsheetError, ValueError):
@@ -54,7 +57,7 @@ def make_patterns(width_px: int, height_px: int) -> list[Image]:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Lit camera pixels (n, 2) and the projector pixels (n, 2) that light them.
+    """The lit camera pixels (n, 2) and the projector pixels (n, 2) that light them.
 
     The images identify a cell of several projector pixels, whose centre is stored.
     """
@@ -73,7 +76,9 @@ def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> D
     if len(images) != expected:
         raise DecodeError(f"expected {expected} images, one per pattern, found {len(images)}")
     if len({image.shape for image in images}) != 1:
-        raise DecodeError("the images have different sizes")
+        raise DecodeError(
+            "the images have different sizes; capture all images with the same camera"
+        )
     white, black = (image.astype(np.int16) for image in images[-2:])
     row, column = np.nonzero(white - black >= MIN_CONTRAST)
     if len(row) < MIN_CELLS:
@@ -100,7 +105,10 @@ def _bits(size_px: int) -> int:
 
 
 def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
-    """Return the camera pixels (n, 2) of projector pixels (n, 2), and a mask (n,) of valid ones."""
+    """Find the camera pixels (n, 2) of projector pixels (n, 2).
+
+    Return the camera pixels, and a mask (n,) that is true for valid pixels.
+    """
     found, valid = np.zeros((len(projector_px), 2)), np.zeros(len(projector_px), np.bool_)
     order = np.argsort(view.lit_by[:, 0], kind="stable")
     lit_by, pixels = view.lit_by[order], view.pixels[order]

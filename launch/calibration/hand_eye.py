@@ -43,23 +43,26 @@ from flexsheet.nodes.models.rigid import (
 Floats = NDArray[np.float64]
 
 MIN_POSES = 6
-"""Minimum number of poses; 15 to 20 are recommended."""
+"""The minimum number of poses; 15 to 20 are recommended."""
 
 MIN_ROTATION_RAD = float(np.radians(5.0))
-"""Minimum rms rotation of the flange about each of two axes; less leaves unknowns undetermined."""
+"""The minimum rms rotation of the flange about each of two axes. Smaller rotations do not determine
+all unknowns."""
 
 RANDOM_STARTS = 60
 SUBSET_POSES = 5
-"""Size of the random subsets that give further initial values, in case some poses are wrong."""
+"""The size of the random subsets that give further initial values, in case some poses are wrong."""
 
 LENGTH_M = 0.3
-"""Translation that counts as much as a rotation of one radian in a pose's error."""
+"""The translation, in metres, that has the same weight in a pose's error as a rotation of one
+radian."""
 
 MAX_MEDIAN_RATIO = 6.0
-"""Maximum ratio of a pose's error to the median error, for the pose to be used in the first fit."""
+"""The maximum ratio of a pose's error to the median error, for the pose to be used in the first
+fit."""
 
 MAX_CHI_SQUARE, MEDIAN_CHI_SQUARE = 60.0, 5.348
-"""Limit of the squared deviation above which a pose is an outlier, and the chi-square median.
+"""The limit of the squared deviation above which a pose is an outlier, and the chi-square median.
 
 The median is that for six degrees of freedom; deviations are scaled by it. The limit is above the
 maximum (43) of 75 simulated sets of 15 poses without outliers; an arm's error varies over its
@@ -68,18 +71,18 @@ workspace.
 
 ROUNDING_PX, ROUNDING_RAD, ROUNDING_M = 1e-4, 1e-8, 1e-8
 MIN_SCALE = 0.01
-"""Lower bound of the scale of deviations, for poses that agree except for rounding."""
+"""The lower bound of the scale of deviations, for poses that agree except for rounding."""
 
 MAX_READMISSIONS = 5
 
 MAX_PLAUSIBLE_ARM_M, MAX_PLAUSIBLE_ARM_RAD = 0.01, 0.05
-"""Maximum plausible standard deviations of an arm; larger ones mean wrongly assigned joints."""
+"""The maximum plausible standard deviations of an arm; larger ones mean wrongly assigned joints."""
 
 MAX_OUTLIER_RATIO = 1.0 / 3.0
-"""Maximum fraction of outlier poses; more indicate another mistake, such as a wrong board."""
+"""The maximum fraction of outlier poses; more indicate another mistake, such as a wrong board."""
 
 MIN_ARM_RAD, MIN_ARM_M = 1e-6, 1e-6
-"""Lower bounds of the estimated standard deviations of the arm."""
+"""The lower bounds of the estimated standard deviations of the arm."""
 
 MAX_ARM_RAD, MAX_ARM_M = 0.1, 0.1
 
@@ -89,14 +92,14 @@ ADVICE = (
 )
 
 INITIAL_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
-"""Initial simplex of the search over the logarithms of the arm's two standard deviations."""
+"""The initial simplex of the search over the logarithms of the arm's two standard deviations."""
 
 MAX_ITERATIONS = 30
 CONVERGED_STEP = 1e-10
-"""Maximum step of any unknown (rad, m) at convergence."""
+"""The maximum step of any unknown (rad, m) at convergence."""
 
 INITIAL_STEP = 1e-6
-"""Maximum step at convergence of the fits that compute initial values."""
+"""The maximum step at convergence of the fits that compute initial values."""
 
 
 class HandEyeError(FlexsheetError, ValueError):
@@ -108,7 +111,7 @@ class HandEyeError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class CameraLens:
-    """Camera matrix (3, 3), px, and Brown's lens distortion (5,)."""
+    """A camera matrix (3, 3), px, and Brown's lens distortion (5,)."""
 
     matrix: Floats
     distortion: Floats
@@ -116,7 +119,7 @@ class CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class LensRig:
-    """Lenses and pose of the stereo camera; transforms are (4, 4)."""
+    """The lenses and pose of the stereo camera; transforms are (4, 4)."""
 
     left: CameraLens
     right: CameraLens
@@ -126,7 +129,7 @@ class LensRig:
 
 @dataclass(frozen=True, slots=True)
 class CornerView:
-    """Board corners in one image: points in the board's frame (k, 3), m, and pixels (k, 2)."""
+    """The board corners in one image: points in the board's frame (k, 3), m, and pixels (k, 2)."""
 
     points_board: Floats
     pixels: Floats
@@ -134,7 +137,7 @@ class CornerView:
 
 @dataclass(frozen=True, slots=True)
 class BoardDetection:
-    """One pose of the arm: joint angles (6,), rad, and the board's corners in both images."""
+    """A pose of the arm: joint angles (6,), rad, and the board's corners in both images."""
 
     name: str
     joints_rad: Floats
@@ -144,7 +147,7 @@ class BoardDetection:
 
 @dataclass(frozen=True, slots=True)
 class PoseResidual:
-    """Residual of one pose of the arm.
+    """The residual of one pose of the arm.
 
     shift_m, rotation_rad: difference between the flange poses from the images and from the joints.
     rms_px: rms distance of the corners from their projections with the pose from the joints.
@@ -160,7 +163,7 @@ class PoseResidual:
 
 @dataclass(frozen=True, slots=True)
 class BaseFit:
-    """Estimated pose of the arm's base, with its uncertainty and residuals.
+    """The estimated pose of the arm's base, with its uncertainty and residuals.
 
     covariance: covariance (6, 6) of the motion from the estimated to the true world_from_base:
     rotation about the base's origin in world axes, then translation. It is scaled by the square of
@@ -168,8 +171,8 @@ class BaseFit:
 
     corner_sigma_px: standard deviation of one corner coordinate. arm_sigma_rad, arm_sigma_m:
     standard deviations of one component of the flange's pose error. jackknife_ratio: ratio of the
-    standard deviations from the jackknife to those from the fit (rms over six). leave_one_out:
-    motions (n, 6) of the base when one inlier is excluded.
+    standard deviations from the jackknife to the standard deviations from the fit (rms over the six
+    components). leave_one_out: motions (n, 6) of the base when one inlier is excluded.
     """
 
     world_from_base: Floats
@@ -195,7 +198,7 @@ class BaseFit:
 
 @dataclass(frozen=True, slots=True)
 class _Unknowns:
-    """Estimates of the unknown transforms, both (4, 4)."""
+    """The estimates of the unknown transforms, both (4, 4)."""
 
     world_from_base: Floats
     flange_from_board: Floats
@@ -210,7 +213,7 @@ class _Unknowns:
 
 @dataclass(frozen=True, slots=True)
 class _LinearizedPose:
-    """Model of one pose, linearized at the current estimates.
+    """A model of one pose, linearized at the current estimates.
 
     measured: flange motion (6,), in the flange's frame, that fits the corners best. spread: its
     covariance (6, 6) per px^2 of corner noise. by_unknowns: derivative (6, 12) of the flange motion
@@ -416,9 +419,9 @@ def _solve_closed_form(
     """Return Shah's solution of B F X = C, or None if the poses have none.
 
     Here B is world_from_base, F base_from_flange, X flange_from_board and C world_from_board. With
-    Y the transpose of X's rotation, C Y = B F for all rotations. So the matrix sum(kron(F, C)) maps
-    the stacked columns of Y to n times those of B, and both are its first singular vectors. The
-    translations follow by linear least squares.
+    Y the transpose of X's rotation, C Y = B F for all rotations. Therefore the matrix sum(kron(F,
+    C)) maps the stacked columns of Y to n times those of B, and both are its first singular
+    vectors. The translations follow by linear least squares.
     """
     worlds = [rig.world_from_left @ board for board in boards]
     stacked = np.sum(
@@ -441,7 +444,7 @@ def _solve_closed_form(
 
 
 def _unstack_rotation(stacked: Floats) -> Floats:
-    """Return the rotation nearest to stacked columns (9,) that are known up to a factor."""
+    """Return the rotation (3, 3) nearest to a multiple of the stacked columns (9,)."""
     matrix = stacked.reshape(3, 3).T
     return _mean_rotation([matrix if np.linalg.det(matrix) > 0.0 else -matrix])
 
@@ -472,7 +475,7 @@ def _find_rough_inliers(discrepancies: Floats) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class _NoiseModel:
-    """Standard deviations of a corner coordinate (px) and of the flange's pose error (rad, m)."""
+    """The standard deviations of corner coordinates, px, and the flange's pose error, rad and m."""
 
     corner_px: float
     arm_rad: float

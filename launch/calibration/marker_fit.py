@@ -1,10 +1,10 @@
 """Fit the marker's position on the finger to touches of known points in several orientations.
 
 The marker's centre is at p + e + R o + b + noise. Here p is the touched point, e the error of its
-position, which all touches of this point share, R the finger's orientation, and o the wanted offset
-in the finger's frame. b is an error that all touches in one orientation share: the detected centre
-of a tilted marker is biased. A touched plane, such as the sheet, only determines the component
-along its normal.
+position, which all touches of this point share, R the finger's orientation, and o the unknown
+offset in the finger's frame. b is an error that all touches in one orientation share: the detected
+centre of a tilted marker is biased. A touched plane, such as the sheet, only determines the
+component along its normal.
 
 This is a linear model with random effects e and b. Their variances are estimated with the offset
 by restricted maximum likelihood and prior distributions, so that the covariance of the offset
@@ -25,37 +25,37 @@ from flexsheet.messages.errors import FlexsheetError
 Floats = NDArray[np.float64]
 
 TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M = 2e-4, 1e-4, 1e-4
-"""Expected standard deviations per axis: of a touch, from camera, hand and measured angle; of the
-error that all touches in one orientation share; of the position of a touched point."""
+"""The expected standard deviations per axis: of a touch, from camera, hand and measured angle; of
+the error that all touches in one orientation share; of the position of a touched point."""
 
 COMMON_ERROR_M = 6.5e-5
-"""Standard deviation per axis of the error that all touches share, which residuals cannot show.
+"""The standard deviation per axis of the error that all touches share, which residuals cannot show.
 
 The causes are the mean bias of the detected centre of a tilted marker and the stereo calibration.
 The value makes the stated error equal the true one in the simulated laboratories 0 to 11.
 """
 
 PRIOR_STD_LN = np.array([0.5, 0.7, 0.4])
-"""Standard deviations of the logarithms of the three standard deviations above."""
+"""The standard deviations of the logarithms of the three standard deviations above."""
 
 POINT_GRID_M = 1e-6
-"""Coordinates of one touched point are equal after rounding to this grid."""
+"""The grid, in metres, to which points are rounded to find touches of the same point."""
 
 MIN_TOUCHES, MIN_ORIENTATIONS = 4, 3
 MIN_ANGLE_RAD = np.radians(8.0)
-"""Minimum angle between orientations that count as different."""
+"""The minimum angle between orientations that count as different."""
 
 MAX_DEVIATION_M = 5e-4
-"""Maximum standard deviation of a component of the offset that counts as determined."""
+"""The maximum standard deviation of a component of the offset that counts as determined."""
 
 MAX_RESIDUAL_M = 1e-3
-"""Maximum root mean square residual of touches that count as consistent."""
+"""The maximum root mean square residual of touches that count as consistent."""
 
 MAX_CONDITION = 1e6
-"""Maximum condition number of touches that determine all components of the offset."""
+"""The maximum condition number of touches that determine all components of the offset."""
 
 MAX_OFFSET_M = 0.05
-"""Maximum plausible distance between the marker and the finger's pad."""
+"""The maximum plausible distance between the marker and the finger's pad."""
 
 
 class MarkerFitError(FlexsheetError, ValueError):
@@ -67,7 +67,7 @@ class MarkerFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """One touch of a known point or plane, during which the finger was at rest.
+    """A touch of a known point or plane, during which the finger was at rest.
 
     marker_m, point_m: measured marker and touched point (3,), world. normal: (3,) of a touched
     plane; None: the pad was at the point. world_from_finger: rotation (3, 3).
@@ -81,7 +81,7 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class MarkerFit:
-    """Fitted offset of the marker (3,) in the finger's frame, m, and its covariance (3, 3), m².
+    """A fitted offset of the marker (3,) in the finger's frame, m, and its covariance (3, 3), m².
 
     point_offset_m: mean of the estimated errors of the touched points, world. residuals_m: residual
     distances (touches,). points, orientations: numbers of different points and orientations.
@@ -133,7 +133,10 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     matrix = np.vstack([one @ touch.world_from_finger for one, touch in pairs])
     values = np.concatenate([one @ (touch.marker_m - touch.point_m) for one, touch in pairs])
     if np.linalg.cond(matrix) > MAX_CONDITION:
-        raise MarkerFitError("the touches do not determine the offset: all are along one direction")
+        raise MarkerFitError(
+            "the touches do not determine the offset, because all are along one direction; touch "
+            "in other orientations"
+        )
     fixed = COMMON_ERROR_M**2 * parallel
     expected_m = np.array([TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M])
 
@@ -192,7 +195,7 @@ def _check_fit(fit: MarkerFit) -> None:
 
 
 def group_orientations(rotations: Sequence[Floats]) -> list[int]:
-    """Return for each rotation (3, 3) the number of the first similar one among the different."""
+    """Group similar rotations (3, 3), and return the index of each rotation's group."""
     different: list[Floats] = []
     groups = []
     for rotation in rotations:

@@ -45,39 +45,40 @@ Random = np.random.Generator
 DRAWS = 12
 DRAW_SEED = 20_000
 PIXEL_M = 0.0025
-"""Size of a pixel of the predicted images, m. Their error is averaged over about 100 mm²."""
+"""The size of a pixel of the predicted images, m. Their error is averaged over about 100 mm²."""
 
 CELLS = 16
-"""Number of mesh intervals per side of the sheet in a prediction."""
+"""The number of mesh intervals per side of the sheet in a prediction."""
 
 NORMAL_95 = 1.645
-"""95 % quantile of the standard normal distribution."""
+"""The 95 % quantile of the standard normal distribution."""
 
 RADIUS_STD_M = 3e-4
-"""Standard deviation of the finger radius, measured with a calliper on a soft fingertip."""
+"""The standard deviation of the finger radius, measured with a calliper on a soft fingertip."""
 
 EYE_STD_M = 5e-3
-"""Standard deviation per axis of a head tracker, used if no step has measured the eyes."""
+"""The standard deviation per axis of a head tracker, used if no step has measured the eyes."""
 
 STAMP_STD_S = 3e-3
-"""Standard deviation of exposure time minus timestamp, used if no step has measured it.
+"""The standard deviation of exposure time minus timestamp, used if no step has measured it.
 
 The value assumes a uniform distribution within an exposure of 10 ms.
 """
 
 THICKNESS_GRADIENT_STD, SHEET_MASS_STD_RATIO = 0.03, 0.07
-"""Standard deviations of the thickness gradient of the sheet, and of its relative mass per area if
-no step has measured it: 4 % of density and 6 % of thickness.
+"""The standard deviations of the thickness gradient of the sheet, and of its relative mass per area
+if no step has measured it: 4 % of density and 6 % of thickness.
 
 Sources: ISO 3302-1 class M1 for rubber sheets; densities of natural rubber compounds.
 """
 
 FRICTION, FRICTION_STD_LN = 1.24, 0.3
-"""Friction coefficient between rubber and a finger at 1 N, and standard deviation of its logarithm
-(Seo et al. 2009)."""
+"""The friction coefficient between rubber and a finger at 1 N, and standard deviation of its
+logarithm (Seo et al. 2009)."""
 
 CREEP_RATIO_PER_DECADE, CREEP_STD = 0.05, 0.02
-"""Relative decrease of the force of natural rubber per decade of time, and standard deviation."""
+"""The relative decrease of the force of natural rubber per decade of time, and standard deviation.
+"""
 
 MAX_HYSTERESIS_RATIO = 0.9
 
@@ -90,7 +91,7 @@ the simulated laboratories 0 to 11.
 
 
 class PredictedError(LimitedModel):
-    """Predicted error of one metric, in the unit of the metric.
+    """The predicted error of one metric, in the unit of the metric.
 
     typical: root mean square error. limit_95: 95 % quantile of the error. tolerance: maximum error
     that the scene allows.
@@ -104,7 +105,7 @@ class PredictedError(LimitedModel):
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """Results of a commissioning from which errors are predicted.
+    """The results of a commissioning from which errors are predicted.
 
     calibrations: calibrations that the nodes use. edges: by side, covariance (19, 19) of the
     unknowns of `fit_edges`; a side that was not calibrated is absent. projector_px2: covariance
@@ -271,7 +272,10 @@ def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: R
 
 
 def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
-    """Draw random modulus and slack width of the sheet; empty without a sheet calibration."""
+    """Draw a random modulus and slack width of the sheet.
+
+    Return an empty mapping without a sheet calibration.
+    """
     sheet = known.calibrations.sheet
     if sheet is None:
         return {}
@@ -284,7 +288,8 @@ def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
 
 
 def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Random) -> Apparatus:
-    """Return the apparatus with a random hysteresis that is consistent with the calibration.
+    """Draw a random hysteresis that is consistent with the calibration; return the changed
+    apparatus.
 
     The calibration measures how much smaller the force is while unloading than while loading, at
     the same depth. Creep explains a part of this difference, and the hysteresis the remainder.

@@ -19,7 +19,7 @@ from flexsheet.messages.files import write_file
 Floats = NDArray[np.float64]
 
 BORDER_SQUARES = 1.0
-"""Width of the white border around the squares, which detectors need."""
+"""The width of the white border around the squares, which detectors need."""
 
 CAPTION_MM = 8.0
 RULER_MM = 100.0

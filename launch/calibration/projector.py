@@ -1,4 +1,4 @@
-"""Calibrate the projector's optics and pose from the points that its pixels light.
+"""Calibrate the optics and the pose of the projector from the points that its pixels light.
 
 A projector is an inverse camera: each of its pixels lights a point, whose position two cameras
 measure. The poses of the sheet on which the points lie therefore need not be known.
@@ -21,10 +21,10 @@ from flexsheet.nodes.models.camera import camera_matrix, normalize, project
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
+    pose_matrix,
     rotation_from_vector,
     rpy_from_rotation,
     transform,
-    transform_from_rpy,
     vector_from_rotation,
 )
 
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 GRID_PX = 20
-"""Distance between the sampled projector pixels, px."""
+"""The distance between the sampled projector pixels, px."""
 
 MIN_POSES, MIN_POINTS = 3, 200
 MIN_DEPTH_RANGE_M = 0.03
@@ -41,7 +41,7 @@ MAX_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
 OUTLIER_RATIO = 4.0
 TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
-"""Typical errors of a projector in a scene that was measured by tape; only their ratios matter.
+"""The typical errors of a projector in a scene that was measured by tape; only their ratios matter.
 
 Rotation (rad), position (m), focal length (relative), principal point (px).
 """
@@ -57,7 +57,7 @@ class ProjectorError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ProjectorPoints:
-    """Points that projector pixels light.
+    """The points that projector pixels light.
 
     world: positions (n, 3), m. pixels: projector pixels (n, 2). pose: index (n,) of the sheet's
     pose. skew_m: distance (n,) between the rays of the two cameras.
@@ -71,7 +71,7 @@ class ProjectorPoints:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorFit:
-    """Calibrated projector and its residuals, in projector pixels and in metres on the sheet.
+    """A calibrated projector and its residuals, in projector pixels and in metres on the sheet.
 
     held_out_rms_px: rms residual of poses that were excluded from the fit. before_rms_px: rms
     residual of the initial projector. coverage_ratio: fraction of the image's cells that contain
@@ -140,14 +140,14 @@ def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tup
     on_a = ((bb * da - ab * db) / denominator)[:, None] * a
     on_b = base + ((ab * da - aa * db) / denominator)[:, None] * b
     pose = camera.world_from_left
-    world_from_left = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    world_from_left = pose_matrix(pose)
     return apply(world_from_left, 0.5 * (on_a + on_b)), np.linalg.norm(on_a - on_b, axis=1)
 
 
 def project_points(projector: Projector, world: Floats) -> Floats:
     """Return the projector pixels (n, 2) that light world points (n, 3)."""
     lens, pose = projector.lens, projector.world_from_projector
-    local = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), world)
+    local = apply(inverse(pose_matrix(pose)), world)
     matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
     return project(local, matrix, np.array(lens.distortion))
 
@@ -226,7 +226,7 @@ def _rms(values: Floats) -> float:
 def _measure_depth_range(points: ProjectorPoints, guess: Projector) -> float:
     """Return the depth range (m) of the central 90 % of the points, along the projector's axis."""
     pose = guess.world_from_projector
-    along = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), points.world)[:, 2]
+    along = apply(inverse(pose_matrix(pose)), points.world)[:, 2]
     return float(np.ptp(np.quantile(along, [0.05, 0.95]))) if len(along) else 0.0
 
 
@@ -241,12 +241,12 @@ def _fit_projector(
 ) -> Projector:
     """Fit a projector by least squares: one focal length, principal point, k1, k2, p1, p2.
 
-    Aspect ratio and k3 are those of the guess. OpenCV's fit is not used, because it rejects a
-    principal point outside the image, which lens shift causes.
+    The aspect ratio and k3 are fixed to the values of the guess. OpenCV's fit is not used, because
+    it rejects a principal point outside the image, which lens shift causes.
     """
     world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
-    from_world = inverse(transform_from_rpy(pose.position_m, pose.rpy_rad))
+    from_world = inverse(pose_matrix(pose))
     aspect, k3 = lens.fy_px / lens.fx_px, lens.distortion[4]
     start = [
         *vector_from_rotation(from_world[:3, :3]),
@@ -316,7 +316,7 @@ def fit_keystone(
             "bottom right, top right, top left, as the user sees them"
         )
     lens, pose = guess.lens, guess.world_from_projector
-    start = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    start = pose_matrix(pose)
 
     def build_projector(numbers: Floats) -> Projector:
         x = numbers * TYPICAL_ERRORS

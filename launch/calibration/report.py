@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0
-"""Length of the arrow that shows the 95th percentile of the residuals, image px."""
+"""The length of the arrow that shows the 95th percentile of the residuals, image px."""
 
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }

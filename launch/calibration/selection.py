@@ -34,14 +34,14 @@ MISFIT_RATIO = 5.0
 MIN_MISFIT_PX = 5.0
 MISFIT = "inconsistent with the other pairs:"
 CORNER_RATIO = 6.0
-"""Residual above which a corner is an outlier, in standard deviations."""
+"""The residual above which a corner is an outlier, in standard deviations."""
 
 CORNER_ROUNDS = 2
 MAX_OUTLIER_FRACTION = 0.15
-"""Maximum fraction of outlier corners in a pair; a pair with more is excluded."""
+"""The maximum fraction of outlier corners in a pair; a pair with more is excluded."""
 
 REPEAT_PX = 1.0
-"""Maximum distance of corners (px) between two pairs that count as the same board pose."""
+"""The maximum distance of corners (px) between two pairs that count as the same board pose."""
 
 
 def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) -> Floats:
@@ -65,7 +65,7 @@ def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) 
 def compute_misfits(
     pairs: Sequence[BoardPair], points: Floats, left: Floats, right: Floats
 ) -> tuple[Floats, Floats]:
-    """Measure how much each pair contradicts the others, to find wrongly matched images.
+    """Measure the deviation of each pair from a reference pair, to find wrongly matched images.
 
     Each pair alone determines the relative pose of the cameras. The reference is the pair whose
     pose has the smallest median deviation over all pairs (least median of squares, Rousseeuw 1984).
@@ -128,7 +128,7 @@ def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardP
 
 
 def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
-    """Find pairs that repeat an earlier board pose; map their indices to the earlier ones.
+    """Map the index of each pair that repeats a board pose to the index of the earlier pair.
 
     Repeated pairs have the same errors, so they must not count as independent measurements.
     """
@@ -147,7 +147,7 @@ def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
 
 
 def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
-    """Return the median distance between common corners, px; the larger one of both views."""
+    """Return the larger of both views' median distances between common corners, px."""
     medians = []
     for here, there in ((pair.left, other.left), (pair.right, other.right)):
         _, a, b = np.intersect1d(here.ids, there.ids, assume_unique=True, return_indices=True)
@@ -158,7 +158,7 @@ def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
 
 
 class PairSelection:
-    """Pairs that remain in a calibration, and the reasons for which others were excluded.
+    """The pairs that remain in a calibration, and the reasons for which others were excluded.
 
     good: indices of the remaining pairs. reasons: reason for each excluded pair, by index.
     residuals: rms (2,) px of the left and right view by index, including excluded pairs.
@@ -185,7 +185,10 @@ class PairSelection:
         return list(self.good.values())
 
     def exclude_pairs(self, errors_px: Floats, ratio: float, min_px: float, what: str) -> bool:
-        """Exclude pairs with errors above `min_px` and `ratio` medians; return whether any was."""
+        """Exclude pairs with errors above `min_px` and `ratio` medians.
+
+        Return whether a pair was excluded.
+        """
         limit_px = max(ratio * float(np.median(errors_px)), min_px)
         bad = [
             (i, error) for i, error in zip(self.good, errors_px, strict=True) if error > limit_px
@@ -208,7 +211,9 @@ class PairSelection:
                 self.good[i] = pair
 
     def stray_corners(self, number: int) -> int:
-        """Return how many corners were removed from both views of the pair with index `number`."""
+        """Return the number of corners that were removed from both views of the pair with index
+        `number`.
+        """
         whole = self.found[number]
         if isinstance(whole, str) or number not in self.good:
             return 0
@@ -216,7 +221,7 @@ class PairSelection:
 
 
 def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int]) -> RigFit:
-    """Fit the rig to the reliable pairs and corners, and exclude the others from the selection.
+    """Fit the rig to the reliable pairs and corners, and exclude unreliable pairs.
 
     Excludes pairs that contradict the others (`compute_misfits`), corners with residuals above six
     standard deviations, and pairs whose residual exceeds half a pixel and three times the median.

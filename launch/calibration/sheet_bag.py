@@ -12,24 +12,24 @@ from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, Fingertip, Force
-from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.models.rigid import pose_matrix
 
 Floats = NDArray[np.float64]
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""Time before and after a measured force, and maximum change of the depth in this time.
+"""The time before and after a measured force, and maximum change of the depth in this time.
 
 Gauges lag, so that forces during a motion cannot be used.
 """
 
 MAX_GAP_S = 0.05
-"""Maximum time between a force and the nearest messages of fingertip and arms."""
+"""The maximum time between a force and the nearest messages of fingertip and arms."""
 
 MIN_DEPTH_M = 0.003
-"""Minimum depth; below it, errors of the fingertip's position dominate the force."""
+"""The minimum depth; below it, errors of the fingertip's position dominate the force."""
 
 REVERSAL_M = 0.001
-"""Change of the depth that counts as loading or unloading."""
+"""The minimum change of the depth that counts as loading or unloading, in metres."""
 
 MAX_ROWS = 300
 
@@ -37,8 +37,8 @@ MAX_ROWS = 300
 def read_pushes(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
     """Return the scene of a bag, and the pushes in which the finger rested in the sheet.
 
-    Fingertip and arm poses are those that the nodes measured. Raises SheetModelFitError if the bag
-    has no scene, or no pushes with a valid contact force.
+    The pushes are computed from the fingertip and arm poses that the nodes measured. Raises
+    SheetModelFitError if the bag has no scene, or no pushes with a valid contact force.
     """
     scene: Scene | None = None
     tips: list[tuple[int, Floats]] = []
@@ -98,10 +98,7 @@ def select_pushes(
     forces: times (ns) and forces (N). tips: positions (3,) of the fingertip; left, right: flange
     poses as rows (16,).
     """
-    clamps = [
-        transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)
-        for arm in (scene.arms.left, scene.arms.right)
-    ]
+    clamps = [pose_matrix(arm.flange_from_edge) for arm in (scene.arms.left, scene.arms.right)]
     half_height_m = 0.5 * scene.sheet.height_m
     pushes: list[MeasuredPush] = []
     unloading, extreme_m = False, 0.0
@@ -147,7 +144,9 @@ def _gap_s(motion: SampledMotion, at_ns: int) -> float:
 
 
 def _locate(tip: Floats, left: Floats, right: Floats) -> tuple[float, tuple[float, float], float]:
-    """Return depth behind the plane of the sheet, position on it, and edge distance, m."""
+    """Return the depth of a fingertip behind the plane of the sheet, its position (x, y) on the
+    sheet, and the distance of the edges, m.
+    """
     across = right[:3, 3] - left[:3, 3]
     distance_m = float(np.linalg.norm(across))
     x_axis = across / distance_m

@@ -28,13 +28,15 @@ Bools = NDArray[np.bool_]
 FORCE_NOISE_N = 0.01
 EDGE_NOISE_N = 0.1
 MODEL_ERROR_RATIO = 0.03
-"""Model error as a fraction of the force; residuals are divided by it and the noise combined."""
+"""The model error as a fraction of the force; residuals are divided by it and the noise combined.
+"""
 
 OUTLIER_SIGMAS = 5.0
-"""Residual of an outlier row, in standard deviations; the fit is repeated without outliers."""
+"""The residual above which a row is an outlier, in standard deviations. The fit is repeated without
+outliers."""
 
 MAX_RELATIVE_DEVIATION = 0.5
-"""Maximum relative standard deviation of a parameter that counts as determined."""
+"""The maximum relative standard deviation of a parameter that counts as determined."""
 
 
 class SheetModelFitError(FlexsheetError, ValueError):
@@ -46,7 +48,7 @@ class SheetModelFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPush:
-    """One measured push.
+    """A measured push of a finger into the sheet; lengths in metres, forces in newtons.
 
     position_m: contact on the stretched sheet, from its centre. edge_force_n: force on a clamped
     edge; None if not measured. unloading: whether the finger was deeper before; None if unknown.
@@ -63,7 +65,7 @@ class MeasuredPush:
 
 @dataclass(frozen=True, slots=True)
 class SheetModelFit:
-    """Fitted sheet model and its uncertainty.
+    """A fitted sheet model and its uncertainty.
 
     law: force model; it takes the stretch ratio relative to the nominal width. names, values,
     standard_deviations: fitted parameters, in the same order. used: mask (n,) of the rows that are
@@ -83,19 +85,21 @@ class SheetModelFit:
 
 
 MIN_HYSTERESIS_ROWS = 3
-"""Minimum number of rows with loading, and with unloading, to estimate the hysteresis."""
+"""The minimum number of rows with loading, and with unloading, to estimate the hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hysteresis:
-    """Fraction of the loading energy that is lost in a cycle, with its standard deviation."""
+    """The fraction of the loading energy that is lost in a cycle, with its standard deviation."""
 
     ratio: float
     standard_deviation: float
 
     @property
     def amplitude(self) -> float:
-        """Return h: loading needs 1 + h times the elastic force, unloading gives 1 - h times."""
+        """Return the relative amplitude h of the hysteresis. The force is 1 + h times the elastic
+        force during loading, and 1 - h times during unloading.
+        """
         return self.ratio / (2.0 - self.ratio)
 
 
@@ -117,15 +121,16 @@ def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> H
         [float(np.mean(part)) for part in parts],
         [float(np.std(part, ddof=1) / np.sqrt(len(part))) for part in parts],
     )
-    share = falls / loading
-    deviation = share * float(np.hypot(errors[0] / loading, errors[1] / falls))
-    if share > 1.0 + 3.0 * deviation:
+    ratio = falls / loading
+    deviation = ratio * float(np.hypot(errors[0] / loading, errors[1] / falls))
+    if ratio > 1.0 + 3.0 * deviation:
         raise SheetModelFitError(
-            f"column unloading: its force is {share:.2f} times that of loading; check the column"
+            f"the force during unloading is {ratio:.2f} times the force during loading, but it "
+            "must be smaller; correct the column unloading (1: unloading, 0: loading)"
         )
     # (1 - h) / (1 + h) is the ratio of the forces, and 2 h / (1 + h) the lost fraction of the
     # energy.
-    return Hysteresis(max(1.0 - share, 0.0), deviation)
+    return Hysteresis(max(1.0 - ratio, 0.0), deviation)
 
 
 def remove_hysteresis(pushes: Sequence[MeasuredPush], hysteresis: Hysteresis) -> list[MeasuredPush]:
@@ -141,8 +146,8 @@ NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_ra
 
 
 PRIOR_WIDTH_M, PRIOR_LOG_CUBIC = 0.0005, 0.2
-"""Standard deviations of a width that was measured with a ruler (tolerance of the slack width), and
-of the logarithm of the cubic ratio, which is 1 for ideal rubber."""
+"""The standard deviations of a width that was measured with a ruler (tolerance of the slack width),
+and of the logarithm of the cubic ratio, which is 1 for ideal rubber."""
 
 
 def fit_sheet_model(
@@ -252,7 +257,7 @@ def fit_sheet_model(
 def _predict(
     law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float
 ) -> tuple[Floats, Floats]:
-    """Compute contact forces and edge forces (n,), N; pushes that differ in depth share a call."""
+    """Compute the contact forces (n,) and the edge forces (n,) of pushes, N."""
     forces, edges = np.empty(len(pushes)), np.empty(len(pushes))
     groups: dict[tuple[float, tuple[float, float], float], list[int]] = {}
     for number, push in enumerate(pushes):
@@ -275,8 +280,8 @@ def _residuals(
 ) -> Floats:
     """Return the weighted residuals of the pushes that `used` selects: contact and edge forces.
 
-    The contact forces are first. fold: return instead, for every push (n,), the larger magnitude of
-        its two residuals.
+    The contact forces are first. fold: return instead the larger magnitude of both residuals of
+    every push (n,).
     """
     forces, edges = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
@@ -307,8 +312,8 @@ def tabulate_pushes(
     """Tabulate the measured corrections of the model, from the used rows.
 
     Every combination of stretch, x and y must occur; points are identified by their distance from
-    the sheet's centre. Depths may differ; they are interpolated to the range that all combinations
-    have. Raises SheetModelFitError for an incomplete grid.
+    the sheet's centre. Depths may differ. Corrections are interpolated at depths that all
+    combinations cover. Raises SheetModelFitError for an incomplete grid.
     """
     cells: dict[tuple[float, float, float], list[tuple[float, float]]] = {}
     ratios = _force_ratios(law, pushes, nominal_width_m) + 1.0

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 
+from flexsheet.launch.calibration.csv_rows import list_missing, read_table
 from flexsheet.launch.calibration.sheet_fit import MeasuredPush
 from flexsheet.launch.calibration.simulated_sheet import SimulatedSheet
-from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
+from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene, SheetSpec
 
@@ -22,10 +22,11 @@ OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm", "unloading")
 COLUMNS = (*STRETCH, *REQUIRED, *OPTIONAL)
 
 MAX_PROBLEMS = 20
-"""Maximum number of problems that are listed; further problems are only counted."""
+"""The maximum number of problems that are listed; further problems are only counted."""
 
 MAX_LENGTH_RATIO = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
-"""Maximum plausible length divided by the sheet's width; a larger one has probably another unit."""
+"""The maximum plausible length divided by the sheet's width, by column. A larger length probably
+has another unit."""
 
 
 def read_rows(
@@ -39,40 +40,12 @@ def read_rows(
     finger was deeper before, else 0). Empty lines and lines that start with # are skipped. Raises
     BadInputError with file, line and column.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        reason = error.strerror or str(error)
-        raise BadInputError(
-            [Problem(str(path), (), f"cannot be read: {reason}", "check the path")]
-        ) from error
-    except UnicodeDecodeError as error:
-        raise BadInputError(
-            [Problem(str(path), (), f"is not UTF-8 text: {error}", "save it as CSV in UTF-8")]
-        ) from error
-    lines = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not lines:
-        raise BadInputError(
-            [
-                Problem(
-                    str(path), (), "is empty", f"start with a line of columns: {', '.join(COLUMNS)}"
-                )
-            ]
-        )
-    first, header = lines[0]
-    names = [name.strip() for name in next(csv.reader([header]))]
-    _check_header(f"{path}:{first}", names)
     problems: list[Problem] = []
     pushes: list[MeasuredPush] = []
     numbers: list[int] = []
-    for number, line in lines[1:]:
-        cells = next(csv.reader([line]))
+    for number, cells in read_table(path, COLUMNS, _check_header, problems):
         found: list[Problem] = []
-        values = _parse_row(f"{path}:{number}", names, cells, sheet, found)
+        values = _parse_row(f"{path}:{number}", cells, sheet, found)
         if found:
             problems += found
         else:
@@ -90,47 +63,21 @@ def read_rows(
     return pushes, numbers
 
 
-def _check_header(where: str, names: list[str]) -> None:
-    problems = [
-        Problem(where, (name,), "unknown column", did_you_mean(name, COLUMNS))
-        for name in names
-        if name not in COLUMNS
-    ]
-    problems += [
-        Problem(where, (name,), "duplicate column", "remove one")
-        for name in dict.fromkeys(names)
-        if names.count(name) > 1
-    ]
-    problems += [
-        Problem(where, (name,), "missing column", "add it")
-        for name in REQUIRED
-        if name not in names
-    ]
+def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
+    problems = list_missing(where, names, REQUIRED)
     if sum(name in names for name in STRETCH) != 1:
         problems.append(
             Problem(where, (), f"expected one of the columns {' and '.join(STRETCH)}", "give one")
         )
-    if problems:
-        raise BadInputError(problems)
+    return problems
 
 
 def _parse_row(
-    where: str, names: list[str], cells: list[str], sheet: SheetSpec, problems: list[Problem]
+    where: str, cells: Mapping[str, str], sheet: SheetSpec, problems: list[Problem]
 ) -> dict[str, float]:
     """Return the values of a row by column; append errors in the row to `problems`."""
-    if len(cells) != len(names):
-        problems.append(
-            Problem(
-                where,
-                (),
-                f"expected {len(names)} values, found {len(cells)}",
-                "give one value per column",
-            )
-        )
-        return {}
     values: dict[str, float] = {}
-    for name, cell in zip(names, cells, strict=True):
-        text = cell.strip()
+    for name, text in cells.items():
         if not text and name in OPTIONAL:
             continue
         try:
@@ -192,7 +139,7 @@ def _make_push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: floa
 SIMULATED_DEPTHS_M = (0.002, 0.004, 0.007, 0.012, 0.020, 0.030, 0.040, 0.050)
 SIMULATED_STRETCHES = 4
 SIMULATED_XS, SIMULATED_YS = (0.0, 0.13, 0.25), (0.0, 0.19, 0.36)
-"""Pushed points from the sheet's centre, as fractions of its width (x) and height (y)."""
+"""The pushed points from the sheet's centre, as fractions of its width (x) and height (y)."""
 
 
 def simulate_rows(
@@ -207,7 +154,7 @@ def simulate_rows(
     """Simulate pushes over the scene's stretches and depths, with the noise of a force gauge.
 
     places: whether to push at points all over the sheet, not only at its centre. apparatus: true
-    parameters of arms and sheet; None: those of the scene. Rubber with hysteresis gives one row
+    parameters of arms and sheet; None: the scene's parameters. Rubber with hysteresis gives one row
     for loading and one for unloading.
     """
     rng = np.random.default_rng(seed)

@@ -32,14 +32,14 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 JUST_TAUT_TENSION = 2e-6
-"""Residual tension of slack rubber, in shear moduli, for a sheet that is almost taut.
+"""The residual tension of slack rubber, in shear moduli, for a sheet that is almost taut.
 
 The simulator of a running graph uses a hundred times as much, because its sheet may hang. In a
 sheet that is barely slack, that tension would triple the force of a small push.
 """
 
 PUSHED_CELLS, UNTOUCHED_CELLS = 24, 16
-"""Numbers of node intervals per side of a sheet that a gauge pushes, and of one that nothing
+"""The numbers of node intervals per side of a sheet that a gauge pushes, and of one that nothing
 touches. With 24, forces differ by 0.5 % from those with 32, at 2 mm depth by 1 %."""
 
 
@@ -104,7 +104,7 @@ def _flat_axes(left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Flo
 
 
 class SimulatedSheet:
-    """Sheet between simulated arms with the true parameters of an apparatus.
+    """A sheet between simulated arms with the true parameters of an apparatus.
 
     The commanded poses of the edges are computed with the arm parameters of the scene. The true
     edges deviate from them by the errors of bases, joints and clamps, and by the compliance of the
@@ -158,7 +158,7 @@ def simulate_force(
     point_m: tuple[float, float],
     finger_radius_m: float,
 ) -> float:
-    """Return only the normal force of `simulate_push`, N."""
+    """Simulate a push as `simulate_push` does, and return only the normal force, N."""
     return simulate_push(sheet, stretch_ratio, depth_m, point_m, finger_radius_m)[0]
 
 

@@ -50,12 +50,13 @@ from flexsheet.messages.scene import Lens
 Floats = NDArray[np.float64]
 
 MAX_DEPTH_ERROR_FRACTION = 0.05
-"""Maximum depth error as a fraction of the working distance; above it, the rig is undetermined."""
+"""The maximum depth error as a fraction of the working distance; above it, the rig is undetermined.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResult:
-    """Calibration with its fit and board pairs, for a report.
+    """A calibration with its fit and board pairs, for a report.
 
     pairs: pairs that were used, by their index among all pairs.
     """

@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
-import csv
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.calibration.csv_rows import list_missing, read_table
+from flexsheet.launch.calibration.edge_marks import make_detector_config
 from flexsheet.launch.calibration.marker_fit import Touch
-from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
+from flexsheet.launch.plans.documents import BadInputError, Problem
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.finger_frame import world_from_finger
 from flexsheet.nodes.models.rigid import rotation_from_vector
-from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
-from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
-from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
-from flexsheet.nodes.triangulator.triangulation import (
-    TRIANGULATION_METHODS,
-    StereoGeometry,
-    TriangulatedPoint,
-)
+from flexsheet.nodes.triangulator.fingertip import detect_all
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
@@ -39,7 +35,7 @@ COLUMNS = (*REQUIRED, *NORMAL)
 MAX_PROBLEMS = 20
 MAX_TILT_DEG = 120.0
 MAX_LENGTH_MM = 5000.0
-"""Maximum plausible coordinate; a larger number is probably in another unit."""
+"""The maximum plausible coordinate; a larger number is probably in another unit."""
 
 
 def read_touches(path: Path, scene: Scene) -> list[Touch]:
@@ -47,28 +43,11 @@ def read_touches(path: Path, scene: Scene) -> list[Touch]:
 
     Raises BadInputError with file, line, column, value and remedy.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInputError(
-            [Problem(str(path), (), f"cannot be read: {error}", "give a CSV file in UTF-8")]
-        ) from error
-    numbered = [
-        (number, line)
-        for number, line in enumerate(lines, start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if not numbered:
-        remedy = f"start with a line of columns: {', '.join(COLUMNS)}"
-        raise BadInputError([Problem(str(path), (), "is empty", remedy)])
-    first, header = numbered[0]
-    names = [name.strip() for name in next(csv.reader([header]))]
-    _check_header(f"{path}:{first}", names)
     problems: list[Problem] = []
     touches = []
-    for number, line in numbered[1:]:
+    for number, cells in read_table(path, COLUMNS, _check_header, problems):
         found: list[Problem] = []
-        values = _parse_row(f"{path}:{number}", names, next(csv.reader([line])), found)
+        values = _parse_row(f"{path}:{number}", cells, found)
         if not found:
             touches.append(_make_touch(values, scene))
         problems += found
@@ -77,36 +56,15 @@ def read_touches(path: Path, scene: Scene) -> list[Touch]:
     return touches
 
 
-def _check_header(where: str, names: list[str]) -> None:
+def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
     wanted = COLUMNS if any(name in names for name in NORMAL) else REQUIRED
-    problems = [
-        Problem(where, (name,), "unknown column", did_you_mean(name, COLUMNS))
-        for name in names
-        if name not in COLUMNS
-    ]
-    problems += [
-        Problem(where, (name,), "missing column", "add it") for name in wanted if name not in names
-    ]
-    problems += [
-        Problem(where, (name,), "duplicate column", "remove one")
-        for name in dict.fromkeys(names)
-        if names.count(name) > 1
-    ]
-    if problems:
-        raise BadInputError(problems)
+    return list_missing(where, names, wanted)
 
 
-def _parse_row(
-    where: str, names: list[str], cells: list[str], problems: list[Problem]
-) -> dict[str, float]:
+def _parse_row(where: str, cells: Mapping[str, str], problems: list[Problem]) -> dict[str, float]:
     """Return the values of a row by column; append errors in the row to `problems`."""
-    if len(cells) != len(names):
-        what = f"expected {len(names)} values, found {len(cells)}"
-        problems.append(Problem(where, (), what, "give one value per column"))
-        return {}
     values: dict[str, float] = {}
-    for name, cell in zip(names, cells, strict=True):
-        text = cell.strip()
+    for name, text in cells.items():
         if not text and name in NORMAL:
             continue
         try:
@@ -148,13 +106,16 @@ SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20),
                        (10, -10), (-10, -10), (-10, 0), (25, 10), (25, -10), (0, 18),
                        (30, 0), (20, 20), (-25, 10), (8, 25), (40, 0), (35, 20),
                        (35, -20))  # fmt: skip
-"""Orientations in which the marker is looked at, like a person would, before the touches."""
+"""The orientations of the finger, as tilts about x and y in degrees, in which the marker is
+measured before the touches."""
 TOUCHED_ORIENTATIONS = 6
-"""Number of these orientations, those in which the camera sees the marker best, for the touches."""
+"""The number of orientations in which points are touched. These are the orientations with the
+smallest uncertainty of the marker."""
 SIMULATED_POINTS_M = np.array([[x, y, 0.01] for y in (0.0, 0.04) for x in (-0.03, 0.01, 0.05)])
-"""Corners of a board that are touched, (n, 3)."""
+"""The touched corners of a simulated board (n, 3), in metres."""
 SIMULATED_CORNER_M, SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, 1e-4, math.radians(1.0)
-"""Standard deviations per axis of the measured corners, of the pad's position, and of angles."""
+"""The standard deviations per axis of the measured corners, of the pad's position, and of angles.
+"""
 
 
 def simulate_touches(
@@ -215,22 +176,11 @@ def _see_marker(
 ) -> TriangulatedPoint | None:
     """Return the detected marker for a pad position; None if it is not accepted."""
     left, right = camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s)
-    given = TriangulatorParameters()
     found = detect_all(
         left,
         right,
         geometry=geometry,
-        config=DetectorConfig(
-            blob_filter=BlobFilter(
-                min_contrast=given.marker_min_contrast,
-                min_area_px=given.marker_min_area_px,
-                max_area_px=given.marker_max_area_px,
-                window_half_px=given.window_half_px,
-            ),
-            refine=MARKER_METHODS["subpixel_fit"],
-            triangulate=TRIANGULATION_METHODS["dlt"],
-            max_reprojection_px=given.max_reprojection_px,
-        ),
+        config=make_detector_config(),
         volume=(scene.finger.volume_min_m, scene.finger.volume_max_m),
         gate=None,
     )

@@ -30,7 +30,8 @@ from flexsheet.nodes.models import rigid
 Floats = NDArray[np.float64]
 
 GROUPS = 20
-"""Maximum number of jackknife refits; if there are more pairs, each refit leaves out several."""
+"""The maximum number of jackknife refits. If there are more pairs, each refit leaves out several
+pairs."""
 
 
 def sample_working_plane(rig: Floats, size: tuple[int, int], distance_m: float) -> Floats:

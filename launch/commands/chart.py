@@ -31,8 +31,8 @@ SYSTEM = "system"
 @app.command(
     epilog=examples(
         "flexsheet chart tracking",
-        "flexsheet chart triangulation --cases",
-        "flexsheet chart triangulation --scene lab.yaml --json",
+        "flexsheet chart marker --cases",
+        "flexsheet chart marker --scene lab.yaml --json",
         "flexsheet chart --output docs/charts --redraw",
         "flexsheet chart system --scene launch/scenes/light-touch.yaml --blocks 6 --json",
     )

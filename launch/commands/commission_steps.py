@@ -43,8 +43,8 @@ from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.calibration import Board, load_calibration, save_calibration
 from flexsheet.messages.files import write_file
-from flexsheet.messages.scene import Pose, Scene, require_projector
-from flexsheet.nodes.models.rigid import rpy_from_rotation, transform_from_rpy
+from flexsheet.messages.scene import Scene, require_projector
+from flexsheet.nodes.models.rigid import pose_matrix, rpy_from_rotation
 from flexsheet.nodes.models.sheet import edge_force_n
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -344,7 +344,7 @@ class Laboratory:
             raise CommissionError(f"step projector: {error}") from error
         lens = fit.projector.lens
         pose = fit.projector.world_from_projector
-        matrix = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        matrix = pose_matrix(pose)
         values = _pose_values("projector.world_from_projector", matrix)
         for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
             values[f"projector.lens.{key}"] = calibrate.round_digits(getattr(lens, key))
@@ -381,8 +381,8 @@ class Laboratory:
         uncertainty = {}
         for side, fit in fits.items():
             arm, key = fit.arm, f"arms.{side}"
-            values |= _pose_values(f"{key}.world_from_base", _matrix(arm.world_from_base))
-            values |= _pose_values(f"{key}.flange_from_edge", _matrix(arm.flange_from_edge))
+            values |= _pose_values(f"{key}.world_from_base", pose_matrix(arm.world_from_base))
+            values |= _pose_values(f"{key}.flange_from_edge", pose_matrix(arm.flange_from_edge))
             offsets = [calibrate.round_digits(one) for one in arm.joint_offsets_rad]
             values[f"{key}.joint_offsets_rad"] = offsets
             compliance = calibrate.round_digits(arm.flange_compliance_m_per_n)
@@ -633,10 +633,6 @@ def _find_images(folder: Path, side: str) -> list[Path]:
     if not found:
         raise CommissionError(f"{folder}: no images {side}*.png or {side}*.jpg; check the folder")
     return found
-
-
-def _matrix(pose: Pose) -> Any:
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 def _pose_values(key: str, matrix: Any) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""Experiments on a running graph that are evaluated from recorded bags.
+"""Define the errors of experiments, which run a graph and evaluate the recorded bag.
 
-They include those of Furukawa et al. 2007.
+Some of them repeat experiments of Furukawa et al. 2007.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class ExperimentInterruptedError(ExperimentError):
 
 
 def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
-    """Check names and remove duplicates; without names, return all known ones.
+    """Check names and remove duplicates; without names, return all known names.
 
     kind: noun for the names in the error text. Raises ExperimentError for an unknown name.
     """
@@ -42,7 +42,7 @@ def select_names(names: Sequence[str], known: Collection[str], kind: str) -> lis
 def find_recorded(entries: Mapping[str, Entry], kind: str, label: str) -> Entry:
     """Return the entry of a bag with a label. Raises ExperimentError if it is missing.
 
-    kind: what the entry is, for the error.
+    kind: noun for the entry in the error text.
     """
     if label not in entries:
         labels = ", ".join(entries) or "none"

@@ -49,33 +49,36 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 POSITIONS_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
-"""Pushed positions: distance along the object, and arc length around it from its front, m."""
+"""The pushed positions: distance along the object, and arc length around it from its front, m."""
 
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.007, 0.010, 0.013, 0.016)
-"""Depths at which the finger rests, up to the scene's push depth, which is always one of them."""
+"""The depths at which the finger rests, up to the scene's push depth, which is always one of them.
+"""
 
 HOVER_M = 0.03
 APPROACH_S = 1.2
 PUSH_M_PER_S = 0.05
 HOLD_S, EVALUATED_S = 1.0, 0.3
-"""Duration of a rest, and duration of its last part, in which the force is evaluated."""
+"""The duration of a rest, and duration of its last part, in which the force is evaluated."""
 
 MEASURED_S = 0.6
-"""Duration of the last part of each rest in which forces measured by a gauge are averaged."""
+"""The duration of the last part of each rest in which forces measured by a gauge are averaged."""
 
 REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
 
 HISTORY_STEP_S = 0.01
-"""Time step in which the force history of the rubber is computed; the finger moves 0.5 mm in it."""
+"""The time step in which the force history of the rubber is computed; the finger moves 0.5 mm in
+it."""
 HISTORY_DEPTHS = 9
 HISTORY_CELLS = 16
-"""Number of depths, and membrane elements per side, of the elastic force curve for the history."""
+"""The number of depths, and membrane elements per side, of the elastic force curve for the history.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class RestInterval:
-    """Evaluated interval of a rest at a depth, s from the start of the finger path."""
+    """An evaluated interval of a rest at a depth, s from the start of the finger path."""
 
     depth_m: float
     begin_s: float
@@ -84,7 +87,7 @@ class RestInterval:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """Finger path of one push.
+    """The finger path of one push.
 
     place: name of the pushed position. place_m: distance along the object and arc length around it
     from its front. surface, normal: point (3,) and normal (3,) of the undeformed object there,
@@ -151,15 +154,14 @@ def _make_press(
 def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
     """Make the procedure of the experiment: push at each position, then move in and out.
 
-    method: least accurate table of the soft body that is accepted. The procedure waits for it
-        before
-        the first push.
+    method: least accurate table of the soft body that is accepted. Before the first push, the
+    procedure waits until the soft body uses such a table.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         await driver.wait_for_table(scene, method, progress)
         for press in make_presses(scene):
-            progress(press.path.label)
+            progress(f"pushing along the finger path {press.path.label}")
             await driver.follow(press.path)
 
     return procedure
@@ -167,7 +169,7 @@ def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_t
 
 @dataclass(frozen=True, slots=True)
 class ComplianceRecording:
-    """Data of a compliance experiment, read from a bag.
+    """The data of a compliance experiment, read from a bag.
 
     windows_ns: (start, end) of each finger path, by label. edges: true flange poses of both arms
     as rows (16,). curves: object force against depth, (m, 2) each, published at `curve_times_ns`.
@@ -236,7 +238,7 @@ def read_bag(bag: Path) -> ComplianceRecording:
 
 @dataclass(frozen=True, slots=True)
 class ForceSample:
-    """Forces at one time.
+    """The forces at one time.
 
     depth_m: true finger depth. wanted_n: published force of the object. felt_n: force of the
     sheet. normal_offset_m: depth of the sheet's centre below the undeformed surface. method: method
@@ -275,7 +277,7 @@ def _relative_error(force_n: float, expected_n: float) -> float:
 
 
 class ForceReference:
-    """Computation of the true forces in a recording with the simulator's membrane model."""
+    """A computation of the true forces in a recording with the simulator's membrane model."""
 
     def __init__(self, recorded: ComplianceRecording) -> None:
         scene = apply_apparatus(recorded.scene, recorded.apparatus)
@@ -336,7 +338,9 @@ class ForceReference:
         return float(pressed.finger_force_n @ press.normal)
 
     def _history_ratio(self, at_ns: int, press: Press) -> float:
-        """Return the ratio of the rubber's force to the elastic sheet's at `at_ns` of a push."""
+        """Return the ratio of the rubber's force to that of an elastic sheet, at the time `at_ns`
+        in a push.
+        """
         if ForceHistory.of(self._recorded.apparatus) is None:
             return 1.0
         label = press.path.label
@@ -346,7 +350,8 @@ class ForceReference:
         return float(np.interp(at_ns, times, ratios))
 
     def _follow_history(self, press: Press) -> tuple[Times, Floats]:
-        """Return the times (ns) of a push, and the ratios of `_history_ratio` at these times.
+        """Return the times (ns) of a push, and the ratios of the rubber's force to that of an
+        elastic sheet.
 
         The membrane is solved at a few depths only, with the edges at the deepest point of the
         push. That suffices, because the ratio depends only on the shape of the force curve.

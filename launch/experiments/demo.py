@@ -23,7 +23,7 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.types import Correction, FingerPath
 
 METRES_PER_PX = 0.0007
-"""Resolution of images in Furukawa et al. 2007. It is sufficient for figures, and images take a
+"""The resolution of images in Furukawa et al. 2007. It is sufficient for figures, and images take a
 quarter of the time of the default resolution."""
 
 SECONDS = (10.0, 30.0)
@@ -35,7 +35,7 @@ PUSH_CORRECTIONS: tuple[Correction, ...] = ("none", "four_triangles", "two_pass"
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """Results of the demo.
+    """The results of the demo.
 
     strokes: result of each stroke. followed: result of following the given path, or None.
     """

@@ -62,20 +62,21 @@ SETTLED_RATE_RAD_PER_S = 0.8
 SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
 EYE_PIXELS_EVERY = 9
-"""Interval, in frames, between frames with pixels. It is odd, so that both eyes' frames have them
-in turn."""
+"""The interval, in frames, between frames with pixels. It is odd, so that both eyes' frames have
+them in turn."""
 WAIT_S = 20.0
 IMAGE_WAIT_S = 40.0
 MAX_TABLE_WAIT_S = 3600.0
-"""Maximum time until a table of the soft body is used; two idle cores need about a minute for the
-coarse one, and about eight minutes for the complete one."""
+"""The maximum time until a table of the soft body is used; two idle cores need about a minute for
+the coarse table, and about eight minutes for the complete table."""
 PROGRESS_PERIOD_S = 5.0
 MAX_LOAD_PER_CORE = 3.0
-"""Load average per core above which the computer counts as overloaded; the demo causes less."""
+"""The load average per core above which the computer counts as overloaded. The demo causes a lower
+load."""
 
 
 class Driver:
-    """Connection of an experiment to a running graph; an asynchronous context manager."""
+    """A connection of an experiment to a running graph; an asynchronous context manager."""
 
     def __init__(
         self,
@@ -125,7 +126,7 @@ class Driver:
 
     def _publish(self, topic: str, message: Message) -> None:
         if self._writer is None:
-            raise RuntimeError("the driver is used outside of its context")
+            raise RuntimeError("the driver is not connected to the graph; use it in `async with`")
         self._writer.publish(topic, message)
 
     def _make_handler(self, name: str) -> Callable[[Message, Header], None]:

@@ -57,14 +57,15 @@ from flexsheet.nodes.twin.paths import map_to_surface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 STEP_S = 1.0 / 30.0
-"""Time step of the linear program."""
+"""The time step of the linear program."""
 
 WINDOW_STEPS = 60
-"""Time steps in a window. Solution time grows faster than linearly with this number."""
+"""The number of time steps in a window. The solution time grows faster than linearly with this
+number."""
 
 MAX_DEVIATION_M = 0.05
 DEVIATION_M = 1e-4
-"""Displacement of the contact for numerical derivatives of the joint angles."""
+"""The displacement of the contact for numerical derivatives of the joint angles."""
 
 ROLL_STEPS = 40
 
@@ -72,16 +73,18 @@ DIRECTIONS = np.array(
     [one for one in product((-1.0, 0.0, 1.0), repeat=3) if any(one)], dtype=np.float64
 )
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
-"""Unit vectors (26, 3). A vector's largest component along them is at least 0.91 of its length."""
+"""The unit vectors (26, 3). A vector's largest component along them is at least 0.91 of its length.
+"""
 
 SPEED_DIRECTIONS = DIRECTIONS[(np.abs(DIRECTIONS) > 0.0).sum(axis=1) != 2]
 SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
-"""Unit vectors (7, 3) along which the tool speed is limited, forwards and backwards."""
+"""The unit vectors (7, 3) along which the tool speed is limited, forwards and backwards."""
 
 
 @dataclass(frozen=True, slots=True)
 class LimitedMotion:
-    """m limited quantities of a mechanism at n time steps, linear in k deviations from a motion.
+    """The m limited quantities of a mechanism at n time steps, linear in k deviations from a
+    motion.
 
     values: (n, m), quantities in the nominal motion. slopes: (n, m, k), derivatives with respect to
     the deviations. max_rate, max_acceleration, low, high: (m,), limits; infinite if there is none.
@@ -101,7 +104,7 @@ def find_least_deviation(
     """Return the lengths (n,) of the deviations with the least weighted mean length.
 
     weights: (n,), zero where a deviation does not count. max_deviation: limit of each component.
-    The weighted mean of the lengths is a lower bound. None if no motion fulfils the limits.
+    The weighted mean of the lengths is a lower bound. Return None if no motion fulfils the limits.
     """
     steps, _, deviations = motion.slopes.shape
     scale = max_deviation
@@ -159,7 +162,9 @@ def _directions(count: int) -> Floats:
 
 
 def _differences(steps: int, order: int) -> csr_array:
-    """Return the matrix (steps - order, steps) of finite differences in time of an order."""
+    """Return the matrix (steps - order, steps) that computes finite differences of the given order
+    in time.
+    """
     return csr_array(np.diff(np.eye(steps), n=order, axis=0))
 
 
@@ -173,7 +178,7 @@ def _block_rows(rows: Floats) -> csr_array:
 
 @dataclass(frozen=True, slots=True)
 class RolledSheet:
-    """Sheet that touches the object.
+    """A sheet that touches the object.
 
     point (3,), rotation (3, 3): contact point and orientation of the sheet, in the object's frame.
     on_sheet_m: the same point in the sheet's coordinates, (x, y, 0).
@@ -205,7 +210,7 @@ class RolledSheet:
 
 
 class FollowedContact:
-    """Computation of the sheet motion that follows a finger exactly, and of deviations from it."""
+    """A computation of the sheet motion that follows a finger exactly, and of its deviations."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None = None) -> None:
         true_scene = apply_apparatus(scene, apparatus or nominal_apparatus(scene))
@@ -390,8 +395,8 @@ def run_follow(
 ) -> dict[str, Any]:
     """Follow a finger path; return the results of `experiment follow --json`.
 
-    bag: file in which to record the running graph; None to follow the path in simulated time, which
-        needs no running graph.
+    bag: file in which to record the running graph; None: follow the path in simulated time, without
+    a running graph.
     """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
     scene, truth = require_scene(plan), plan.apparatus_message()

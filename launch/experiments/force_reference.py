@@ -2,7 +2,7 @@
 
 `benchmarks.force_reference` computes the curves and describes the method. They are dimensionless:
 lengths are in finger radii, forces in Young's modulus times the squared finger radius. Therefore
-they are valid for every scene of the same proportions.
+each curve is valid for all scenes with the same proportions.
 """
 
 from __future__ import annotations
@@ -19,22 +19,24 @@ from flexsheet.messages.scene import Cylinder, Scene, StripSupport
 
 REFERENCE_FILE = Path(__file__).with_name("force_reference.json")
 SAME_RATIO = 1e-3
-"""Relative difference up to which lengths, angles or Poisson's ratios count as equal."""
+"""The relative difference up to which lengths, angles or Poisson's ratios count as equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceForce:
-    """Force (N) of the object on the finger, and its relative uncertainty."""
+    """The force (N) of the object on the finger, and its relative uncertainty."""
 
     force_n: float
     uncertainty_ratio: float
 
 
 class ReferenceForceCurve:
-    """Force against depth from an independent solver, at one position of the object of a scene."""
+    """A curve of force against depth from an independent solver, at one position on a scene's
+    object.
+    """
 
     def __init__(self, curve: dict[str, Any], *, finger_radius_m: float, modulus_pa: float) -> None:
-        """Interpolate a curve of the file; it must contain two or more depths."""
+        """Store a curve of the file, which must contain two or more depths."""
         self._depths_m = finger_radius_m * np.array(curve["depths"])
         forces = modulus_pa * finger_radius_m**2 * np.array(curve["forces"])
         # As in Hertz' theory, force / depth^1.5 hardly changes, so its interpolation is precise.

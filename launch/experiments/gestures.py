@@ -32,11 +32,11 @@ from flexsheet.nodes.twin.paths import recorded_path
 Times = NDArray[np.int64]
 
 PREDICTION_HORIZONS_S = (0.0, 0.02, 0.05)
-"""Evaluated prediction horizons: zero, the latency from exposure to arm command, and that latency
-plus the servo lag of the arm."""
+"""The evaluated prediction horizons: zero, the latency from exposure to arm command, and that
+latency plus the servo lag of the arm."""
 
 MAX_LAG_S = 0.08
-"""Maximum lag in the cross-correlation. It is less than half the period of the fastest taps, so
+"""The maximum lag in the cross-correlation. It is less than half the period of the fastest taps, so
 that a tap is not matched with the next one."""
 
 MIN_SAMPLES = 10
@@ -48,7 +48,7 @@ GESTURES: dict[str, Callable[[Scene], FingerPath]] = {
     "stroke-30": partial(stroke.stroke_path, seconds=30.0),
     **twin_gestures.GESTURES,
 }
-"""Finger paths by name: the strokes of Furukawa et al. 2007, and models of human gestures."""
+"""The finger paths by name: the strokes of Furukawa et al. 2007, and models of human gestures."""
 
 
 def gesture_path(name: str, scene: Scene) -> FingerPath:
@@ -93,7 +93,7 @@ def make_gestures_procedure(names: Sequence[str], progress: Progress) -> Procedu
 
 @dataclass(frozen=True, slots=True)
 class TrueFinger:
-    """True finger motion, sampled at the exposures: times (n,) ns, positions, velocities (n, 3)."""
+    """The true finger motion at the exposures: times (n,) ns, positions and velocities (n, 3)."""
 
     times_ns: Times
     positions: Floats
@@ -120,7 +120,7 @@ class TrueFinger:
 
 @dataclass(frozen=True, slots=True)
 class GestureRecording:
-    """Data of gestures, read from a bag; all times are in ns on the same clock.
+    """The data of gestures, read from a bag; all times are in ns on the same clock.
 
     truth: true finger. fingertips: measured at the exposures `times_ns`. windows_ns: start and end
     of each gesture.
@@ -189,7 +189,7 @@ def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
 def error_mm(errors: Floats) -> dict[str, float | None]:
     """Return rms, 99 % quantile and maximum length of errors (n, 3) m, in mm.
 
-    Return None if there are no errors.
+    All values are None if there are no errors.
     """
     if len(errors) == 0:
         return {"rms": None, "p99": None, "max": None}
@@ -214,7 +214,7 @@ def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
 
 
 def _stack_rows(points: Sequence[Floats]) -> Floats:
-    """Stack points (3,) as rows of an array (n, 3), also for n = 0."""
+    """Stack points (3,) as rows of an array (n, 3). Without points, its shape is (0, 3)."""
     return np.array(points, dtype=np.float64).reshape(len(points), 3)
 
 

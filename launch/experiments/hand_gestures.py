@@ -47,19 +47,19 @@ from flexsheet.nodes.twin.paths import inside, limit_path_speed, map_to_surface,
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 
 DEPTH_FRACTION = 0.3
-"""Voluntary depth of the gestures, as a fraction of the scene's push depth."""
+"""The voluntary depth of the gestures, as a fraction of the scene's push depth."""
 
 TAPS, TAP_M, TAP_LIFT_M = 6, 0.004, 0.012
 STROKE_M_PER_S, MODULATION_HZ = 0.035, 1.0
 SLIP_FRACTION = 0.375
-"""Distance of a slip along the object, as a fraction of the sheet's width."""
+"""The distance of a slip along the object, as a fraction of the sheet's width."""
 
 TRANSIENT_S = 0.1
-"""Time after the start of a touch in which force errors are transients of the contact."""
+"""The time after the start of a touch in which force errors are transients of the contact."""
 
 MIN_CONTACT_N = 2e-3
-"""Force above which the finger touches the sheet: a tenth of the smallest
-force that a fingertip can perceive."""
+"""The force above which the finger touches the sheet: a tenth of the smallest force that a
+fingertip can perceive."""
 
 
 def _press(depth_m: float, hold_s: float, lift_s: float) -> tuple[Floats, Floats]:
@@ -91,14 +91,14 @@ def _place(scene: Scene, label: str, times_s: Floats, points: Floats) -> FingerP
 
 
 def make_tap(scene: Scene, depth_m: float) -> FingerPath:
-    """Tap six times, three times a second, to a depth of 4 mm."""
+    """Make a finger path that taps six times, three times a second, to a fixed depth of 4 mm."""
     above, below = (0.0, 0.0, TAP_LIFT_M), (0.0, 0.0, -TAP_M)
     moves = [move for _ in range(TAPS) for move in ((0.11, below), (0.06, below), (0.16, above))]
     return _make_path(scene, "tap", minimum_jerk(above, moves))
 
 
 def make_hold(scene: Scene, depth_m: float) -> FingerPath:
-    """Push and hold still for 3 s."""
+    """Make a finger path that pushes to `depth_m`, holds still for 3 s, and lifts."""
     return _make_path(scene, "hold", _press(depth_m, 3.0, 0.8))
 
 
@@ -108,7 +108,10 @@ def make_let_go(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
-    """Stroke around the object and back, while the depth oscillates between half and full, 1 Hz."""
+    """Make a finger path that strokes around the object and back.
+
+    The depth oscillates between half of `depth_m` and `depth_m` once per second.
+    """
     half_m = 0.4 * touchable(scene)[1]
     stroke_s = 2.0 * half_m / STROKE_M_PER_S * 1.875
     _, reach = minimum_jerk(
@@ -130,7 +133,7 @@ def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_slip(scene: Scene, depth_m: float) -> FingerPath:
-    """Push, slide along a straight line off the object's end, and lift."""
+    """Make a finger path that pushes, slides straight off the object's end, and lifts."""
     times, places = _press(0.5 * depth_m, 2.5, 0.8)
     points = map_to_surface(scene, places)
     ends = map_to_surface(scene, np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0]]))
@@ -151,12 +154,12 @@ HAND_GESTURES: dict[str, tuple[Callable[[Scene, float], FingerPath], int]] = {
     "let-go": (make_let_go, 1),
     "slip": (make_slip, 1),
 }
-"""Function that makes each gesture, and the number of touches in the gesture, by name."""
+"""The function that makes each gesture, and the number of touches in the gesture, by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeltForce:
-    """Force that a finger feels, and force of the object at the finger's depth.
+    """The force that a finger feels, and force of the object at the finger's depth.
 
     times_s, depths_m, felt_n, wanted_n: arrays (n,), one element per time step.
     """
@@ -288,7 +291,7 @@ def run_gestures(
     async def procedure(driver: Driver, _: Scene) -> None:
         await driver.wait_for_table(scene, "quick_table", progress)
         for name, (make_path, _touches) in HAND_GESTURES.items():
-            progress(name)
+            progress(f"performing the gesture {name}")
             await driver.follow(make_path(scene, depth_m))
 
     bag = folder / "gestures.mcap"

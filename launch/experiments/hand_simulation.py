@@ -21,26 +21,26 @@ Curve = Callable[[Floats], Floats]
 STEPS_PER_PERIOD = 64
 FILTER_DAMPING_RATIO = 0.5
 PAD_STIFFNESS_N_PER_M, PAD_DAMPING_NS_PER_M = 1100.0, 1.0
-"""Stiffness and damping of the finger pad at 1 N: Hertz contact, tissue of 0.07 to 0.2 MPa."""
+"""The stiffness and damping of the finger pad at 1 N: Hertz contact, tissue of 0.07 to 0.2 MPa."""
 
 JITTER_SEED = 0
 CAMERA_RESOLUTION_M = 2e-5
 RELEASE_M = 2e-3
-"""Distance from the equilibrium at which the finger is released."""
+"""The distance from the equilibrium at which the finger is released."""
 
 MAX_AMPLITUDE_M = 5e-5
-"""Maximum amplitude at which the finger counts as being at rest."""
+"""The maximum amplitude at which the finger counts as being at rest."""
 
 SLOWEST_DECAY_PER_S = 0.5
-"""Minimum decay rate of an oscillation that counts as stable."""
+"""The minimum decay rate of an oscillation that counts as stable."""
 
 ENERGY_FRACTION = 0.05
-"""Maximum ratio of the energy that a stable sheet delivers in 2 s to the energy at release."""
+"""The maximum ratio of the energy that a stable sheet delivers in 2 s to the energy at release."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cases:
-    """Hands and control loops that are simulated together; each field has shape (n,).
+    """The hands and control loops that are simulated together; each field has shape (n,).
 
     delay_s: time from exposure to the sheet's motion. jitter_s: maximum additional delay of a
     measurement, uniformly distributed; a measurement that a newer one overtakes is lost.
@@ -65,7 +65,7 @@ class Cases:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Result of a simulation.
+    """The result of a simulation.
 
     decay_per_s (n,): decay rate of the oscillation between the second and the last quarter of the
     time; infinite if it has died out. amplitude_m (n,): amplitude in the last quarter.
@@ -90,7 +90,8 @@ class Motion:
 
 
 class HeldOffset:
-    """Sheet offset that is computed from sampled finger depths, with filter, delay and lead.
+    """A control loop that computes the sheet's offset from sampled finger depths, with filter and
+    delay.
 
     Until the next offset takes effect, the sheet moves on at its last rate, as with the real arms.
     """

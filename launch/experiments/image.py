@@ -78,7 +78,7 @@ def push_path(
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One of the two image experiments.
+    """An image experiment, in which one quantity varies.
 
     key: result column of the varied value. name: format of a case's name with the value. path:
     function that makes the finger path for a value. sizes: function that measures sizes of the
@@ -119,7 +119,7 @@ def make_push_series(along_mm: float, tilt_deg: float) -> Series:
 
 
 RAMPS: tuple[Pattern, ...] = ("coordinate_ramp_x", "coordinate_ramp_y")
-"""Patterns whose brightness encodes x or y on the screen plane, for errors at all points."""
+"""The patterns whose brightness encodes x or y on the screen plane, for errors at all points."""
 
 
 def make_pattern_label(label: str, pattern: Pattern) -> str:
@@ -139,7 +139,7 @@ def make_eye_key(label: str, viewpoint: Viewpoint) -> str:
 
 @dataclass(frozen=True, slots=True)
 class EyeImage:
-    """Image that the simulated eye sees, with the image that it should see (`expected`)."""
+    """An image that the simulated eye sees, with the image that it should see (`expected`)."""
 
     label: str
     correction: Correction

@@ -1,14 +1,15 @@
 """Measure the Weber fraction of stiffness with an adaptive staircase, and store its trials.
 
 In each trial the participant pushes two objects and names the stiffer one. One of them is the
-reference; the other one is stiffer by the relative increment d. The probability
-of a correct answer is
+reference, and the other one is stiffer by the relative increment d. The probability of a correct
+answer is
 
     p(d) = lapse / 2 + (1 - lapse) * Phi(ln(1 + d) / sigma +- bias),
 
 with the normal distribution function Phi (Green & Swets, Signal detection theory, 1966). The bias
-is positive if the second interval is preferred and is the stiffer one. The Weber fraction w is the
-increment of 75 % correct answers without lapses and bias: ln(1 + w) = 0.674 sigma.
+is a preference for the second interval. It is added if the second interval has the stiffer object,
+and subtracted otherwise. The Weber fraction w is the increment of 75 % correct answers without
+lapses and bias: ln(1 + w) = 0.674 sigma.
 
 The increment of a trial is the one with the least expected entropy of the posterior of w: the psi
 method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown lapse rate
@@ -37,26 +38,26 @@ from flexsheet.messages.files import make_write_error
 from flexsheet.nodes.arrays import Floats
 
 CRITERION = 0.75
-"""Fraction of correct answers, without lapses, at an increment of one Weber fraction."""
+"""The fraction of correct answers, without lapses, at an increment of one Weber fraction."""
 
 INCREMENTS = np.geomspace(0.02, 1.0, 25)
 WEBER_FRACTIONS = np.geomspace(0.02, 1.0, 81)
 LAPSE_RATES = np.array([0.0, 0.01, 0.03, 0.06, 0.12])
 LAPSE_SCALE = 0.03
-"""Mean of the exponential prior of the lapse rate."""
+"""The mean of the exponential prior of the lapse rate."""
 
 BIASES = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
 BIAS_SCALE = 0.25
-"""Standard deviation of the normal prior of the bias, in sigmas."""
+"""The standard deviation of the normal prior of the bias, in sigmas."""
 
 CATCH_PERIOD = 20
-"""Number of trials of which one has the largest increment, in order to detect inattention."""
+"""The number of trials of which one has the largest increment, in order to detect inattention."""
 
 INTERVAL_QUANTILES = (0.025, 0.975)
 
 
 class StaircaseEstimator:
-    """Posterior of Weber fraction, lapse rate and bias, which selects the next increment."""
+    """The posterior of Weber fraction, lapse rate and bias, which selects the next increment."""
 
     def __init__(self) -> None:
         sigmas = np.log1p(WEBER_FRACTIONS) / ndtri(CRITERION)
@@ -124,7 +125,7 @@ def _expected_entropy(joint: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SessionPlan:
-    """Settings of a session, which must be the same when an interrupted session continues.
+    """The settings of a session, which must be the same when an interrupted session continues.
 
     participant: random code, not a name. scene: name and hash of the scene's geometry.
     reference_pa: Young's modulus of the reference object.
@@ -139,7 +140,7 @@ class SessionPlan:
 
 @dataclass(frozen=True, slots=True)
 class PairTrial:
-    """Pair of objects with different stiffness, which is presented in one trial.
+    """A pair of objects with different stiffness, which is presented in one trial.
 
     number: number of the trial, from 1. increment: index in INCREMENTS. stiffer: interval with the
     stiffer object, 1 or 2. moduli_pa: Young's moduli in both intervals. catch: whether the trial
@@ -155,7 +156,7 @@ class PairTrial:
 
 @dataclass(frozen=True, slots=True)
 class PairAnswer:
-    """Answer of the participant, and what was measured while the pair was presented.
+    """The answer of the participant, and what was measured while the pair was presented.
 
     stiffer: interval that the participant named, 1 or 2. response_s: time of the answer after the
     end of the second interval. depths_m, forces_n: maximum push depth and maximum measured
@@ -170,7 +171,7 @@ class PairAnswer:
 
 @dataclass(frozen=True, slots=True)
 class TrialRow:
-    """One line of the CSV file, with the result of a trial; unmeasured quantities are empty."""
+    """A line of the CSV file, with the result of a trial; unmeasured quantities are empty."""
 
     participant: str
     seed: int
@@ -196,13 +197,16 @@ Present = Callable[[PairTrial], Awaitable[PairAnswer]]
 
 
 class StaircaseSession:
-    """Trials of one participant, and the CSV file in which they are stored.
+    """The trials of one participant, and the CSV file in which they are stored.
 
     Raises ExperimentError if an existing file belongs to another session or is damaged.
     """
 
     def __init__(self, plan: SessionPlan, file: Path, *, now: Callable[[], str]) -> None:
-        """Continue the session of an existing file; now: returns the present time as text."""
+        """Create a session, or continue the session of an existing file.
+
+        now: function that returns the present time as text.
+        """
         self.plan, self.file, self._now = plan, file, now
         self.estimator = StaircaseEstimator()
         self.done = self.catches = self.missed_catches = 0

@@ -31,7 +31,7 @@ Instructions for the operator
 
 
 class PeakMonitor:
-    """Maximum push depth and measured force since the last reset.
+    """The maximum push depth and measured force since the last reset.
 
     Both are None if there are no measurements.
     """
@@ -51,7 +51,7 @@ class PeakMonitor:
 
 
 class PairPresenter:
-    """Presenter that shows the pairs of a session by changing the modulus of a graph's object."""
+    """A presenter that shows the pairs of a session by changing the modulus of a graph's object."""
 
     def __init__(self, driver: Driver, scene: Scene, ask: Ask) -> None:
         self._driver, self._scene, self._ask = driver, scene, ask
@@ -59,7 +59,10 @@ class PairPresenter:
         driver.on_message = self._peaks.update
 
     async def present(self, trial: PairTrial) -> PairAnswer:
-        """Present both objects in turn, and return the answer; raise ExperimentError for "q"."""
+        """Present both objects in turn, and return the answer.
+
+        Raise ExperimentError if the operator types "q".
+        """
         depths: list[float | None] = []
         forces: list[float | None] = []
         for interval, modulus_pa in enumerate(trial.moduli_pa, start=1):

@@ -20,10 +20,10 @@ from flexsheet.launch.experiments.pictures import CORRECTION_NAMES
 from flexsheet.nodes.twin.error_map import ErrorMap
 
 MIN_MM, MAX_MM = 0.01, 10.0
-"""Limits of the logarithmic colour scale."""
+"""The limits of the logarithmic colour scale."""
 
 CROSS_MAGNIFICATION = 20.0
-"""Magnification of the error arrows in `draw_cross_errors`."""
+"""The magnification of the error arrows in `draw_cross_errors`."""
 
 
 def draw_error_maps(images: dict[str, EyeImage], series: Series, path: Path) -> None:

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class NodeCalibrations:
-    """Calibrations of stereo camera, sheet and marker that nodes use; None: from the scene.
+    """The calibrations of stereo camera, sheet and marker that nodes use; None: the scene's values.
 
     stamp_offset_s: time that the camera node adds to timestamps.
     """

@@ -1,13 +1,13 @@
 """Evaluate an apparatus without running the nodes.
 
 An apparatus is a set of true parameters of the simulated hardware. The nodes' methods get the
-parameters of the scene, and the simulator's models those of the apparatus. The errors of fingertip,
-sheet, image and felt force are computed at rest. Those of fingertip and sheet can also be computed
-for a constant speed of the finger, at which wrong exposure times cause errors. Only the force model
-of the rubber depends on time: it simulates a push in and out. So servo lag, delays, frame rate,
-tremor and backlash have no effect here; an experiment with running nodes measures those. Images
-have no noise. The references for the errors have their own models of camera, arms, membrane and
-eye, not those of the nodes.
+parameters of the scene, and the simulator's models get the parameters of the apparatus. The errors
+of fingertip, sheet, image and felt force are computed at rest. Those of fingertip and sheet can
+also be computed for a constant speed of the finger, at which wrong exposure times cause errors.
+Only the force model of the rubber depends on time: it simulates a push in and out. Therefore servo
+lag, delays, frame rate, tremor and backlash have no effect. An experiment with running nodes
+measures these effects. Images have no noise. The references for the errors have their own models of
+camera, arms, membrane and eye, not those of the nodes.
 """
 
 from __future__ import annotations
@@ -53,17 +53,19 @@ from flexsheet.nodes.twin.true_object import TrueBody
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 METRES_PER_PX = 0.0007
-"""Resolution of the images in Furukawa et al. 2007."""
+"""The resolution of the images in Furukawa et al. 2007."""
 
 STROKE_RATIOS = (0.0, 0.5, 1.0)
-"""Evaluated finger positions, as fractions of the upper half of the touchable arc of the object."""
+"""The evaluated finger positions, as fractions of the upper half of the touchable arc of the
+object."""
 
 MAX_FORCE_DEPTHS_M = (0.004, 0.016)
-"""Depths of the pushes whose forces are compared. They are limited to half and to all of the push
-depth of the scene."""
+"""The depths of the pushes whose forces are compared. They are limited to half and to all of the
+push depth of the scene."""
 
 MIN_FORCE_N = 0.1
-"""Minimum denominator of relative force errors. Relative errors of smaller forces are not felt."""
+"""The minimum denominator of relative force errors. Relative errors of smaller forces are not felt.
+"""
 
 MAX_IMAGE_DEPTH_M = 0.03
 RENDERER_SPACING_M = 0.0025
@@ -71,7 +73,7 @@ UNIT_COVARIANCE_PX2 = np.eye(2)
 
 
 class Metric(StrEnum):
-    """Names of the evaluated metrics in the results."""
+    """The names of the evaluated metrics in the results."""
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"
@@ -81,16 +83,17 @@ class Metric(StrEnum):
 
 ALL_METRICS = frozenset(Metric)
 MOVING_METRICS = frozenset({Metric.SHEET, Metric.FINGERTIP})
-"""Metrics that can be evaluated while the finger moves."""
+"""The metrics that can be evaluated while the finger moves."""
 
 
 CROSS_RATIOS, CROSS_ASIDES_M = (-1.0, -0.5, 0.0, 0.5, 1.0), (-0.03, 0.0, 0.03)
-"""Places of the crosses: fractions of the stroke along the object, and distances to the right."""
+"""The positions of the crosses: fractions of the stroke along the object, and distances to the
+right, in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Errors of one apparatus; None for metrics that were not evaluated.
+    """The errors of one apparatus; None for metrics that were not evaluated.
 
     fingertip_m: (n, 3), measured minus true fingertip. sheet_m: (n, 3), point of the object under
     the true finger minus the contact point of the sheet. image_m: one map (rows, columns, 2) of
@@ -108,7 +111,7 @@ class Evaluation:
         """Summarize the errors in one number per metric.
 
         The image error is a root mean square, the force error a mean absolute relative error. The
-        others are mean lengths.
+        errors of sheet and fingertip are mean lengths.
         """
         return {
             Metric.SHEET: _mean_length_mm(self.sheet_m),
@@ -163,11 +166,11 @@ def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class CrossErrors:
-    """Errors of crosses that are projected at expected contact points.
+    """The errors of crosses that are projected at expected contact points.
 
     All positions are projected from a viewpoint onto the screen plane. places_m (n, 2): expected
-    contact points, seen from the midpoint between the true eyes. errors_m (n, 2, 2): positions
-    (x, y) at which the left and the right eye see the cross, minus those of the actual contact.
+    contact points, seen from the midpoint between the true eyes. errors_m (n, 2, 2): positions (x,
+    y) at which the left and the right eye see the cross, minus the positions of the actual contact.
     """
 
     places_m: Floats
@@ -188,7 +191,7 @@ class CrossErrors:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """Sheet in contact: its pose (4, 4), and the touched point of the undeformed object (3,)."""
+    """A sheet in contact: its pose (4, 4), and the touched point of the undeformed object (3,)."""
 
     world_from_sheet: Floats
     point: Floats
@@ -199,7 +202,7 @@ class Contact:
 
 
 class OfflineEvaluator:
-    """Evaluator of the errors of apparatuses (true hardware parameters) of one scene.
+    """An evaluator of the errors of apparatuses (true hardware parameters) of one scene.
 
     metres_per_px: resolution of the images. cells: number of node intervals per side of the mesh of
     the true sheet. correction, sheet_shape: methods of the renderer.
@@ -597,7 +600,7 @@ class OfflineEvaluator:
 
 
 def _on_screen(eye: Floats, points: Floats) -> Floats:
-    """Return where an eye (3,) sees points (n, 3) on the screen plane z = 0, (n, 2), m."""
+    """Project points (n, 3) from an eye (3,) to the screen plane z = 0; return x, y (n, 2), m."""
     to_screen = eye[2] / (eye[2] - points[:, 2:])
     return np.asarray(eye[:2] + (points[:, :2] - eye[:2]) * to_screen)
 

@@ -23,7 +23,8 @@ EVENTS = tuple(event for event in LatencyEvent if event is not LatencyEvent.LIGH
 
 MAX_BLACK = 8
 DRAWN_RANGE = (0.18, 0.82)
-"""Drawn part of the eye's image, as fractions of its size. The rest shows only the dark sheet."""
+"""The drawn part of the eye's image, as fractions of its size. The rest shows only the dark sheet.
+"""
 
 CORRECTION_NAMES = {
     "none": "not corrected",

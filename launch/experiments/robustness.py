@@ -1,6 +1,6 @@
 """Evaluate the system with many random apparatuses (true parameters of the simulated hardware).
 
-Each represents a laboratory whose hardware differs at random from its scene file.
+Each apparatus represents a laboratory whose hardware differs at random from its scene file.
 """
 
 from __future__ import annotations
@@ -134,8 +134,7 @@ def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
 
     confusion: number of laboratories by report (good or not) and by true errors (within tolerance
     or not), in total and by metric. stated_over_true: quantiles of the ratio of predicted rms error
-    to true error. covered: share of true errors below the predicted 95 %
-    quantile.
+    to true error. covered: fraction of true errors below the predicted 95 % quantile.
     """
     predictions = {}
     for metric in Metric:
@@ -192,8 +191,8 @@ def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
 def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Return median, 95 % quantile and maximum of each metric, and the seed of the maximum.
 
-    They are None if a metric has no values. Also count the trials with the metric, the trials
-    out of tolerance, and among these the trials in which no self-check suspected a cause.
+    These values are None if a metric has no values. Also count the trials with the metric, the
+    trials out of tolerance, and among these the trials in which no self-check suspected a cause.
     """
     summary: dict[str, dict[str, float | None]] = {}
     for metric in METRICS:

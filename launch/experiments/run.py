@@ -184,7 +184,7 @@ def make_image_procedure(
             await driver.wait_settled()
             for correction in corrections:
                 label = series.label(value, correction)
-                progress(label)
+                progress(f"taking the image {label}")
                 await driver.capture_image(label, correction, shading)
                 for pattern in image.RAMPS if with_maps else ():
                     ramp_label = image.make_pattern_label(label, pattern)

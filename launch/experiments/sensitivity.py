@@ -35,11 +35,11 @@ SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 
 
 class EvaluationKind(StrEnum):
-    """Method by which the effect of a parameter was evaluated.
+    """The method by which the effect of a parameter was evaluated.
 
-    offline: without running nodes; sheet and fingertip at the working speed, others at rest. graph:
-    in motion, with running nodes. not_measured: the effect occurs only in motion, and no graph was
-    run. not_simulated: no simulator node uses the parameter.
+    offline: without running nodes; errors of sheet and fingertip at the working speed, errors of
+    image and force at rest. graph: in motion, with running nodes. not_measured: the effect occurs
+    only in motion, and no graph was run. not_simulated: no simulator node uses the parameter.
     """
 
     OFFLINE = "offline"
@@ -70,7 +70,7 @@ TIMING = frozenset(
         "projector.latency_offset_s",
     }
 )
-"""Parameters without effect at rest, or on a noise-free image of the marker.
+"""The parameters without effect at rest, or on a noise-free image of the marker.
 
 Errors of sheet and fingertip in a running graph show their effects, except for those of eyes and
 projector.
@@ -85,7 +85,7 @@ AFFECTED: dict[str, frozenset[Metric]] = {
     "eyes": frozenset({Metric.IMAGE}),
     "projector": frozenset({Metric.IMAGE}),
 }
-"""Metrics that each section of the apparatus affects at rest."""
+"""The metrics that each section of the apparatus affects at rest."""
 
 
 def evaluation_of(parameter: str, *, with_graph: bool) -> EvaluationKind:

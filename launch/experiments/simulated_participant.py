@@ -13,22 +13,23 @@ from statistics import NormalDist
 import numpy as np
 
 SEED_STREAM = 75
-"""Second element of the random seed; it makes the participant independent of the session."""
+"""The second element of the random seed; it makes the participant independent of the session."""
 
 WEBER_RANGE = (0.08, 0.3)
-"""Range of Weber fractions; published values for stiffness are 0.07 (force cue) to 0.23."""
+"""The range of Weber fractions; published values for stiffness are 0.07 (force cue) to 0.23."""
 
 MAX_LAPSE_RATE = 0.05
 BIAS_SIGMAS = 0.2
-"""Standard deviation of the interval bias, in standard deviations of a perceived difference."""
+"""The standard deviation of the interval bias, in standard deviations of a perceived difference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Perception:
-    """Parameters of the perception of a simulated participant.
+    """The parameters of the perception of a simulated participant.
 
-    noise: standard deviation of the perceived logarithm of a stiffness. bias: value added to
-    that of the second object. lapse_rate: fraction of trials that are answered at random.
+    noise: standard deviation of the perceived logarithm of a stiffness. bias: value added to the
+    perceived logarithm of the second object's stiffness. lapse_rate: fraction of trials that are
+    answered at random.
     """
 
     noise: float
@@ -37,12 +38,12 @@ class Perception:
 
     @property
     def weber_fraction(self) -> float:
-        """Return the increment with 75 % correct answers if attentive and unbiased."""
+        """Return the stiffness increment of 75 % correct answers without lapses and bias."""
         return math.expm1(NormalDist(0.0, math.sqrt(2.0) * self.noise).inv_cdf(0.75))
 
 
 class SimulatedParticipant:
-    """Simulated participant that compares two noisy percepts; equal seeds give equal answers.
+    """A simulated participant that compares two noisy percepts; equal seeds give equal answers.
 
     The noise of a trial depends only on the seed and the number of the trial, so that an
     interrupted session continues with the same answers.

@@ -76,34 +76,35 @@ from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 CYCLE_S = 0.0071
-"""Period of the commands to the arms."""
+"""The period of the commands to the arms."""
 
 READ_OUT_S, COMPUTING_S, SENDING_S = 0.004, 0.002, 0.001
-"""Durations of three successive stages: camera read-out (unless the apparatus states it),
+"""The durations of three successive stages: camera read-out (unless the apparatus states it),
 computation until the target is published, and transmission until an arm command uses it."""
 
 PIXEL_NOISE_PX = 0.02
 PREDICTION_S = 0.12
 SERVO_LAG_S = 0.025
-"""Servo lag of the simulated arms, unless the apparatus states it."""
+"""The servo lag of the simulated arms, unless the apparatus states it."""
 
 MAX_LAG_S, MAX_EXTRAPOLATION_S = 0.1, 0.06
-"""Maximum measured servo lag, and maximum extrapolation time of a target, as in the bridges."""
+"""The maximum measured servo lag, and the maximum extrapolation time of a target, in seconds. The
+values are those of the bridges."""
 
 SETTLING_S = 2.0
-"""Time for which the finger rests at the start of the path, until the sheet has reached it."""
+"""The time for which the finger rests at the start of the path, until the sheet has reached it."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
-    """Settings of a run.
+    """The settings of a run.
 
     tracking: tracking method. planner: parameters of the planner by name. lag_known: whether the
-    bridges know the true servo lag of the arms, for comparison with runs in which they measure it.
-    computing_s: time from the end of the read-out to the published target. calibrations: those of
-    the nodes, with which they see the finger through the true camera; None: they know camera,
-    marker and exposure times exactly. with_images: whether the triangulator node finds the marker
-    in simulated images by the scene's methods, instead of in positions with noise.
+    bridges know the true servo lag of the arms; otherwise they measure it. computing_s: time from
+    the end of the read-out to the published target. calibrations: calibrations of the nodes, from
+    which the true camera deviates; None: the nodes know camera, marker and exposure times exactly.
+    with_images: whether the triangulator node detects the marker in simulated images; otherwise it
+    measures pixels with noise.
     """
 
     tracking: str = "adaptive"
@@ -116,7 +117,7 @@ class LoopSettings:
 
 
 class MeasuredFinger:
-    """Simulated camera with pixel noise, and the triangulator's tracking of the finger."""
+    """A simulated camera with pixel noise, and the triangulator's tracking of the finger."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus, settings: LoopSettings) -> None:
         given, self._truth = settings.calibrations, apparatus.camera
@@ -139,9 +140,10 @@ class MeasuredFinger:
         self._horizons_s = make_horizons_s(PREDICTION_S)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Measure the finger, whose true position and velocity at the timestamp are given, (3,).
+        """Measure the finger at a timestamp; return its predicted path (n, 3), m.
 
-        Returns the predicted path (n, 3), m. The images are exposed slightly after the timestamp.
+        position_world, velocity: true position (m) and velocity (m/s) of the finger at the
+        timestamp, (3,). The images are exposed slightly later.
         """
         truth, random = self._truth, self._random
         late_s = truth.stamp_offset_s - self._stamp_offset_s
@@ -167,7 +169,7 @@ class MeasuredFinger:
 
 
 class FilmedFinger:
-    """Simulated camera that takes images, and the triangulator node that finds the finger there."""
+    """A simulated camera that takes images, and the triangulator node that detects the finger."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus, settings: LoopSettings) -> None:
         true_scene, self._truth = apply_apparatus(scene, apparatus), apparatus.camera
@@ -223,7 +225,7 @@ class FilmedFinger:
 
 
 class SimulatedArm:
-    """Simulated arm: the control methods of its bridge, and the simulator's servo."""
+    """A simulated arm: the control methods of its bridge, and the simulator's servo."""
 
     def __init__(
         self, scene: Scene, side: Side, truth: ArmTruth, sheet: SheetMotion, *, lag_known: bool
@@ -275,7 +277,11 @@ class SimulatedArm:
             self._now_s = until_s
 
     def command(self, target: SheetMotion, valid_at_s: float, now_s: float, step_s: float) -> None:
-        """Send the command of one arm cycle to the servo; the cycle lasts `step_s`."""
+        """Send the command of one arm cycle to the servo.
+
+        target: motion of the sheet for the time `valid_at_s`. now_s: present time. step_s: duration
+        of the cycle. All times are in seconds.
+        """
         goal = extrapolate_goal(
             target, now_s - valid_at_s + self.lag_s, 0.0, max_extrapolation_s=MAX_EXTRAPOLATION_S
         )
@@ -309,7 +315,7 @@ class SimulatedArm:
 
 
 class SimulatedSheet:
-    """Simulated arms with the sheet between them."""
+    """The simulated arms with the sheet between them."""
 
     def __init__(
         self, scene: Scene, apparatus: Apparatus, sheet: SheetMotion, *, lag_known: bool
@@ -347,7 +353,7 @@ class SimulatedSheet:
 
 
 class SimulatedLoop:
-    """Camera, tracking, planner, arms and sheet in simulated time, optionally with a hand."""
+    """A simulation of camera, tracking, planner, arms and sheet in simulated time."""
 
     def __init__(
         self,
@@ -538,7 +544,8 @@ def stroke_in_simulated_time(
 ) -> dict[str, dict[str, float]]:
     """Simulate the experiment `stroke`; return its errors in mm and degrees as `stroke_result`.
 
-    The settings must have calibrations. The errors delta_d_mm are those that the devices report.
+    The settings must have calibrations. Keys with the prefix `true_` contain true errors. The same
+    keys without the prefix contain the errors that the devices report.
     """
     recorded = record_in_simulated_time(
         scene, apparatus, settings, stroke_path(scene, seconds), stroke_window_s(seconds)
@@ -558,7 +565,7 @@ def stroke_in_simulated_time(
 
 @dataclass(frozen=True, slots=True)
 class TouchRecording:
-    """Touch of a simulated hand that the sheet pushes, sampled at the exposures.
+    """A touch of a simulated hand that the sheet pushes, sampled at the exposures.
 
     times_s (n,): times of the exposures. positions_m (n, 3): true fingertip.
     phases (n,): contact phase of the planner. delay_s: time from an exposure to the sheet's motion.

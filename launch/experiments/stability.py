@@ -47,30 +47,32 @@ HAND_RANGES = {
     "wrist": ((0.1, 0.2), (100.0, 400.0), (0.15, 0.5)),
     "arm": ((0.5, 1.5), (100.0, 800.0), (0.15, 0.6)),
 }
-"""Ranges of mass (kg), stiffness (N/m) and damping ratio. Sources: see `nodes.models.hand_loop`."""
+"""The ranges of mass (kg), stiffness (N/m) and damping ratio. Sources: see
+`nodes.models.hand_loop`."""
 
 DELAYS_S = (0.01, 0.03, 0.05, 0.07, 0.1)
 JITTERS_S = (0.0, 0.03)
-"""Ranges of the packet jitter: uniformly distributed additional delays up to this value."""
+"""The ranges of the packet jitter: uniformly distributed additional delays up to this value."""
 
 RATES_HZ = (30.0, 60.0, 120.0)
 OBJECT_RATIOS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
 DEPTH_FRACTIONS = (0.25, 0.6, 0.95)
 GAINS = (1.0, 1.25, 1.5, 2.0, 3.0)
-"""Factors by which the sheet's motion is increased to measure the gain margin."""
+"""The factors by which the sheet's motion is increased to measure the gain margin."""
 
 LINEAR_STIFFNESS_N_PER_M, LINEAR_DEPTH_M = 100.0, 0.02
 MAX_BOUNDARY_SLOPE = 1.5
-"""Maximum compared critical slope. Above it, the finger loses contact with the sheet."""
+"""The maximum compared critical slope. Above it, the finger loses contact with the sheet."""
 
 SLOPES = 32
 FILTERS = ((math.inf, False), (math.inf, True), (10.0, False))
-"""Bandwidth of the depth's filter (rad/s), and whether the depth is predicted over the delay."""
+"""The bandwidth of the depth's filter (rad/s), and whether the depth is predicted over the delay.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class StabilitySettings:
-    """Extent of the experiment.
+    """The extent of the experiment.
 
     hands: number of random hands per group of HAND_RANGES, sampled with `seed`. rates_hz: camera
     rates at which the critical slope is measured. object_ratios: factors by which the stiffness of
@@ -100,7 +102,7 @@ def draw_hands(count: int, seed: int) -> list[Hand]:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Hand in a control loop, released near an equilibrium depth."""
+    """A hand in a control loop, released near an equilibrium depth."""
 
     hand: Hand
     loop: SampledLoop

@@ -53,13 +53,14 @@ PAPER_TABLE_1 = {
     10.0: {"delta_d_mm": (0.443, 0.0330), "delta_theta_deg": (0.359, 0.267)},
     30.0: {"delta_d_mm": (0.277, 0.0221), "delta_theta_deg": (0.225, 0.179)},
 }
-"""Errors in Table I of the paper: mean and standard deviation, by duration of the stroke (s)."""
+"""The errors in Table I of the paper: mean and standard deviation, by duration of the stroke (s).
+"""
 
 NO_VALUES: Floats = np.empty(0)
 
 
 class LatencyEvent(StrEnum):
-    """Event that an exposure of the camera causes; its latency counts from the exposure."""
+    """An event that an exposure of the camera causes; its latency counts from the exposure."""
 
     FINGERTIP = "fingertip"
     SHEET_TARGET = "sheet target"
@@ -79,7 +80,7 @@ ARM_EVENTS: dict[Side, LatencyEvent] = {
 
 @dataclass(frozen=True, slots=True)
 class DrawnFrames:
-    """Contents that the renderer drew, each with the time at the centre of its display, ns.
+    """The contents that the renderer drew, each with the time at the centre of its display, ns.
 
     fingertip: drawn fingertip position (3,), m. sheet: centre and normal of the sheet (6,).
     deformation_ages: age of the finger measurement that deforms the drawn object (1,), s.
@@ -102,7 +103,7 @@ class DrawnFrames:
             self.deformation_ages.append((frame.light_ns, np.array([age_s])))
 
     def shifted(self, late_ns: int) -> DrawnFrames:
-        """Return the contents at the true display times, `late_ns` after the recorded ones.
+        """Return the contents at the true display times, `late_ns` after the recorded times.
 
         The ages of the drawn deformation increase by the same time.
         """
@@ -168,7 +169,7 @@ def object_pose(scene: Scene) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SampledMotion:
-    """Sampled motion: times (n,) in ns, and k values at each time (n, k)."""
+    """A sampled motion: times (n,) in ns, and k values at each time (n, k)."""
 
     times_ns: NDArray[np.int64]
     values: Floats
@@ -192,7 +193,7 @@ class SampledMotion:
 def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
     """Make a motion from samples (time in ns, value): sort them and drop repeated times.
 
-    Raises ExperimentError for fewer than two samples. name: what they are, for the error.
+    name: name of the samples in the error text. Raises ExperimentError for fewer than two samples.
     """
     if len(samples) < 2:
         raise ExperimentError(
@@ -207,14 +208,15 @@ def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
 
 @dataclass(frozen=True, slots=True)
 class StrokeRecording:
-    """Data of an experiment, read from a bag.
+    """The data of an experiment, read from a bag.
 
     fingertip, measured, finger: filtered, measured and true position of the fingertip.
     measured_edges, true_edges: left and right clamped edge of the sheet. A row (9,) is the centre,
     y axis and z axis of an edge in the world frame. delays_s: delays from the centre of an exposure
-    to the events that it caused, by event. drops: number of lost or refused messages, except those
-    that a `latest` reader skipped. apparatus: origin of the true parameters of the simulated
-    hardware. surface, true_surface: shape of the unloaded sheet, by the scene and by the apparatus.
+    to the events that it caused, by event. drops: number of lost or refused messages, without
+    messages that a `latest` reader skipped. apparatus: origin of the true parameters of the
+    simulated hardware. surface, true_surface: shape of the unloaded sheet, by the scene and by the
+    apparatus.
     """
 
     scene: Scene
@@ -252,7 +254,9 @@ def make_edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats
 
 
 def frame_events(frame: Frame, published_ns: int) -> list[tuple[LatencyEvent, int]]:
-    """Return when a frame was begun, drawn and (if it was) displayed, as (event, time in ns)."""
+    """Return the times at which a frame was begun, drawn and, if so, displayed: (event, time in
+    ns).
+    """
     drawn_ns = frame.drawn_ns or published_ns
     begun_ns = drawn_ns - round(frame.draw_s * 1e9)
     events = [(LatencyEvent.FRAME_BEGUN, begun_ns), (LatencyEvent.FRAME_DRAWN, drawn_ns)]
@@ -383,7 +387,7 @@ def apply_compliance(
 ) -> tuple[SampledMotion, SampledMotion]:
     """Displace the reported motions of both edges by the compliance of the flanges.
 
-    The arms report poses as if they were rigid, but the tension of the sheet displaces them.
+    The arms report poses of rigid flanges, but the tension of the sheet displaces the flanges.
     """
     limits = ArmGeometry(scene, "left").sheet_limits
     moved = []
@@ -441,7 +445,8 @@ def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Flo
 
 
 MIN_CURVATURE_PER_M = 1.0
-"""Minimum principal curvature, 1/m. A flatter surface has many points with nearly one normal."""
+"""The minimum principal curvature, 1/m. A flatter surface has many points with nearly one normal.
+"""
 
 
 def project_presented_point(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
@@ -539,7 +544,7 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class StrokeErrors:
-    """Errors of a stroke as functions of time, m and rad.
+    """The errors of a stroke as functions of time, m and rad.
 
     seconds: (n,), times of the measured errors since the start of the stroke. These are exposures
     with a valid fingertip. true_seconds: (m,), times of the true errors. These are all exposures,
@@ -659,7 +664,7 @@ def tangential_distance(
 
 
 def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, float | None]:
-    """Return by how much the displayed image lags behind reality, ms; None if unknown.
+    """Return the lags of the displayed image behind reality, ms; None for an unknown lag.
 
     fingertip, sheet: lag of the drawn fingertip, and of the drawn rotation of the sheet about the
     object, estimated by cross-correlation with the true motion. object: median age of the finger

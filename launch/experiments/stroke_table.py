@@ -24,20 +24,22 @@ from flexsheet.messages.methods import TrackingMethod
 from flexsheet.messages.scene import Scene, require_cylinder
 
 FIRST_SEED = 4100
-"""Random seed of finger and camera noise in the first stroke. Charts and defaults use others."""
+"""The random seed of finger and camera noise in the first stroke. Charts and defaults use other
+seeds."""
 
 CONFIDENCE = 0.95
 RATES_HZ = (15.0, 30.0, 60.0)
 RADIUS_FACTOR = 2.0
-"""Ratio of the radii. The angle and distance errors in the paper's table agree for a radius of
-70.7 mm, which is twice the radius in its text."""
+"""The ratio of the cylinder's radius in the variant to the radius in the scene. The angle and
+distance errors in the paper's table agree for a radius of 70.7 mm, which is twice the radius in the
+paper's text."""
 
 ERRORS = ("delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """Variant of the experiment. settings: override parameters of the launch file."""
+    """A variant of the experiment. settings: override parameters of the launch file."""
 
     name: str
     launch_file: Path

@@ -34,7 +34,7 @@ SETTINGS_FILE = "sweep.json"
 TRIAL_MODULE = "flexsheet.launch.experiments.trial"
 POLL_S = 0.2
 END_S = 20.0
-"""Time in which the process of a stopped trial must end the nodes that it started."""
+"""The time in which the process of a stopped trial must end the nodes that it started."""
 
 MAX_ERROR_CHARACTERS = 600
 
@@ -203,10 +203,12 @@ def execute_trial(trial: Mapping[str, Any]) -> Row:
             given = None
             if must_stop():
                 _end(process)
-                raise TrialError("interrupted") from None
+                raise TrialError("the trial was interrupted; start the sweep again") from None
     if process.returncode != 0:
         last_line = errors.strip().rpartition("\n")[2][-MAX_ERROR_CHARACTERS:]
-        raise TrialError(last_line or f"exit status {process.returncode}")
+        raise TrialError(
+            last_line or f"the trial ended with status {process.returncode} and no error message"
+        )
     try:
         row = json.loads(output.splitlines()[-1])
     except (IndexError, ValueError) as error:

@@ -57,29 +57,30 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 STROKE = "system stroke"
 TOUCH_M = 0.001
-"""Push depth during the stroke. It keeps the finger in contact despite drift and tremor."""
+"""The push depth during the stroke. It keeps the finger in contact despite drift and tremor."""
 
 STROKED_RATIO = 0.9
-"""Fraction of the touchable arc length of the object that is stroked."""
+"""The fraction of the touchable arc length of the object that is stroked."""
 
 SAMPLE_S = 0.05
 MAX_STEP_RAD = 0.1
-"""Maximum phase of the stroke between two points of its path."""
+"""The maximum phase of the stroke between two points of its path."""
 
 APPROACH_S = 1.0
 WARM_UP_S = 0.5
-"""Time after the approach in which errors are not evaluated, until the sheet has settled."""
+"""The time after the approach in which errors are not evaluated, until the sheet has settled."""
 
 HOVER_M = 0.03
 METRES_PER_PX = 0.0014
-"""Resolution of the images; the error map interpolates between the drawn coordinates."""
+"""The resolution of the images; the error map interpolates between the drawn coordinates."""
 
 FORCE_STEP_S, FORCE_REST_S = 1.0 / 60.0, 1.5
-"""Time step of the planner during a push, and duration of the rest before a force is evaluated."""
+"""The time step of the planner during a push, and duration of the rest before a force is evaluated.
+"""
 
 STAGES = ("fingertip", "planner and arms", "geometry of the arms")
-"""Stages whose errors add up to the sheet's error: measured minus true finger; sheet computed from
-the arms' measured joints minus measured finger; true sheet minus that computed sheet."""
+"""The stages whose errors add up to the sheet's error: measured minus true finger; sheet computed
+from the arms' measured joints minus measured finger; true sheet minus that computed sheet."""
 
 
 def make_stroke(scene: Scene, seconds: float, label: str = STROKE) -> FingerPath:
@@ -102,7 +103,7 @@ def make_stroke(scene: Scene, seconds: float, label: str = STROKE) -> FingerPath
 
 @dataclass(slots=True)
 class ErrorEvaluator:
-    """Evaluator of configurations of one scene with one apparatus (true hardware parameters).
+    """An evaluator of configurations of one scene with one apparatus (true hardware parameters).
 
     seconds: duration of the stroke. seed: random seed of the finger. Results of methods that
     several configurations have in common are computed once.
@@ -119,7 +120,7 @@ class ErrorEvaluator:
         """Return mean, p95 and maximum of each error, or None for one that the scene lacks.
 
         methods: all methods of the configuration. planner: further parameters of the planner.
-        budget: share of each stage of `STAGES` in the sheet's mean square error.
+        budget: fraction of the sheet's mean square error that each stage of `STAGES` causes.
         """
         has_image, has_force = self.scene.projector is not None, self.scene.object.material
         moving = (methods.marker, methods.tracking, *planner.items())
@@ -227,7 +228,7 @@ class ErrorEvaluator:
 
 @dataclass(slots=True)
 class RestingPush:
-    """Planned sheet for a finger that moves in and rests.
+    """A planned sheet for a finger that moves in and rests.
 
     measured_m: measured minus true fingertip (3,).
     """
@@ -273,10 +274,11 @@ def load_body(scene: Scene, choice: SoftBodyChoice | None) -> SoftBody:
 def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: Any) -> Floats:
     """Split the sheet's error into the errors of the stages `STAGES`, (3, n, 3) m.
 
-    The total is the object's point nearest to the true finger, moved inward by the commanded
-    offset (n, 1), minus the contact point of the true sheet. Vectors are in the object's frame.
-    A displacement of a flat sheet along a flat object changes nothing that is presented. There, the
-    total is the distance between the planes only, which is zero if the arms move within the plane.
+    The total is the object's point nearest to the true finger, moved inward by the commanded offset
+    (n, 1), minus the contact point of the true sheet. Vectors are in the object's frame. A
+    displacement of a flat sheet along a flat object does not change the contact. For flat objects,
+    the total is the distance between the planes only, which is zero if the arms move within the
+    plane.
     """
     world_from_object = object_pose(recording.scene)
     object_from_world = inverse(world_from_object)

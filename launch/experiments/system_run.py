@@ -33,7 +33,7 @@ DELAY_TOPICS = ("twin/apparatus", "arm_left", "arm_right", "frame")
 
 @dataclass(slots=True)
 class CpuUse:
-    """Average number of processor cores that the processes of a graph use, by node name."""
+    """The average number of processor cores that the processes of a graph use, by node name."""
 
     cores: dict[str, float] = field(default_factory=dict)
 

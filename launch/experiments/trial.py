@@ -38,7 +38,7 @@ from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
 Row = dict[str, Any]
 
 NICENESS = 10
-"""Niceness of trials without a graph, so that other programs on the computer stay usable."""
+"""The niceness of trials without a graph, so that other programs on the computer stay usable."""
 
 
 @contextmanager
@@ -56,9 +56,7 @@ def _tell(text: str) -> None:
 
 
 def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
-    """Run one stroke in a separate graph; return its results with the causes of error that nodes
-    suspected.
-    """
+    """Run one stroke in a separate graph; return its results and the suspected causes of errors."""
     launch_file, seconds = Path(trial["launch_file"]), float(trial["seconds"])
     settings = [*choose_ports(launch_file), *trial.get("settings", ())]
     with _bag_of(trial) as bag:
@@ -88,7 +86,7 @@ def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
-    """Return errors with a random apparatus: sheet and finger in motion, others at rest."""
+    """Return errors with a random apparatus: sheet and finger moving, image and force at rest."""
     if trial.get("commission_folder"):
         return _run_commissioned_trial(trial)
     apparatus_file, launch_file = trial["apparatus"], Path(trial["launch_file"])

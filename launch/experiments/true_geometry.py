@@ -1,6 +1,6 @@
 """Compute the true poses of the sheet's edges for the poses that the nodes command.
 
-Kinematics are those of the simulated arms, which share no code with the nodes' kinematics.
+The kinematics of the simulated arms are used, which share no code with the nodes' kinematics.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Fl
 
 @dataclass(frozen=True, slots=True)
 class ArmModel:
-    """Geometry of one arm: its mechanics, and the poses (4, 4) of its base and its clamped edge."""
+    """The geometry of one arm: its mechanics, and the poses (4, 4) of its base and its clamped
+    edge.
+    """
 
     mechanics: ArmMechanics
     world_from_base: Floats
@@ -53,7 +55,7 @@ class ArmModel:
 
 
 class ArmPair:
-    """Both arms, with the geometry that the scene assumes and their true geometry."""
+    """A pair of arms, with the geometry that the scene assumes and the true geometry."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus) -> None:
         true_scene = apply_apparatus(scene, apparatus)

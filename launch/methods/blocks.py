@@ -18,7 +18,7 @@ from flexsheet.nodes.methods import Interval, dominates
 CONFIDENCE = 0.95
 RESAMPLES = 2000
 SEED = 20261123
-"""Fixed random seed of the bootstrap, so that equal data give equal intervals."""
+"""The fixed random seed of the bootstrap, which makes intervals reproducible."""
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
@@ -30,8 +30,8 @@ def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[s
 def bootstrap_median(values: Floats) -> Interval | None:
     """Return the median of values (n,), one per block, with its confidence interval.
 
-    NaN marks a failed run. None if there are no finite values. If only one block has a value, the
-    limits are infinite.
+    NaN marks a failed run. Return None if there are no finite values. If only one block has a
+    value, the limits are infinite.
     """
     known = values[np.isfinite(values)]
     if len(known) == 0:
@@ -48,7 +48,7 @@ def bootstrap_median(values: Floats) -> Interval | None:
 def compare_paired(values: Floats, control: Floats) -> Interval | None:
     """Return the median ratio of positive values (n,) to the control's values in the same blocks.
 
-    It is computed from logarithms, so that a ratio and its inverse have the same weight.
+    The median is computed from logarithms, so that a ratio and its inverse have the same weight.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = bootstrap_median(np.log(values / control))
@@ -62,7 +62,7 @@ def attribute_error(parts: Floats) -> Floats:
     """Return the fractions (k,) of a mean square error that k parts of the error cause.
 
     parts: (k, n, d), error vectors that add up to the whole error. The fractions add up to one. A
-    part that compensates others has a negative fraction.
+    part that compensates other parts has a negative fraction.
     """
     whole = parts.sum(axis=0)
     total = float(np.square(whole).sum())
@@ -72,7 +72,7 @@ def attribute_error(parts: Floats) -> Floats:
 
 
 def find_front(points: Mapping[str, Sequence[Interval]]) -> list[str]:
-    """Return the names of the points on the Pareto front: those that no other point dominates.
+    """Return the names of the points that no other point dominates (the Pareto front).
 
     points: costs of each point, smaller is better. A point dominates another if one of its costs is
     lower and none is higher. Costs with overlapping confidence intervals count as equal.

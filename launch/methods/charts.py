@@ -31,14 +31,13 @@ if TYPE_CHECKING:
 
 FAMILIES: dict[str, str] = {
     "marker": "flexsheet.nodes.triangulator.benchmarks:MARKER",
-    "triangulation": "flexsheet.nodes.triangulator.benchmarks:TRIANGULATION",
     "tracking": "flexsheet.launch.methods.benchmarks:TRACKING",
     "soft-body": "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY",
     "correction": "flexsheet.launch.methods.benchmarks:CORRECTION",
     "sheet-force": "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
     "sheet-shape": "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
 }
-"""Location `module:NAME` of each method family, by its name on the command line."""
+"""The location `module:NAME` of each method family, by its name on the command line."""
 
 REPEATS = 30
 PROGRESS_PERIOD_S = 1.0
@@ -304,7 +303,7 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
 
 
 def read_charts(folder: Path) -> list[dict[str, Any]]:
-    """Read the chart results in a folder: those of `FAMILIES` in order, then other benchmarks."""
+    """Read the chart results in a folder: `FAMILIES` in their order, then other benchmarks."""
     order = list(FAMILIES)
     paths = sorted(
         folder.glob("*.json"),

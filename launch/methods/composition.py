@@ -17,14 +17,16 @@ from itertools import product
 from typing import Any
 
 MAX_RUNS = 4
-"""Maximum number of configurations that are run through the graph."""
+"""The maximum number of configurations that are run through the graph."""
 
 P95_OVER_RMS = 1.614
-"""Ratio of the 95 % quantile to the root mean square of the length of a 3D Gaussian error."""
+"""The ratio of the 95 % quantile to the root mean square of the length of a 3D Gaussian error."""
 
 
 class SystemMetric(StrEnum):
-    """Names of the system's 95 % errors and latencies that have a tolerance, as in the results."""
+    """The 95 % errors and latencies of the system that have a tolerance; the values are result
+    keys.
+    """
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"
@@ -40,7 +42,7 @@ DELAYS = frozenset({SystemMetric.TO_ARM, SystemMetric.TO_LIGHT})
 
 @dataclass(frozen=True, slots=True)
 class StageOption:
-    """Method that can be chosen for a stage.
+    """A method that can be chosen for a stage.
 
     cores: processor time per second. spreads, biases: 95 % errors or delays (ms) that it adds to
     metrics. given: methods of other stages for which these values were measured. in_range: whether
@@ -61,9 +63,9 @@ Figures = Mapping[SystemMetric, float]
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """Excess of measured over predicted system metrics, learned from runs of the graph.
+    """The excess of measured over predicted system metrics, learned from runs of the graph.
 
-    It is added to later predictions, because the errors of the single methods do not explain it.
+    The excess is added to later predictions.
     """
 
     parts: Figures = field(default_factory=dict)
@@ -110,7 +112,10 @@ def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
 
 
 def list_combinations(stages: Mapping[str, Sequence[StageOption]]) -> list[Combination]:
-    """Return all combinations whose options agree with each other (see `given`), cheapest first."""
+    """Return all combinations of one option per stage, sorted by their cost.
+
+    Combinations are omitted if an option was measured with another method of a stage (`given`).
+    """
     combinations = [
         dict(zip(stages, options, strict=True)) for options in product(*stages.values())
     ]
@@ -143,7 +148,11 @@ def excess(figures: Figures, tolerances: Figures) -> dict[SystemMetric, float]:
 
 @dataclass(frozen=True, slots=True)
 class GraphRun:
-    """Run of one combination in the graph. measured: 95 % values."""
+    """A run of one combination in the graph.
+
+    predicted, measured: 95 % values by metric. exceeded: ratio of value to tolerance of each metric
+    that exceeds its tolerance.
+    """
 
     methods: Mapping[str, str]
     cores: float
@@ -154,7 +163,7 @@ class GraphRun:
 
 @dataclass(frozen=True, slots=True)
 class Composition:
-    """Result of the search.
+    """The result of the search for a combination of methods.
 
     chosen: accepted combination, or the one that exceeds the tolerances least. runs: all runs.
     """
@@ -272,7 +281,7 @@ def _predicted_excess(one: Combination, unexplained: Unexplained, limits: Figure
 
 
 def _miss(one: Combination, unexplained: Unexplained, limits: Figures) -> tuple[int, float, float]:
-    """Return a key that sorts combinations by their excess, those with methods in range first."""
+    """Return a key that sorts combinations by methods out of range, then excess, then cost."""
     outside = sum(not option.in_range for option in one.values())
     worst = max(excess(predict(one, unexplained), limits).values(), default=0.0)
     return outside, worst, cost(one)

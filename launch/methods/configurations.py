@@ -26,29 +26,26 @@ from flexsheet.nodes.renderer.sheet_mesh import MAX_TRIANGLES_DEPTH_M
 
 NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
     "marker": ("triangulator", "marker"),
-    "triangulation": ("triangulator", "triangulation"),
     "tracking": ("triangulator", "tracking"),
     "sheet_force": ("planner", "sheet_force"),
     "sheet_shape": ("renderer", "sheet_shape"),
     "correction": ("renderer", "correction"),
     "compliance": ("planner", "compliance_mode"),
 }
-"""Node type, and its parameter that selects the method, for each key of `Methods`."""
+"""The node type, and its parameter that selects the method, for each key of `Methods`."""
 
 NODE_DEFAULTS = Methods(
     marker="subpixel_fit",
-    triangulation="dlt",
     tracking="adaptive",
     sheet_force="scaled",
     sheet_shape="reduced_order",
     correction="two_pass",
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.003),
 )
-"""Methods that the nodes use if the scene contains no choice."""
+"""The methods that the nodes use if the scene contains no choice."""
 
 PAPER = Methods(
     marker="moments",
-    triangulation="dlt",
     tracking="none",
     sheet_force="scaled",
     sheet_shape="four_triangles",
@@ -56,12 +53,12 @@ PAPER = Methods(
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.0045),
     compliance="stiffness",
 )
-"""Methods of Furukawa et al. 2007, sections III and IV: no filter, linear FEM, four triangles, and
-stiffness rendered by the sheet's stretch only."""
+"""The methods of Furukawa et al. 2007, sections III and IV: no filter, linear FEM, four triangles,
+and stiffness rendered by the sheet's stretch only."""
 
 PAPER_PLANNER = {"prediction_horizon_s": 0.0}
-"""Parameters of the planner for the same paper, which does not compensate the delay (section V-C).
-"""
+"""The parameters of the planner for the same paper, which does not compensate the delay (section
+V-C)."""
 
 FINEST = NODE_DEFAULTS.model_copy(
     update={
@@ -73,7 +70,7 @@ FINEST = NODE_DEFAULTS.model_copy(
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """Methods of all nodes, with further parameters of the planner by name."""
+    """The methods of all nodes, with further parameters of the planner by name."""
 
     name: str
     methods: Methods
@@ -99,7 +96,7 @@ class Configuration:
         ]
 
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
-        """Compute and cache the tables of the sheet that the methods need, so that no run has to.
+        """Compute and cache the tables of the sheet that the methods need.
 
         A missing table of the soft body is not computed; the linear method then replaces it.
         """
@@ -116,7 +113,7 @@ class Configuration:
 def choose_cheapest(scene: Scene) -> Methods:
     """Return the cheapest method of each family whose range contains the scene's working range.
 
-    Errors are not considered. If no method of a family has a sufficient range, the one with the
+    Errors are not considered. If no method of a family has a sufficient range, the method with the
     largest range is returned.
     """
     depth_m, tilt_deg = scene.working_range.push_depth_m, np.degrees(scene.working_range.tilt_rad)
@@ -132,7 +129,6 @@ def choose_cheapest(scene: Scene) -> Methods:
     return Methods.model_validate(
         {
             "marker": "moments",
-            "triangulation": "dlt",
             "tracking": "one_euro",
             "sheet_force": "scaled" if is_scaled else "table",
             "sheet_shape": "four_triangles" if is_flat else "reduced_order",
@@ -145,7 +141,7 @@ def choose_cheapest(scene: Scene) -> Methods:
 
 
 def choose_tuned(scene: Scene) -> Methods:
-    """Return the methods that the scene names, and the nodes' default methods for the others."""
+    """Return the methods that the scene names, and the nodes' default methods of other families."""
     chosen = scene.methods.model_dump(exclude_none=True)
     return Methods.model_validate(NODE_DEFAULTS.model_dump() | chosen)
 
@@ -153,7 +149,7 @@ def choose_tuned(scene: Scene) -> Methods:
 TUNED = "tuned"
 NAMES = ("paper", "cheapest in range", "default", TUNED, "most exact")
 CONTROL = TUNED
-"""Configuration with which the others are compared; it runs twice in each block."""
+"""The configuration with which the others are compared; it runs twice in each block."""
 
 CONTROL_AGAIN = "tuned, again"
 

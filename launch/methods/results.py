@@ -11,7 +11,7 @@ from typing import Any
 CPU_INFO = Path("/proc/cpuinfo")
 
 MAX_LOAD_PER_CORE = 0.5
-"""Maximum load average per core at which timings are reliable."""
+"""The maximum load average per core at which timings are reliable."""
 
 
 def replace_non_finite(value: Any) -> Any:

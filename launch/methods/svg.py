@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, DARK_INK = "#1f2328", "#e6edf3"
-"""Colours of axes and text on light and on dark pages."""
+"""The colours of axes and text on light and on dark pages."""
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#8c6bb1", "#7f7f7f")
-"""Colours that people with colour vision deficiency can distinguish (after Okabe and Ito)."""
+"""The colours that people with colour vision deficiency can distinguish (after Okabe and Ito)."""
 
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK,

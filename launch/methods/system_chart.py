@@ -3,8 +3,8 @@
 Processor use and latency are measured in the running graph (`experiments/system_run.py`). A block
 contains all configurations; results are medians over blocks with their confidence intervals. Errors
 are 95 % values, computed in simulated time (`experiments/system_errors.py`) for the nominal
-apparatus (true parameters of the simulated hardware) and for random ones. Each trial is a separate
-process.
+apparatus (true parameters of the simulated hardware) and for random apparatuses. Each trial is a
+separate process.
 """
 
 from __future__ import annotations
@@ -46,25 +46,26 @@ from flexsheet.nodes.twin.tolerance_table import Profile
 Progress = Callable[[str], None]
 
 NOMINAL = "errors-nominal"
-"""Name of the trial that computes the errors with the nominal apparatus."""
+"""The name of the trial that computes the errors with the nominal apparatus."""
 
 FIRST_SEED = 100
-"""Seed of the first random apparatus; smaller seeds are for development."""
+"""The seed of the first random apparatus; smaller seeds are for development."""
 
 ORDER_SEED = 19
 FINGER_SEED = 5200
-"""Random seed of the finger in the first block; charts of single families do not use it."""
+"""The random seed of the finger in the first block; charts of single families do not use it."""
 
 ERRORS = ("sheet_mm", "image_mm", "force_percent", "fingertip_mm")
 LATENCIES = ("exposure_to_arm_ms", "exposure_to_light_ms")
 QUANTILES = ("p50", "p95", "p99")
 COMPARED = ("cpu_cores", "exposure_to_arm_ms.p50", "exposure_to_light_ms.p50")
-"""Keys of the speed values that are compared with the control configuration in the same block."""
+"""The keys of the speed values that are compared with the control configuration in the same block.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class SceneTrials:
-    """Trials of one scene.
+    """The trials of one scene.
 
     trials: description of each trial for the sweep, by name. places: block and configuration of
     each trial. common: settings that all trials share.
@@ -247,9 +248,9 @@ def list_tolerances(scene: Scene) -> dict[str, float]:
 
 
 def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[str, Any]]:
-    """Summarize each configuration of a scene in a point.
+    """Summarize each configuration of a scene in a point of the chart.
 
-    Omit those that have no successful run.
+    Configurations without a successful run are omitted.
     """
     nominal: Mapping[str, Any] = _good(rows, NOMINAL)
     speeds: dict[str, list[Row]] = {}
@@ -272,7 +273,7 @@ def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[
 
 
 def _good(rows: Mapping[str, Row], name: str) -> Row:
-    """Return the row of a trial; an empty one if the trial failed."""
+    """Return the row of a trial, or an empty row if the trial failed."""
     row = rows.get(name, {})
     return {} if "error" in row else row
 
@@ -390,7 +391,7 @@ def worst_ratio(point: Mapping[str, Any]) -> Interval:
 
 
 def find_system_front(points: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the configurations of a scene on the Pareto front, which no other one dominates.
+    """Return the names of a scene's configurations on the Pareto front.
 
     Costs are the latency from exposure to arm, the processor cores, and the worst error relative to
     its tolerance.

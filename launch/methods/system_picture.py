@@ -23,7 +23,7 @@ NAMES = {
     "fingertip_mm": "fingertip",
 }
 MIN_RATIO = 0.03
-"""Minimum of the drawn ratios of error to tolerance."""
+"""The minimum of the drawn ratios of error to tolerance."""
 
 ROW_HEIGHT = 4.2
 

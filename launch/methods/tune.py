@@ -35,16 +35,15 @@ from flexsheet.messages.methods import (
     SheetForceMethod,
     SheetShapeMethod,
     TrackingMethod,
-    TriangulationMethod,
 )
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Family, Point, Trial
 
 REPEATS = 10
 MARGIN = 0.2
-"""Fraction of a tolerance that is reserved for errors in cases that are not measured."""
+"""The fraction of a tolerance that is reserved for errors in cases that are not measured."""
 TIE_RATIO = 1.1
-"""Maximum ratio of a method's time to the fastest time at which both count as equally fast.
+"""The maximum ratio of a method's time to the fastest time at which both count as equally fast.
 
 Of equally fast methods, the most accurate one is chosen.
 """
@@ -62,11 +61,11 @@ class UnknownTunableError(FlexsheetError, KeyError):
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """Method family whose method can be chosen in a scene.
+    """A method family whose method can be chosen in a scene.
 
-    families: families of which it consists, as `module:NAME`, in the order of measurement. Later
-    ones take minutes to prepare and are measured only if no earlier method is sufficient. settings:
-    value to write into the scene for each method, by the method's name in the family's chart.
+    families: locations `module:NAME` of its parts, in the order of measurement. Later parts take
+    minutes to prepare, and are measured only if no earlier method is sufficient. settings: value to
+    write into the scene for each method, by the method's name in the family's chart.
     """
 
     name: str
@@ -88,15 +87,11 @@ def _make_soft_body(method: str, skin_spacing_m: float) -> Setting:
     return {"method": method, "skin_spacing_m": skin_spacing_m}
 
 
-_BENCHMARKS, _TRIANGULATOR, _FEM_SOLVER = (
-    "flexsheet.launch.methods.benchmarks",
-    "flexsheet.nodes.triangulator.benchmarks",
-    "flexsheet.nodes.fem_solver.benchmarks",
-)
+_BENCHMARKS = "flexsheet.launch.methods.benchmarks"
+_FEM_SOLVER = "flexsheet.nodes.fem_solver.benchmarks"
 TUNABLES = (
-    Tunable("marker", (f"{_TRIANGULATOR}:MARKER",), _make_settings(MarkerMethod)),
     Tunable(
-        "triangulation", (f"{_TRIANGULATOR}:TRIANGULATION",), _make_settings(TriangulationMethod)
+        "marker", ("flexsheet.nodes.triangulator.benchmarks:MARKER",), _make_settings(MarkerMethod)
     ),
     Tunable("tracking", (f"{_BENCHMARKS}:TRACKING",), _make_settings(TrackingMethod)),
     Tunable(
@@ -125,14 +120,14 @@ TUNABLES = (
         },
     ),
 )
-"""All tunable families in the order of tuning. The sheet shape precedes the image correction,
-whose settings depend on it."""
+"""The tunable families in the order of tuning. The sheet shape precedes the image correction, whose
+settings depend on it."""
 
 TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
     "reduced_order": "two_pass",
 }
-"""Names of the two-pass image correction in its chart, by method of the sheet shape."""
+"""The names of the two-pass image correction in its chart, by method of the sheet shape."""
 
 
 def find_tunables(names: Sequence[str]) -> list[Tunable]:
@@ -146,7 +141,7 @@ def find_tunables(names: Sequence[str]) -> list[Tunable]:
 
 @dataclass(frozen=True, slots=True)
 class MethodEvaluation:
-    """Evaluation of one method over a scene's working range.
+    """The evaluation of one method over a scene's working range.
 
     median_s, slowest_s: median and maximum of the time per call over the cases. error: maximum
     error within the method's stated range, found at `worst_case`; infinite if no reference is
@@ -176,7 +171,7 @@ class MethodEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Choice of one method of a family, with the evaluations of all its measured methods."""
+    """The choice of one method of a family, with the evaluations of all its measured methods."""
 
     family: str
     key: str
@@ -377,7 +372,7 @@ def _tune_family(
         }
         if not left:
             continue
-        progress(", ".join(left))
+        progress(f"measuring {', '.join(left)}")
         select = partial(_is_selected, left)
         if measure is not None:
             points = measure(family, scene, select)
@@ -449,7 +444,7 @@ def _make_line(choice: Choice, indent: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """Block `methods` of a scene file, with the indices of its lines.
+    """The block `methods` of a scene file, with the indices of its lines.
 
     start: first line, including the generated comment above it. end: line after the block. If the
     file has no such block, both are the end of the file. header: the line `methods:`, if it can be
@@ -503,7 +498,7 @@ def _format_flow(item: Any) -> str:
 
 
 FILES = (("object", "geometry", "file"), ("object", "appearance", "image_file"))
-"""Keys of a scene file whose values are paths relative to the file's folder."""
+"""The keys of a scene file whose values are paths relative to the file's folder."""
 
 
 def relocate_paths(text: str, source: Path, target: Path) -> str:

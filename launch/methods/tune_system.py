@@ -43,10 +43,10 @@ from flexsheet.nodes.methods import Point, Trial
 from flexsheet.nodes.triangulator.tracking_benchmark import make_tracking_family
 
 RENDERED_HZ = 30.0
-"""Maximum frame rate of the renderer in `launch/demo.yaml`."""
+"""The maximum frame rate of the renderer in `launch/demo.yaml`."""
 
 IMAGES = 2
-"""Number of images per exposure in which the marker is searched."""
+"""The number of images per exposure in which the marker is searched."""
 
 STROKE_S = 10.0
 LEAD = "lead_ms"
@@ -109,8 +109,6 @@ def _make_option(
         case "marker":
             rate_hz *= IMAGES
             took_ms *= IMAGES
-            biases = {SystemMetric.TO_ARM: took_ms, SystemMetric.TO_LIGHT: took_ms}
-        case "triangulation":
             biases = {SystemMetric.TO_ARM: took_ms, SystemMetric.TO_LIGHT: took_ms}
         case "sheet-force":
             biases = {SystemMetric.FORCE: one.error}
@@ -197,7 +195,7 @@ def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> lis
 
 
 def make_methods(scene: Scene, choices: Sequence[Choice]) -> Methods:
-    """Return the methods of the choices; for other families those of the scene or the defaults."""
+    """Return the chosen methods; for other families the methods of the scene or the defaults."""
     chosen = {choice.key: choice.chosen.setting for choice in choices}
     return Methods.model_validate(choose_tuned(scene).model_dump() | chosen)
 

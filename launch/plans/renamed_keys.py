@@ -44,7 +44,7 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
 SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
 """New key by former key of scene files."""
 
-REMOVED_KEYS = frozenset({"kinematics"})
+REMOVED_KEYS = frozenset({"kinematics", "triangulation"})
 """Keys of scenes and node parameters that were removed, because only one value was left."""
 
 LAUNCH_KEYS: Mapping[str, str] = {
@@ -67,7 +67,6 @@ VALUES: Mapping[str, Mapping[str, str]] = {
         "constant_acceleration": "adaptive",
         "exponential": "one_euro",
     },
-    "triangulation": {"midpoint": "dlt", "optimal": "dlt"},
     "driver": {"mxt_pose": "mxt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }

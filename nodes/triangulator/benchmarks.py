@@ -1,4 +1,4 @@
-"""Benchmark the marker methods and the triangulation methods: their computing times and errors."""
+"""Benchmark the marker methods: their time per image and their error over many images."""
 
 from __future__ import annotations
 
@@ -14,109 +14,7 @@ from flexsheet.nodes.methods import Case, Family, Interval, Trial, estimate_rms
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter, Marker, detect_blobs
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
-from flexsheet.nodes.triangulator.triangulation import (
-    TRIANGULATION_METHODS,
-    StereoGeometry,
-    measure,
-)
-
-CASE_POINTS = 2000
-NOISES_PX = (0.01, 0.025, 0.1, 2.0)
-BASELINES_M = (0.012, 0.06, 0.1205, 0.24)
-"""The benchmarked baselines of a stereo camera.  The smallest baseline is a tenth of the usual
-baseline and gives nearly parallel rays."""
-
-MAX_NOISE_PX = 0.1
-"""The maximum standard deviation of a marker's centre for which the methods may be used."""
-
-
-def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
-    """Yield a trial for each pixel noise, baseline and slab of the box that the finger can reach.
-
-    The points of a trial are random in one of three slabs of increasing height.  The scene's
-    baseline replaces the nearest element of BASELINES_M.  Trials in the methods' range have at
-    least this baseline, and at most the noise MAX_NOISE_PX.  Trials in the scene's range have
-    exactly the scene's baseline, and at most the noise that the scene's tolerance permits.
-    """
-    low, high = scene.finger.volume_min_m, scene.finger.volume_max_m
-    own_m = float(np.linalg.norm(scene.camera.right_from_left[:3, 3]))
-    nearest_m = min(BASELINES_M, key=lambda baseline_m: abs(baseline_m - own_m))
-    allowed_px = max(min(NOISES_PX), _marker_tolerance_px(scene))
-    baselines_m = (own_m if each_m == nearest_m else each_m for each_m in BASELINES_M)
-    for baseline_m in baselines_m:
-        changed = scene.camera.right_from_left.copy()
-        changed[:3, 3] *= baseline_m / own_m
-        geometry = StereoGeometry.of(scene.camera.model_copy(update={"right_from_left": changed}))
-        for slab in range(3):
-            random = np.random.default_rng(slab)
-            thickness_m = (high[2] - low[2]) / 3
-            corner = np.array([low[0], low[1], low[2] + slab * thickness_m])
-            size = np.array([high[0] - low[0], high[1] - low[1], thickness_m])
-            truth = corner + size * random.random((CASE_POINTS, 3))
-            depth_m = float(rigid.apply(geometry.left_from_world, truth)[:, 2].mean())
-            pixels = geometry.project(truth)
-            for noise_px in NOISES_PX:
-                seen = [view + noise_px * random.standard_normal(view.shape) for view in pixels]
-                case: Case = {
-                    "depth_mm": round(1e3 * depth_m),
-                    "noise_px": noise_px,
-                    "baseline_mm": round(1e3 * baseline_m, 2),
-                }
-                in_range = baseline_m >= own_m and noise_px <= MAX_NOISE_PX
-                in_scene = baseline_m == own_m and noise_px <= allowed_px
-                for name in TRIANGULATION_METHODS:
-                    yield _triangulation_trial(
-                        name,
-                        case,
-                        geometry.normalize(*seen),
-                        geometry,
-                        truth,
-                        in_range=in_range,
-                        in_scene=in_scene,
-                    )
-
-
-def _triangulation_trial(
-    name: str,
-    case: Case,
-    seen: tuple[Floats, Floats],
-    geometry: StereoGeometry,
-    truth: Floats,
-    *,
-    in_range: bool,
-    in_scene: bool,
-) -> Trial:
-    method, rig, (left, right) = TRIANGULATION_METHODS[name], geometry.right_from_left, seen
-
-    def error_mm(_: Floats) -> Interval:
-        """Return the root mean square error, mm.
-
-        The error of a point that is not found is set to its depth.
-        """
-        points = rigid.apply(geometry.world_from_left, method(left, right, rig))
-        away = np.linalg.norm(points - truth, axis=1)
-        depth = rigid.apply(geometry.left_from_world, truth)[:, 2]
-        lost = ~np.isfinite(away) | (away > depth)
-        return estimate_rms(1e3 * np.where(lost, depth, away))
-
-    return Trial(
-        method=name,
-        case=case,
-        run=lambda: method(left[:1], right[:1], rig),
-        error=error_mm,
-        in_range=in_range,
-        in_scene=in_scene,
-    )
-
-
-TRIANGULATION = Family(
-    name="triangulation",
-    unit="mm",
-    reference="true points over the finger's volume",
-    methods=tuple(TRIANGULATION_METHODS),
-    trials=_triangulation_trials,
-    tolerance=lambda scene: 1e3 * scene.tolerances.fingertip_m,
-)
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 
 MARKER_RADIUS_M = 0.003
 MARKER_IMAGES = 40

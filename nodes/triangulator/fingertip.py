@@ -33,7 +33,6 @@ from flexsheet.nodes.triangulator.tracking import Gate
 from flexsheet.nodes.triangulator.triangulation import (
     ClosestApproach,
     StereoGeometry,
-    Triangulate,
     TriangulatedPoint,
     measure,
     project_with_jacobian,
@@ -93,7 +92,7 @@ class DetectorConfig:
     """The settings of the detection, refinement and triangulation of markers.
 
     blob_filter: criteria for a blob that may be the marker.
-    refine, triangulate: functions of the selected methods.
+    refine: function of the selected marker method.
     max_reprojection_px: maximum reprojection error of a pair.
     noise_px: standard deviation of a marker's centre; None uses the estimate of `refine`.
     marker_radius_m: true radius of the marker.
@@ -103,7 +102,6 @@ class DetectorConfig:
 
     blob_filter: BlobFilter
     refine: Refine
-    triangulate: Triangulate
     max_reprojection_px: float
     noise_px: float | None = None
     marker_radius_m: float = 0.003
@@ -563,7 +561,6 @@ def _triangulate(
         markers[1].centre + inputs.origins[1],
         covariance=left,
         right_covariance=right,
-        method=inputs.config.triangulate,
     )
 
 

@@ -48,7 +48,6 @@ from flexsheet.nodes.triangulator.tracking import (
     make_horizons_s,
 )
 from flexsheet.nodes.triangulator.triangulation import (
-    TRIANGULATION_METHODS,
     StereoGeometry,
     TriangulatedPoint,
     check_images,
@@ -114,9 +113,8 @@ class Triangulator(Node):
         )
         self.reasons: Counter[FingertipReason] = Counter()
         marker = resolve_method(p.marker, scene.methods.marker, "subpixel_fit")
-        triangulation = resolve_method(p.triangulation, scene.methods.triangulation, "dlt")
         tracking = resolve_method(p.tracking, scene.methods.tracking, "adaptive")
-        self.methods = f"{marker}, {triangulation}, {tracking}"
+        self.methods = f"{marker}, {tracking}"
         self.filter = TRACKING_METHODS[tracking](scene.finger.max_speed_m_per_s)
         self.config = DetectorConfig(
             blob_filter=BlobFilter(
@@ -126,7 +124,6 @@ class Triangulator(Node):
                 window_half_px=p.window_half_px,
             ),
             refine=MARKER_METHODS[marker],
-            triangulate=TRIANGULATION_METHODS[triangulation],
             noise_px=p.marker_noise_px,
             marker_radius_m=p.marker_radius_m,
             max_reprojection_px=p.max_reprojection_px,

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from flexsheet.messages.methods import MarkerMethod, TrackingMethod, TriangulationMethod
+from flexsheet.messages.methods import MarkerMethod, TrackingMethod
 from flexsheet.messages.scene import Finite, Positive
 from flexsheet.nodes.node import NodeParameters
 from flexsheet.nodes.parameter_marks import CameraCalibrationFile, MarkerCalibrationFile
@@ -29,9 +29,6 @@ class TriangulatorParameters(NodeParameters):
         default="auto",
         description="method that refines the marker's centre; auto: the scene's method, else "
         "subpixel_fit",
-    )
-    triangulation: TriangulationMethod | Literal["auto"] = Field(
-        default="auto", description="triangulation method; auto: the scene's method, else dlt"
     )
     marker_noise_px: Positive | None = Field(
         default=None,

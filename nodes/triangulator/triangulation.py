@@ -8,7 +8,6 @@ rays these contain infinite or NaN elements, which the caller must reject.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -20,8 +19,6 @@ from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.messages.types import StereoPair
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import camera, rigid
-
-Triangulate = Callable[[Floats, Floats, Floats], Floats]
 
 NEWTON_STEPS = 12
 MIN_DISTORTION_SLOPE = 0.05
@@ -179,9 +176,6 @@ def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
         return np.asarray(homogeneous[:, :3] / homogeneous[:, 3:])
 
 
-TRIANGULATION_METHODS: dict[str, Triangulate] = {"dlt": dlt}
-
-
 def project_with_jacobian(
     point: Floats, matrix: Floats, distortion: Floats
 ) -> tuple[Floats, Floats]:
@@ -278,11 +272,11 @@ def measure(
     *,
     covariance: Floats,
     right_covariance: Floats | None = None,
-    method: Triangulate = dlt,
 ) -> TriangulatedPoint | None:
     """Triangulate a marker from its pixels (2,) in both views, with covariances (2, 2) px^2.
 
-    covariance, right_covariance: of the left and of the right pixel; None: both are equal.
+    covariance: covariance of the left pixel, px^2.  right_covariance: covariance of the right pixel,
+    px^2; None: equal to that of the left pixel.
     Return None if the point is not in front of both cameras, or if a pixel is not finite or outside
     the range of the lens model.  Both views have equal weights.  The covariances are therefore
     propagated by (J^T J)^-1 J^T, with the Jacobian J of the four pixel coordinates with respect to
@@ -293,7 +287,7 @@ def measure(
     if left is None or right is None:
         return None
     rig = geometry.right_from_left
-    point = method(np.array([left]), np.array([right]), rig)[0]
+    point = dlt(np.array([left]), np.array([right]), rig)[0]
     in_right = rig[:3, :3] @ point + rig[:3, 3]
     if not (0.0 < point[2] < MAX_DISTANCE_M and 0.0 < in_right[2] < MAX_DISTANCE_M):
         return None
