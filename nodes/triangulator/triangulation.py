@@ -275,8 +275,9 @@ def measure(
 ) -> TriangulatedPoint | None:
     """Triangulate a marker from its pixels (2,) in both views, with covariances (2, 2) px^2.
 
-    covariance: covariance of the left pixel, px^2.  right_covariance: covariance of the right pixel,
-    px^2; None: equal to that of the left pixel.
+    covariance: covariance of the left pixel.  right_covariance: covariance of the right pixel;
+    None: equal to that of the left pixel.
+
     Return None if the point is not in front of both cameras, or if a pixel is not finite or outside
     the range of the lens model.  Both views have equal weights.  The covariances are therefore
     propagated by (J^T J)^-1 J^T, with the Jacobian J of the four pixel coordinates with respect to
