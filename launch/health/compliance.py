@@ -43,10 +43,11 @@ from flexsheet.nodes.planner.sheet_force import make_force_model
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 FINGERTIP_AGE_S = 0.012
-"""Age of a fingertip when it is published: half an exposure, the read-out and the computation."""
+"""The age of a fingertip when it is published: half an exposure, the read-out and the computation.
+"""
 
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Push depths in the report, as fractions of the maximum push depth."""
+"""The push depths in the report, as fractions of the maximum push depth."""
 
 
 def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
@@ -89,7 +90,7 @@ def compute_compliance(
 
 
 class LoopRisk(StrEnum):
-    """Risk that the feedback loop of sheet and hand is unstable or renders the force wrongly.
+    """The risk that the feedback loop of sheet and hand is unstable or renders the force wrongly.
 
     OSCILLATION: a hand of low damping can oscillate, since the sheet moves away too late.
     DELAY: the delay limits the stable offset of the sheet too much to render the object's force.
@@ -103,7 +104,7 @@ class LoopRisk(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopFinding:
-    """Risk of the feedback loop of sheet and hand, as found by `find_loop_risk`.
+    """The risk of the feedback loop of sheet and hand, as found by `find_loop_risk`.
 
     delay_s: time from a measured depth until the sheet has moved accordingly. error_ratio: largest
     relative error of the rendered force within the stable bounds.

@@ -27,12 +27,13 @@ FAST_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_coun
 MIN_FREE_DISK_BYTES = 2 << 30
 MIN_CORES = 2
 PROBE_S, PROBE_PERIOD_S, PROBE_RUN_S = 1.0, 1.0 / 140.0, 0.001
-"""Duration of the check of the load; cycle period and processor time per cycle of an arm bridge."""
+"""The duration of the check of the load; cycle period and processor time per cycle of an arm
+bridge."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one check; `what` is the finding, `remedy` is empty if the check passed."""
+    """The result of one check; `what` is the finding, `remedy` is empty if the check passed."""
 
     check: str
     state: Literal["ok", "warning", "failed"]

@@ -41,7 +41,7 @@ from flexsheet.nodes.arm_bridge.link_drivers import TCP_DRIVERS
 
 State = Literal["ok", "warning", "failed", "not asked"]
 RATE_TOLERANCE_RATIO = 0.1
-"""Relative tolerance of message rates, which are measured over one second."""
+"""The relative tolerance of message rates, which are measured over one second."""
 
 MIN_FREE_MEMORY_BYTES = 256 << 20
 CONTROLLER_S = 2.0
@@ -50,7 +50,9 @@ MAX_NAMES_SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class HostFinding:
-    """Result of one check of one host; `what`: the finding; `remedy`: empty if the check passed."""
+    """The result of one check of one host; `what`: the finding; `remedy`: empty if the check
+    passed.
+    """
 
     host: str
     check: str
@@ -77,7 +79,7 @@ NETWORK_FAULTS: dict[Reachability, tuple[str, str]] = {
         "open the TCP ports {first}-{last} of {address} for the other hosts in the firewall",
     ),
 }
-"""Finding and remedy if the host cannot be reached."""
+"""The finding and remedy if the host cannot be reached."""
 
 LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.CLOSED: (
@@ -117,10 +119,10 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
         "correct the key of this computer first; see the findings of {here}",
     ),
 }
-"""Check, finding and remedy if the host is on, but its launcher does not report."""
+"""The check, finding and remedy if the host is on, but its launcher does not report."""
 
 SELF_CHECK = "self-check"
-"""Name of the check that lists the causes of error which the nodes of a host suspect."""
+"""The name of the check that lists the causes of error which the nodes of a host suspect."""
 
 
 def evaluate_probes(
@@ -158,7 +160,7 @@ REQUIRED_FOR_CHECKS = {
     "touch_point_world_m": "the marker on the finger",
     "sheet_calibration": "the sheet's modulus (`flexsheet calibrate sheet`)",
 }
-"""Name of each optional check, by the parameter that enables it."""
+"""The name of each optional check, by the parameter that enables it."""
 
 
 def check_apparatus(
@@ -416,7 +418,7 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
         f"check OpenGL on that host: flexsheet doctor; {OPENGL_REMEDY}",
     ),
 }
-"""Name of the check and remedy for nodes that must publish, by role."""
+"""The name of the check and remedy for nodes that must publish, by role."""
 
 
 def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[HostFinding]:

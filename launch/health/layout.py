@@ -46,30 +46,31 @@ from flexsheet.nodes.planner.rolling import (
 Progress = Callable[[str], None]
 
 TILTS, SIDE_TILTS, DEPTHS = 17, 5, 6
-"""Number of samples over the vertical tilts, the horizontal tilts and the depths."""
+"""The number of samples over the vertical tilts, the horizontal tilts and the depths."""
 
 VIEW_DISTANCE_M = 1.0
 DUPLICATE_DISTANCE_M, DUPLICATE_NORMAL = 0.004, 0.02
 """Two contacts are duplicates if the differences of positions and of normals are below these."""
 
 ROLL_STARTS = 24
-"""Number of contacts from which the sheet is rolled to find other contacts on the sheet."""
+"""The number of contacts from which the sheet is rolled to find other contacts on the sheet."""
 
 CLAMP_MARGIN_M = 0.03
-"""Minimum distance between the finger and a clamped edge of the sheet."""
+"""The minimum distance between the finger and a clamped edge of the sheet."""
 
 OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
-"""Offsets along each world axis at which a base position is tried as a remedy."""
+"""The offsets along each world axis at which a base position is tried as a remedy."""
 
 REACHED_COLOR = "#dcefdc"
 
 THINNED_COUNT = 600
-"""Number of samples that are checked first; only a base that reaches them gets a complete check."""
+"""The number of samples that are checked first; only a base that reaches them gets a complete
+check."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContactSample:
-    """Contact of the finger with the object, and a pose of the sheet there without push.
+    """A contact of the finger with the object, and a pose of the sheet there without push.
 
     tilt_rad: angle between the surface normal and the direction towards the user, positive upwards.
     world_from_sheet: (4, 4). twists_world: velocities (k, 6) of the sheet when the finger strokes
@@ -84,7 +85,7 @@ class ContactSample:
 
 @dataclass(frozen=True, slots=True)
 class LayoutSamples:
-    """Sheet poses that the arms must reach, with tilt (n,), push depth (n,) and contact (n, 3)."""
+    """The sheet poses that the arms must reach, with tilt (n,), push depth (n,) and contact (n, 3)."""
 
     poses: SheetPoses
     tilt_rad: Floats
@@ -94,7 +95,7 @@ class LayoutSamples:
 
 @dataclass(frozen=True, slots=True)
 class LayoutRemedy:
-    """Change that makes the whole range reachable, as text and as values."""
+    """A change that makes the whole range reachable, as text and as values."""
 
     what: str
     values: dict[str, Any]
@@ -102,7 +103,7 @@ class LayoutRemedy:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Result of the check: the reach of each arm, blocked paths between samples, and remedies."""
+    """The result of the check: the reach of each arm, blocked paths between samples, and remedies."""
 
     scene: Scene
     samples: LayoutSamples
@@ -515,7 +516,7 @@ def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True)
 class _TiltDepthGrid:
-    """Grid of cells over tilt and depth.
+    """A grid of cells over tilt and depth.
 
     rows, columns: cell indices (n,) of the samples. frame: plot options.
     """

@@ -9,7 +9,7 @@ import subprocess
 import sys
 
 OPENGL_PACKAGES = ("libegl1", "libgl1-mesa-dri")
-"""Debian packages that provide headless OpenGL."""
+"""The Debian packages that provide headless OpenGL."""
 
 OPENGL_REMEDY = f"on Debian: sudo apt-get install -y {' '.join(OPENGL_PACKAGES)}"
 

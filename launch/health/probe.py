@@ -30,19 +30,20 @@ from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
 
 CONNECT_S = 4.0
-"""Time limit of a connection; the kernel needs 3 s to report that no host has the address."""
+"""The time limit of a connection; the kernel needs 3 s to report that no host has the address."""
 
 HANDSHAKE_S = 3.0
 MIN_LISTEN_S = 1.2
-"""Minimum listening time; nodes publish the message rates of the last second once per second."""
+"""The minimum listening time; nodes publish the message rates of the last second once per second.
+"""
 
 POLL_PERIOD_S = 0.02
 SSH_PORT = 22
-"""Port whose reply, open or closed, shows that a host is on."""
+"""The port whose reply, open or closed, shows that a host is on."""
 
 
 class Reachability(StrEnum):
-    """Outcome of an attempt to connect to a host's launcher."""
+    """The outcome of an attempt to connect to a host's launcher."""
 
     RESPONDING = "responding"
     LOCAL = "local"
@@ -76,7 +77,7 @@ HANDSHAKES: dict[int, Reachability] = {
 
 @dataclass(slots=True)
 class HostProbe:
-    """Messages that one host published, and problems while receiving them.
+    """The messages that one host published, and problems while receiving them.
 
     refused: messages that were not accepted. failed_handshakes: connections whose key became
     invalid after an earlier connection with a valid key.

@@ -28,18 +28,18 @@ Floats = NDArray[np.float64]
 JOINTS = 6
 MAX_BYTES = 4 << 20
 CONTINUOUS_RANGE_RAD = 2.0 * np.pi
-"""Assumed range (+-) of a joint without limits: two revolutions, to protect the cables."""
+"""The assumed range (+-) of a joint without limits: two revolutions, to protect the cables."""
 
 
 class UrdfError(FlexsheetError, ValueError):
-    """Raised for a URDF file that does not describe a usable arm."""
+    """The error that is raised for a URDF file that does not describe a usable arm."""
 
     code = "urdf"
     remedy = "Correct the URDF file or the links `base` and `tip` of the scene file."
 
 
 class UrdfArm(LimitedModel):
-    """Model of an arm in a scene file that refers to a URDF file."""
+    """A model of an arm in a scene file that refers to a URDF file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

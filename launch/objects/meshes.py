@@ -35,23 +35,24 @@ from flexsheet.nodes.models.shapes.triangles import (
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
-"""Shape names that scene files may contain. There a mesh is given as a file, not as arrays."""
+"""The shape names that scene files may contain. There a mesh is given as a file, not as arrays."""
 SUFFIXES = (".obj", ".stl")
 MAX_BYTES = 64 << 20
 MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0
-"""Plausible extents of an object. Other extents probably result from a wrong unit."""
+"""The plausible extents of an object. Other extents probably result from a wrong unit."""
 MAX_COORDINATE = 1e9
-"""Maximum coordinate in a mesh file, in its unit. Larger ones cause overflows in computations."""
+"""The maximum coordinate in a mesh file, in its unit. Larger ones cause overflows in computations.
+"""
 
 MAX_CUTTING_RATIO = 0.01
-"""Maximum ratio of the number of intersecting triangle pairs to the number of triangles.
+"""The maximum ratio of the number of intersecting triangle pairs to the number of triangles.
 
 Up to this ratio, the smooth surface bridges the intersections. A mesh with more is not one solid.
 """
 
 
 class MeshFile(LimitedModel):
-    """Geometry of an object in a scene file that refers to a mesh file."""
+    """The geometry of an object in a scene file that refers to a mesh file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -23,11 +23,11 @@ APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_SIDE_PX = 2048
-"""Maximum width and height of a texture image. The projector has fewer pixels."""
+"""The maximum width and height of a texture image. The projector has fewer pixels."""
 
 
 class TextureError(FlexsheetError, ValueError):
-    """Raised if a file cannot be used as the texture of an object."""
+    """The error that is raised if a file cannot be used as the texture of an object."""
 
     code = "texture"
     remedy = "Use a PNG or JPEG file, and a mesh with texture coordinates."

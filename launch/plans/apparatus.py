@@ -34,14 +34,14 @@ TOPIC = "twin/apparatus"
 _SEED = re.compile(r"seed:(?P<seed>\d{1,18})(?P<words>(?:,[a-z]+)*)")
 CALIBRATED = "calibrated"
 COMMISSION_STATE = "commission.json"
-"""File next to a commissioned scene that names the scene before commissioning."""
+"""The file next to a commissioned scene that names the scene before commissioning."""
 
 PROFILES = tuple(one.value for one in Profile)
 
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """Random sample of an apparatus, parsed from `seed:N[,modern|paper][,calibrated]`."""
+    """A random sample of an apparatus, parsed from `seed:N[,modern|paper][,calibrated]`."""
 
     seed: int
     profile: Profile

@@ -54,7 +54,7 @@ M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
 MAX_DEPTH = 50
 MAX_VALUES = 5000
-"""Maximum number of values in a file. The parser needs about one second for so many values.
+"""The maximum number of values in a file. The parser needs about one second for so many values.
 
 The largest shipped file contains 300.
 """
@@ -74,13 +74,15 @@ SCALARS: tuple[tuple[type, type], ...] = (
     (ScalarInt, int),
     (ScalarString, str),
 )
-"""Pairs of a YAML parser type, which preserves formatting, and the Python type that replaces it."""
+"""The pairs of a YAML parser type, which preserves formatting, and the Python type that replaces
+it."""
 
 MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
-"""Types of pydantic errors whose message names a Python class where the file needs a mapping."""
+"""The types of pydantic errors whose message names a Python class where the file needs a mapping.
+"""
 
 Key = tuple[str | int, ...]
-"""Path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
+"""The path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,7 @@ class Problem:
 
 
 class BadInputError(FlexsheetError, ValueError):
-    """Input that cannot be used; `problems` contains all errors."""
+    """An input that cannot be used; `problems` contains all errors."""
 
     code = "bad-input"
     exit_code = 2
@@ -119,7 +121,7 @@ class BadInputError(FlexsheetError, ValueError):
 
 @dataclass(slots=True)
 class Document:
-    """Values of a YAML file, with the line of every key and the origin of overridden values."""
+    """The values of a YAML file, with the line of every key and the origin of overridden values."""
 
     path: Path
     values: dict[str, Any]
@@ -128,7 +130,7 @@ class Document:
     overrides: dict[Key, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     extended: dict[Key, Path] = field(default_factory=dict)
-    """Source file of each key that was inherited from another file by `extend`."""
+    """The source file of each key that was inherited from another file by `extend`."""
 
     def where(self, key: Key) -> str:
         """Return the location of `key` for error texts: "file:line", or the overriding option.

@@ -11,7 +11,7 @@ from flexsheet.messages.topics import TOPICS
 Position = tuple[float, float]
 
 WIDTH, HEIGHT = 132, 34
-"""Width and height of the box of a node, px."""
+"""The width and height of the box of a node, px."""
 
 STYLE = """
   text { font: 13px system-ui, sans-serif; fill: #1f2328; text-anchor: middle }
@@ -36,7 +36,7 @@ STYLE = """
 
 @dataclass(frozen=True)
 class Arrow:
-    """Arrow for the topics from one node to another, or for a connection to a device.
+    """An arrow for the topics from one node to another, or for a connection to a device.
 
     path: points of the SVG polyline. label_at: position of the label, px. wire: label of a device
     connection; empty for topics.
@@ -53,7 +53,7 @@ class Arrow:
 
 @dataclass(frozen=True)
 class GraphDrawing:
-    """Geometry of the drawing of a graph, px.
+    """The geometry of the drawing of a graph, px.
 
     hosts: left, top, width and height of each host's frame. boxes, devices: centre of the box of
     each node and device.
@@ -107,7 +107,7 @@ def svg(drawing: GraphDrawing) -> str:
 
 
 MARGIN, COLUMN, ROW, HOST_GAP = 30, 230, 75, 45
-"""Outer margin, column and row pitch, and gap between hosts in an automatic layout, px."""
+"""The outer margin, column and row pitch, and gap between hosts in an automatic layout, px."""
 
 
 def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:

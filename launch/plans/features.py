@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Feature(StrEnum):
-    """Part of the display that can be omitted in a run: the projected image or rendered force."""
+    """A part of the display that can be omitted in a run: the projected image or rendered force."""
 
     IMAGE = "image"
     FORCE = "force"

@@ -21,28 +21,30 @@ from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import find_role
 
 RECORDER_NICE = 5
-"""Default niceness of the recorder.
+"""The default niceness of the recorder.
 
 Its input messages wait in queues, so its delay affects no other node.
 """
 
 CONSOLE_NICE = 10
-"""Niceness of the console that --console adds; it must not delay the nodes that it shows."""
+"""The niceness of the console that --console adds; it must not delay the nodes that it shows."""
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
-"""Bag file that is recorded from the console: strftime pattern, relative to the working folder."""
+"""The bag file that is recorded from the console: strftime pattern, relative to the working folder.
+"""
 
 MERGED_LEVELS = 4
-"""Depth to which a launch file is merged with the file it extends: nodes.NAME.parameters.KEY."""
+"""The depth to which a launch file is merged with the file it extends: nodes.NAME.parameters.KEY.
+"""
 
 SCENE_KEY_SET = frozenset({"object", "sheet", "arms", "camera", "working_range"})
-"""Keys by which a scene file is recognized, because launch files do not have them."""
+"""The keys by which a scene file is recognized, because launch files do not have them."""
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=32)]
 
 
 class HostSpec(StrictModel):
-    """Settings of one host, which is a computer of the graph."""
+    """The settings of one host, which is a computer of the graph."""
 
     address: str = Field(description="IP address on which the host's nodes listen")
     key: str | None = Field(
@@ -56,7 +58,7 @@ class HostSpec(StrictModel):
 
 
 class NodeSpec(StrictModel):
-    """Settings of one node in a launch file."""
+    """The settings of one node in a launch file."""
 
     type: str = Field(description='node type: a shipped one, or "module:Class"')
     host: str = MAIN
@@ -95,7 +97,7 @@ class NodeSpec(StrictModel):
 
 
 class ClocksSpec(StrictModel):
-    """Required accuracy of the clock comparison between hosts; see docs/clocks.md."""
+    """The required accuracy of the clock comparison between hosts; see docs/clocks.md."""
 
     max_offset_uncertainty_s: float = Field(
         default=0.005,
@@ -113,7 +115,7 @@ class ClocksSpec(StrictModel):
 
 
 class LaunchFile(StrictModel):
-    """Content of a launch file: its keys with their types and defaults."""
+    """The content of a launch file: its keys with their types and defaults."""
 
     extends: str | None = Field(
         default=None,

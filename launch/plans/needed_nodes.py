@@ -97,7 +97,7 @@ EXTERNAL_TOPICS = frozenset(name for name, topic in TOPICS.items() if topic.many
     "scene",
     "twin/apparatus",
 }
-"""Topics that may be written by the launcher or by command-line tools."""
+"""The topics that may be written by the launcher or by command-line tools."""
 
 
 def _required_inputs(entry: NodeEntry) -> set[str]:

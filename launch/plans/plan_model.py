@@ -20,13 +20,15 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole, OmissionReason, node_class
 
 MAIN = "main"
-"""Name of the host on which the launcher's topics, the recorder and command-line tools run."""
+"""The name of the host on which the launcher's topics, the recorder and command-line tools run."""
 
 LAUNCHER, TOOLS = "launch", "tools"
-"""Names of the topic writers that are not nodes: the launcher; command-line tools, experiments."""
+"""The names of the topic writers that are not nodes: the launcher; command-line tools, experiments.
+"""
 
 RUN_DIRECTORY = "@run"
-"""Placeholder in endpoints and parameters; the start of a run replaces it by the run's folder."""
+"""The placeholder in endpoints and parameters; the start of a run replaces it by the run's folder.
+"""
 
 
 ROLES_OF_TYPES = {
@@ -38,28 +40,28 @@ ROLES_OF_TYPES = {
     "renderer": NodeRole.RENDERER,
     "twin_finger": NodeRole.FINGER_SIMULATOR,
 }
-"""Node role by node type, for plans in older bags, which contain no roles."""
+"""The node role by node type, for plans in older bags, which contain no roles."""
 
 
 OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
-"""Parameters with a calibration file, for plans in older bags, which list no calibrations."""
+"""The parameters with a calibration file, for plans in older bags, which list no calibrations."""
 
 
 class ArmingMode(StrEnum):
-    """Value of the arm bridge parameter `arming`: who permits the arm to move."""
+    """A value of the arm bridge parameter `arming`: who permits the arm to move."""
 
     MANUAL = "manual"
     AUTO = "auto"
 
 
 class StrictModel(LimitedModel):
-    """Base of immutable models that reject unknown keys."""
+    """A base of immutable models that reject unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class RestartSpec(StrictModel):
-    """Restart policy that is applied when the process of a node exits.
+    """A restart policy that is applied when the process of a node exits.
 
     The first restart in the last `window_s` is immediate. The delay before the second one is
     `delay_s` and doubles with each further one, up to `max_delay_s`. If the process exits after
@@ -74,7 +76,7 @@ class RestartSpec(StrictModel):
 
 
 class Writer(StrictModel):
-    """Writer of a topic, with an ipc endpoint for readers on its host and a tcp one for others."""
+    """A writer of a topic, with an ipc endpoint for readers on its host and a tcp one for others."""
 
     name: str
     host: str
@@ -101,7 +103,7 @@ class Writer(StrictModel):
 
 
 class ResolvedPort(StrictModel):
-    """Port of a node with its topic; an output binds the endpoints, an input connects to them."""
+    """A port of a node with its topic; an output binds the endpoints, an input connects to them."""
 
     port: str
     topic: str
@@ -109,7 +111,7 @@ class ResolvedPort(StrictModel):
 
 
 class ResolvedNode(StrictModel):
-    """Complete settings with which a node is started."""
+    """The complete settings with which a node is started."""
 
     name: str
     type: str
@@ -167,7 +169,7 @@ class ResolvedNode(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class ResolvedProcess:
-    """Process with its nodes, which have equal niceness, restart policy and heartbeat timeout."""
+    """A process with its nodes, which have equal niceness, restart policy and heartbeat timeout."""
 
     name: str
     nodes: tuple[ResolvedNode, ...]
@@ -183,7 +185,7 @@ class ResolvedProcess:
 
 
 class OmittedNode(StrictModel):
-    """Node of the launch file that is not started, with the reason."""
+    """A node of the launch file that is not started, with the reason."""
 
     name: str
     type: str
@@ -192,7 +194,7 @@ class OmittedNode(StrictModel):
 
 
 class ResolvedGraph(StrictModel):
-    """Resolved launch file: nodes and hosts with all defaults, and the endpoints of all topics."""
+    """A resolved launch file: nodes and hosts with all defaults, and the endpoints of all topics."""
 
     launch_file: str
     launch_text: str

@@ -11,7 +11,7 @@ from flexsheet.nodes.node import find_role
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 COMMON_KEYS = ("host", "nice", "restart", "liveness_s")
-"""Keys of a node that must be equal for all nodes in a process."""
+"""The keys of a node that must be equal for all nodes in a process."""
 
 
 def check_processes(entries: list[NodeEntry], document: Document) -> None:

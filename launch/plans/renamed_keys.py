@@ -39,20 +39,20 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
     },
     "twin_eye": {"again_after_s": "min_interval_s", "most_waiting": "max_queue"},
 }
-"""New name by former name of node parameters, for each node type."""
+"""The new name by former name of node parameters, for each node type."""
 
 SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
-"""New key by former key of scene files."""
+"""The new key by former key of scene files."""
 
 REMOVED_KEYS = frozenset({"kinematics"})
-"""Keys of scenes and node parameters that were removed, because only one value was left."""
+"""The keys of scenes and node parameters that were removed, because only one value was left."""
 
 LAUNCH_KEYS: Mapping[str, str] = {
     "from_tools": "external_topics",
     "also": "include",
     "waits": "start_paused",
 }
-"""New key by former key of launch files, including the keys below `record`."""
+"""The new key by former key of launch files, including the keys below `record`."""
 
 VALUES: Mapping[str, Mapping[str, str]] = {
     "arming": {"by_command": "manual", "by_itself": "auto"},
@@ -71,4 +71,4 @@ VALUES: Mapping[str, Mapping[str, str]] = {
     "driver": {"mxt_pose": "mxt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }
-"""New value by former value of a key, for names of methods, patterns and modes."""
+"""The new value by former value of a key, for names of methods, patterns and modes."""

@@ -31,17 +31,17 @@ from flexsheet.nodes.node import (
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")
-"""Names that nodes must not have, because files in the run's directory have them."""
+"""The names that nodes must not have, because files in the run's directory have them."""
 
 _PARAMETER_SECTIONS: tuple[Key, ...] = (("record",), ("clocks",))
-"""Keys of a launch file that contain the parameters of a node directly.
+"""The keys of a launch file that contain the parameters of a node directly.
 
 Other nodes have their parameters below the key `parameters`.
 """
 
 
 class NodeEntry:
-    """Node of a launch file that is being resolved.
+    """A node of a launch file that is being resolved.
 
     type, parameters: class and parameters of the node; None until they are known. ports: connected
     ports with their topics. unconnected: unconnected ports with the topics they would have.

@@ -14,13 +14,14 @@ from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.topics import TOPICS
 
 WRITABLE_ON_ALL_HOSTS = ("estop",)
-"""Topics that tools on every host may write, so that the arms can be stopped from each host."""
+"""The topics that tools on every host may write, so that the arms can be stopped from each host."""
 
 LAUNCHER_TOPICS = ("host", "estop")
-"""Topics that the launcher on every host publishes."""
+"""The topics that the launcher on every host publishes."""
 
 FIRST_PORT, PORT_COUNT = 20_000, 10_000
-"""Range of the TCP ports of topics, below Linux's ports of outgoing connections (from 32768)."""
+"""The range of the TCP ports of topics, below Linux's ports of outgoing connections (from 32768).
+"""
 
 
 def list_writers(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 PARENT_VARIABLE = "FLEXSHEET_PARENT"
 LIFELINE_VARIABLE = "FLEXSHEET_LIFELINE"
-"""Environment variable with the file descriptor of the lifeline.
+"""The environment variable with the file descriptor of the lifeline.
 
 The lifeline is a pipe to which nothing is written. Reading from it ends when the launcher exits.
 """
@@ -20,12 +20,13 @@ The lifeline is a pipe to which nothing is written. Reading from it ends when th
 NICE_VARIABLE = "FLEXSHEET_NICE"
 
 AUTOGROUP = Path("/proc/self/autogroup")
-"""File with the niceness of a whole session, by which Linux shares the processor among sessions.
+"""The file with the niceness of a whole session, by which Linux shares the processor among
+sessions.
 
 Each node is a separate session, so the niceness of its process alone has little effect."""
 
 AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
-"""Number of attempts to write AUTOGROUP, and the time between them.
+"""The number of attempts to write AUTOGROUP, and the time between them.
 
 Without privileges, the kernel accepts only one write per 0.1 s from all processes together.
 """

@@ -9,10 +9,10 @@ from pathlib import Path
 
 COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 SOURCE_PATHS = ("messages", "nodes", "launch", "flexsheet", "pyproject.toml")
-"""Paths in the repository that contain all the code of a run."""
+"""The paths in the repository that contain all the code of a run."""
 
 SOURCE_SUFFIXES = {".py", ".glsl", ".css", ".js"}
-"""Suffixes of untracked files that count as a change of the code.
+"""The suffixes of untracked files that count as a change of the code.
 
 Others, such as new launch files, scenes and meshes, affect a run only if a launch file names them.
 """

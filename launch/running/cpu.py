@@ -18,11 +18,11 @@ from pathlib import Path
 from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
-"""Fraction of the time that a node waits for a core, above which the computer is overloaded."""
+"""The fraction of the time that a node waits for a core, above which the computer is overloaded."""
 
 WINDOW_S = 3.0
 BACKGROUND_NICE = 10
-"""Niceness from which a node waits by design, so that its waiting time is ignored."""
+"""The niceness from which a node waits by design, so that its waiting time is ignored."""
 
 MAX_PROGRAMS = 3
 MIN_CORES = 0.1
@@ -32,14 +32,14 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Waits:
-    """Sample of the total waiting time (s) of each process id, taken at `time_s`."""
+    """A sample of the total waiting time (s) of each process id, taken at `time_s`."""
 
     time_s: float
     waited_s: dict[int, float]
 
 
 class CpuWatch:
-    """Measurement of waiting and processor times over the last WINDOW_S.
+    """A measurement of waiting and processor times over the last WINDOW_S.
 
     Call `update` once a second. proc: folder of the kernel's counters. now_s: function that returns
     the time of the monotonic clock, s.

@@ -46,10 +46,11 @@ from flexsheet.nodes.stop_socket import StopSocket
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
 REASON_LENGTH = 1000
-"""Maximum number of characters of a reason, so that it fits into all messages that repeat it."""
+"""The maximum number of characters of a reason, so that it fits into all messages that repeat it.
+"""
 
 RESET_WITHIN_S = 5.0
-"""Time within which all arms must confirm the reset of an e-stop."""
+"""The time within which all arms must confirm the reset of an e-stop."""
 
 ARMS = ("arm_left", "arm_right")
 
@@ -60,7 +61,7 @@ Sources = Callable[[list[Source]], tuple[Source, ...]]
 
 
 class HostAgent:
-    """Part of the launcher that publishes the status of its host and latches e-stops.
+    """A part of the launcher that publishes the status of its host and latches e-stops.
 
     It works between `start` and `close`. endpoints, sources: functions that replace the placeholder
     of the run's directory. code: commit that `HostStatus` reports. run_directory: folder for the

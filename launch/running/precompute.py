@@ -20,7 +20,7 @@ from flexsheet.nodes.renderer import deflection_cache
 Progress = Callable[[str], None]
 
 REPORT_STEP_RATIO = 0.1
-"""Fraction of the total work after which progress is reported again."""
+"""The fraction of the total work after which progress is reported again."""
 
 
 class NoSoftBodyError(FlexsheetError, RuntimeError):

@@ -11,7 +11,7 @@ from flexsheet.launch.plans.plan_model import ResolvedNode
 
 MIN_NICE = -20
 CAP_SYS_NICE = 23
-"""Bit index of the Linux capability that permits any niceness."""
+"""The bit index of the Linux capability that permits any niceness."""
 
 
 def min_nice_step() -> int:

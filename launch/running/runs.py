@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from flexsheet.messages.bus import Source
 
 RUN_VARIABLE = "FLEXSHEET_RUN"
-"""Environment variable with the run's name, set in every process of the run."""
+"""The environment variable with the run's name, set in every process of the run."""
 
 ROOT_VARIABLE = "FLEXSHEET_RUNS"
-"""Environment variable that replaces the default folder of all runs."""
+"""The environment variable that replaces the default folder of all runs."""
 
 MAX_FINISHED_RUNS = 10
 ORPHAN_GRACE_S = 3.5

@@ -11,7 +11,7 @@ RUNNABLE = "R"
 
 @dataclass(frozen=True, slots=True)
 class ProcessorTime:
-    """Kernel counters of a process's main thread since its start.
+    """The kernel counters of a process's main thread since its start.
 
     run_s: time on a processor core. wait_s: time in which it was ready to run but had no core, up
     to the last time it ran. state: letter in /proc/PID/stat (R, S, D, T, ...).

@@ -37,7 +37,7 @@ TARGET_TOPIC = "sheet_target"
 
 
 class StopPath(StrEnum):
-    """Means by which an e-stop was sent: a socket, a topic, or a signal that kills a process."""
+    """The means by which an e-stop was sent: a socket, a topic, or a signal that kills a process."""
 
     LAUNCHER = "launcher"
     NODE = "node"
@@ -46,7 +46,7 @@ class StopPath(StrEnum):
 
 
 class StopOutcome(StrEnum):
-    """Outcome of an attempt to stop.
+    """The outcome of an attempt to stop.
 
     confirmed: the receiver has engaged the stop. silent: the stop was sent but not confirmed.
     absent: no process listens. published: the stop was sent on the topic, without confirmation.
@@ -104,7 +104,7 @@ def send_early(arguments: Sequence[str]) -> None:
 
 
 sent_early: list[list[StopAttempt]] = []
-"""Result of `send_early` for the command: empty, or one list of attempts."""
+"""The result of `send_early` for the command: empty, or one list of attempts."""
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:

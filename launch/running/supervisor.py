@@ -73,12 +73,13 @@ STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
 LIVENESS_PERIOD_S = 0.5
 STACK_DUMP_S = 0.5
-"""Time that a hanging node gets to write its call stacks to its log before it is killed."""
+"""The time that a hanging node gets to write its call stacks to its log before it is killed."""
 
 LOG_READ_BYTES = 65_536
 
 Report = Callable[[str, str], None]
-"""Function (node, line) that is called for each log line. The launcher's node name is "launch"."""
+"""The function (node, line) that is called for each log line. The launcher's node name is "launch".
+"""
 
 
 class NodeFailedError(FlexsheetError, RuntimeError):
@@ -92,7 +93,7 @@ class NodeFailedError(FlexsheetError, RuntimeError):
 
 
 class Child:
-    """Operating system process that runs one or more nodes, from its start to its exit."""
+    """An operating system process that runs one or more nodes, from its start to its exit."""
 
     def __init__(
         self,
@@ -261,7 +262,7 @@ class Child:
 
 
 class RunningGraph:
-    """Supervisor of the processes that run the nodes of a graph.
+    """A supervisor of the processes that run the nodes of a graph.
 
     host: start only the nodes assigned to this host; None starts all nodes on this computer.
     without: names of nodes that are not started. report: called with (node, line) for every log

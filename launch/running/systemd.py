@@ -30,7 +30,7 @@ def list_bags(plan: ResolvedGraph, host: str) -> Iterator[Path]:
 
 @dataclass(frozen=True, slots=True)
 class SystemFile:
-    """File to install: path, text and permission bits."""
+    """A file to install: path, text and permission bits."""
 
     path: Path
     text: str

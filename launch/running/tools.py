@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
-"""Time after which all readers have connected to a new writer; they retry every 0.5 s."""
+"""The time after which all readers have connected to a new writer; they retry every 0.5 s."""
 
 
 @dataclass(slots=True)
 class ToolCounts:
-    """Numbers of messages that the subscriber of a tool has lost or rejected."""
+    """The numbers of messages that the subscriber of a tool has lost or rejected."""
 
     dropped: int = 0
     gaps: int = 0
@@ -105,7 +105,7 @@ async def read_topic(
 
 
 class GraphWriter:
-    """Writer of topics for tools outside the running graph.  Requires a running event loop.
+    """A writer of topics for tools outside the running graph.  Requires a running event loop.
 
     Raises BadInputError for a topic that tools may not write, and BusError if another tool is
     writing it.

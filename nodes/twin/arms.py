@@ -41,7 +41,8 @@ Fault = Literal[
     "frozen",
     "lagging",
 ]
-"""Faults that a test can switch on in a simulated arm. MXT is the protocol of `mxt_controller.py`.
+"""The faults that a test can switch on in a simulated arm. MXT is the protocol of
+`mxt_controller.py`.
 
 silent: does not answer.
 slow: answers with the delay LATE_S.
@@ -61,7 +62,7 @@ logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 CONTROLLER_CYCLE_S = 0.0071
 
 JITTER_STREAM = 1
-"""Second element of the random seed for the jitter of cycles, which makes it independent of the
+"""The second element of the random seed for the jitter of cycles, which makes it independent of the
 noise of measured joints."""
 
 
@@ -93,7 +94,7 @@ def _skew(axis: Floats) -> Floats:
 
 
 class ArmMechanics:
-    """Geometry and limits of a simulated arm, from its model in the scene.
+    """The geometry and limits of a simulated arm, from its model in the scene.
 
     range_rad: lower and upper ends of the joints' ranges (6, 2).
     speed_rad_per_s, acceleration_rad_per_s2: maximum speeds and accelerations of the joints (6,).
@@ -179,7 +180,7 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 
 RV_1A_MECHANICS = ArmMechanics(RV_1A)
-"""Mechanics of the RV-1A, the default arm of a scene."""
+"""The mechanics of the RV-1A, the default arm of a scene."""
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
@@ -245,7 +246,7 @@ class Servo:
 
 
 class Controller:
-    """Simulated controller of one arm, which checks command blocks and answers with its status.
+    """A simulated controller of one arm, which checks command blocks and answers with its status.
 
     It rejects an invalid command (magic number, version, CRC, mode, sequence number) by a Modbus
     exception. In four cases it enters the fault state, in which it brakes and stops: joints out of
@@ -393,7 +394,7 @@ class Controller:
 
 
 class ArmServer:
-    """Modbus TCP server through which clients command a simulated controller."""
+    """A modbus TCP server through which clients command a simulated controller."""
 
     def __init__(
         self, controller: Controller, *, host: str, port: int, before: Callable[[], None]

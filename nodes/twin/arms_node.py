@@ -38,7 +38,7 @@ Loopback = Annotated[str, AfterValidator(check_loopback)]
 
 
 class TwinArmsParameters(SimulatorParameters):
-    """Parameters of the simulated arms; values that the apparatus states take precedence."""
+    """The parameters of the simulated arms; values that the apparatus states take precedence."""
 
     host: Loopback = "127.0.0.1"
     left_port: ListenPort = Field(

@@ -21,28 +21,31 @@ from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
 
 RAYS = 3
-"""Number of rays per pixel in each direction."""
+"""The number of rays per pixel in each direction."""
 
 PAPER_LEVEL = 175.0
 INK_LEVEL = 22.0
 ROOM_LEVEL = 45.0
 BORDER_SQUARES = 0.6
-"""Width of the white border around the squares, in squares."""
+"""The width of the white border around the squares, in squares."""
 
 TILTS_RAD = (0.0, 0.35, 0.6, 0.45, 0.25)
 HEIGHT_FRACTIONS = (0.95, 0.5, 0.75, 0.35, 0.6)
-"""Tilts of successive poses, and fractions of the image height that the untilted board fills."""
+"""The tilts of successive poses, and fractions of the image height that the untilted board fills.
+"""
 
 MARGIN_PX = 6.0
 MIN_CHARUCO_FRACTION = 0.6
-"""Minimum visible fraction of the corners of a ChArUco board; the image may cut off the others."""
+"""The minimum visible fraction of the corners of a ChArUco board; the image may cut off the others.
+"""
 
 CHARUCO_NEARER = 1.2
-"""Factor by which a ChArUco board appears larger than a chessboard, since its markers are small."""
+"""The factor by which a ChArUco board appears larger than a chessboard, since its markers are
+small."""
 
 
 class BoardError(FlexsheetError, ValueError):
-    """Raised for a board that cannot be rendered; the text states the cause."""
+    """The error that is raised for a board that cannot be rendered; the text states the cause."""
 
     code = "board"
     exit_code = 2
@@ -51,7 +54,7 @@ class BoardError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Uneven illumination of an image, and the background behind the board.
+    """The uneven illumination of an image, and the background behind the board.
 
     gain: factor at the image centre. slope_x, slope_y: relative change from there to the right and
     the lower edge. background: its levels (height, width).
@@ -64,7 +67,7 @@ class Light:
 
 
 class TwinBoard:
-    """Simulated stereo camera that views a calibration board.
+    """A simulated stereo camera that views a calibration board.
 
     camera: true lenses and poses. seed: determines noise, illumination and poses.
     """

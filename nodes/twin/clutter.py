@@ -21,11 +21,11 @@ Views = Literal["both", "left", "right"]
 MARKER_RADIUS_M = 0.003
 FINGER_LENGTH_M = 0.06
 FINGER_DIRECTION: Point = (0.0, -0.5, 0.866)
-"""World direction from the fingertip to the knuckle; the finger must not hide the marker."""
+"""The world direction from the fingertip to the knuckle; the finger must not hide the marker."""
 
 
 class Trajectory(Protocol):
-    """Interface of a position as a function of simulation time."""
+    """An interface of a position as a function of simulation time."""
 
     def at(self, time_s: float) -> Floats:
         """Return the position (3,) in the world frame, or relative to the fingertip, m."""
@@ -34,7 +34,7 @@ class Trajectory(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FixedPoint:
-    """Trajectory of an object that does not move."""
+    """A trajectory of an object that does not move."""
 
     point: Point
 
@@ -44,7 +44,7 @@ class FixedPoint:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """Trajectory that leaves `start` at time 0 and has a constant velocity."""
+    """A trajectory that leaves `start` at time 0 and has a constant velocity."""
 
     start: Point
     velocity_m_per_s: Point
@@ -55,7 +55,7 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Oscillation:
-    """Sinusoidal oscillation about the centre `middle` with the amplitude `reach`."""
+    """A sinusoidal oscillation about the centre `middle` with the amplitude `reach`."""
 
     middle: Point
     reach: Point
@@ -69,7 +69,7 @@ class Oscillation:
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """Part of the hand: a tapered capsule between two points, drawn behind the finger."""
+    """A part of the hand: a tapered capsule between two points, drawn behind the finger."""
 
     start: Trajectory
     end: Trajectory
@@ -81,7 +81,7 @@ class Capsule:
 
 @dataclass(frozen=True, slots=True)
 class SecondMarker:
-    """Bead that looks like the marker on the fingertip."""
+    """A bead that looks like the marker on the fingertip."""
 
     path: Trajectory
     radius_m: float = MARKER_RADIUS_M
@@ -92,7 +92,7 @@ class SecondMarker:
 
 @dataclass(frozen=True, slots=True)
 class Highlight:
-    """Reflection of a lamp: a small spot whose light is added to the background.
+    """A reflection of a lamp: a small spot whose light is added to the background.
 
     It saturates above 255. On a curved surface it often appears in only one of the two images.
     """
@@ -106,7 +106,7 @@ class Highlight:
 
 @dataclass(frozen=True, slots=True)
 class Occluder:
-    """Capsule of constant level that hides everything behind it, such as a cable."""
+    """A capsule of constant level that hides everything behind it, such as a cable."""
 
     start: Trajectory
     end: Trajectory
@@ -118,7 +118,7 @@ class Occluder:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """Illuminated rubber sheet behind the finger, at rest in the plane z = 0, with a texture.
+    """An illuminated rubber sheet behind the finger, at rest in the plane z = 0, with a texture.
 
     contrast: standard deviation of the texture's levels. grain_m: size of its features.
     """
@@ -132,7 +132,7 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """Set of cluttering objects, in the order in which they are drawn.
+    """A set of cluttering objects, in the order in which they are drawn.
 
     The finger with its marker is drawn after `limbs`.
     """
@@ -218,12 +218,12 @@ HAND = Clutter(
         ),
     )
 )  # fmt: skip
-"""Palm, folded fingers and thumb of a right hand whose index finger points."""
+"""The palm, folded fingers and thumb of a right hand whose index finger points."""
 
 NAIL = Clutter(
     highlights=(Highlight(FixedPoint((0.001, -0.006, 0.014)), 0.0006, 120.0, carried=True),)
 )
-"""Reflection on the fingernail, dimmer and smaller than the marker."""
+"""The reflection on the fingernail, dimmer and smaller than the marker."""
 
 CLAMPS = Clutter(
     highlights=(
@@ -231,7 +231,7 @@ CLAMPS = Clutter(
         Highlight(FixedPoint((0.135, -0.04, 0.01)), 0.0008, 150.0),
     )
 )
-"""Reflections on the clamps of the sheet's edges."""
+"""The reflections on the clamps of the sheet's edges."""
 
 PASSING = Clutter(
     markers=(SecondMarker(Oscillation((0.0, 0.05, 0.02), (0.14, 0.02, 0.0), 7.3)),),
@@ -253,11 +253,11 @@ PASSING = Clutter(
         ),
     ),
 )  # fmt: skip
-"""Moving bead as bright as the marker, moving reflections, and cables that swing in front."""
+"""The moving bead as bright as the marker, moving reflections, and cables that swing in front."""
 
 CLUTTER = {
     "none": Clutter(),
     "lab": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS),
     "crowded": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS, PASSING),
 }
-"""Sets of clutter by their names in launch files."""
+"""The sets of clutter by their names in launch files."""

@@ -16,27 +16,29 @@ import numpy as np
 from flexsheet.nodes.arrays import Bools, Floats, Image
 
 PERIOD_M, RANGE_M = 0.02, 0.24
-"""Period of the phase and range of the coarse position, as in the shader `object.frag.glsl`."""
+"""The period of the phase and range of the coarse position, as in the shader `object.frag.glsl`."""
 
 PURE = 0.06
-"""Maximum deviation of red and green from the circle of codes, relative to its radius. A pixel that
-deviates more is a mixture of different colours and is ignored."""
+"""The maximum deviation of red and green from the circle of codes, relative to its radius. A pixel
+that deviates more is a mixture of different colours and is ignored."""
 
 AGREES_M = 0.002
-"""Maximum difference between the positions that blue and the phase encode; a pixel with a larger
-one is ignored. One step of blue is 1.2 mm."""
+"""The maximum difference between the positions that blue and the phase encode; a pixel with a
+larger one is ignored. One step of blue is 1.2 mm."""
 
 RIM_PX = 3
-"""Width of the outline that is ignored, since mixing with black would change the decoded position.
+"""The width of the outline that is ignored, since mixing with black would change the decoded
+position.
 """
 
 COARSE_LIGHT = 0.1
-"""Fraction of full blue below which a pixel counts as black; the object has at least twice that."""
+"""The fraction of full blue below which a pixel counts as black; the object has at least twice
+that."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorMap:
-    """Image error at each visible point of the object.
+    """The image error at each visible point of the object.
 
     errors_m: (rows, columns, 2) seen minus expected position, x right, y up; NaN where no point can
     be decoded.

@@ -35,27 +35,30 @@ from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
 Indices = NDArray[np.intp]
 
 METRES_PER_PX = 0.00035
-"""Default size of a pixel on the screen plane: half of the paper's 0.7 mm."""
+"""The default size of a pixel on the screen plane: half of the paper's 0.7 mm."""
 
 HALF_WINDOW_M = 0.12
 MARGIN_PX = 3
 SEEN_SAMPLES = 2
 FLAT_SAMPLES, SOFT_SAMPLES = 8, 4
-"""Samples per pixel and direction for flat and soft shading of the expected image. Sizes are
+"""The samples per pixel and direction for flat and soft shading of the expected image. Sizes are
 measured in flat-shaded images, whose outline needs finer sampling."""
 
 SHADOW_TOLERANCE = 0.002
-"""Relative distance behind the first surface on a projector ray beyond which a point is in shadow.
+"""The relative distance behind the first surface on a projector ray beyond which a point is in
+shadow.
 """
 
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 AMBIENT, WRAP, SHEEN, SHEEN_EXPONENT = 0.25, 0.35, 0.10, 20.0
 GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0, 1.05]), 0.025
-"""Parameters of the shading of a soft object; see docs/renderer.md."""
+"""The parameters of the shading of a soft object; see docs/renderer.md."""
 
 
 class NotMeasurableError(FlexsheetError, ValueError):
-    """Raised if an image does not show the object to be measured; the text states the cause."""
+    """The error that is raised if an image does not show the object to be measured; the text states
+    the cause.
+    """
 
     code = "not-measurable"
     remedy = "Choose a pose in which the whole object is visible within the image."
@@ -63,7 +66,7 @@ class NotMeasurableError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Regular fan of rays from `origin`, one per pixel of an image.
+    """A regular fan of rays from `origin`, one per pixel of an image.
 
     The direction of a ray is first + column * right + row * down; all vectors are (3,).
     """
@@ -83,7 +86,7 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """First intersection of each ray of a fan with a mesh.
+    """The first intersection of each ray of a fan with a mesh.
 
     triangle: (height, width) index of the triangle that is hit; -1 where nothing is hit.
     inverse_range: (height, width) reciprocal of the ray parameter at the hit; 0 if there is no hit.
@@ -140,7 +143,7 @@ def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
 
 
 class TrueProjector:
-    """Simulated projector, which maps between its pixels and the points of the sheet they light."""
+    """A simulated projector, which maps between its pixels and the points of the sheet they light."""
 
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
         """Prepare the rays of a projector that lights a mesh.
@@ -224,7 +227,7 @@ class TrueProjector:
 
 
 Box = tuple[int, int, int, int]
-"""Part of an image: first column, first row, last column + 1, last row + 1."""
+"""The part of an image: first column, first row, last column + 1, last row + 1."""
 
 
 def eye_rays(eye: Floats, *, metres_per_px: float, size: int, box: Box, samples: int) -> Rays:
@@ -373,7 +376,7 @@ def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) ->
 
 
 class _Silhouette:
-    """Outline of the largest bright region of an image, measured along rows and columns."""
+    """The outline of the largest bright region of an image, measured along rows and columns."""
 
     def __init__(self, picture: Image) -> None:
         gray = picture.astype(np.float64).mean(axis=2)
@@ -439,11 +442,11 @@ def _edge(profile: Floats, first: int) -> float:
 
 
 INSET = 0.05
-"""Fraction of the height of the tilted cylinder. Its widths are measured this far inside the upper
-and lower edge, away from the rounded corners."""
+"""The fraction of the height of the tilted cylinder. Its widths are measured this far inside the
+upper and lower edge, away from the rounded corners."""
 
 MIDDLE_COLUMNS = 17
-"""Number of columns about the centre over which a measured height is averaged."""
+"""The number of columns about the centre over which a measured height is averaged."""
 
 
 def _height(shape: _Silhouette) -> tuple[float, float]:
@@ -485,7 +488,7 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class EyeSituation:
-    """True state of the simulated hardware and of the object while a frame is shown.
+    """The true state of the simulated hardware and of the object while a frame is shown.
 
     world_from_flange_left, world_from_flange_right: (4, 4) poses of the arms' last links.
     finger_tip: (3,) in the world frame, or None if there is no finger.
@@ -577,7 +580,7 @@ def true_sheet(
 
 
 class EyeCamera:
-    """Measuring camera at the user's eye, which caches results that later images can use."""
+    """A measuring camera at the user's eye, which caches results that later images can use."""
 
     def __init__(self) -> None:
         self._scene: Scene | None = None

@@ -39,7 +39,7 @@ Job = tuple[EyeSituation, Floats, Frame, Header]
 
 
 class TwinEyeParameters(SimulatorParameters):
-    """Parameters of the simulated eye."""
+    """The parameters of the simulated eye."""
 
     metres_per_px: Positive = Field(
         default=METRES_PER_PX, description="size of a pixel on the screen plane, m"

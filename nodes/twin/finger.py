@@ -25,7 +25,7 @@ ROUNDING_S = 0.04
 """Half the duration over which corners of a polyline are rounded; a hand does not turn abruptly."""
 
 EASE_SPEED_M_PER_S = 0.4
-"""Peak speed of the reach from the present position to the first point of a path."""
+"""The peak speed of the reach from the present position to the first point of a path."""
 
 MIN_EASE_S = 0.3
 WANDER_BAND_HZ = (0.15, 1.2)
@@ -33,7 +33,9 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 
 
 class FingerPathError(FlexsheetError, ValueError):
-    """Raised for a path that the simulated finger cannot follow; the text gives the remedy."""
+    """The error that is raised for a path that the simulated finger cannot follow; the text gives
+    the remedy.
+    """
 
     code = "finger-path"
     remedy = "Slow the path down, or correct the point or line that the text names."
@@ -67,7 +69,7 @@ class SineSum:
 
 
 class Path(Protocol):
-    """Interface of the steady motion along a path, without wander and tremor.
+    """An interface of the steady motion along a path, without wander and tremor.
 
     Here times are in seconds from the first point. The finger rests before and after the path.
     """
@@ -97,7 +99,8 @@ class Path(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RoundedLines:
-    """Motion along straight lines, whose corners are rounded by a moving average of +-ROUNDING_S.
+    """The motion along straight lines, whose corners are rounded by a moving average of
+    +-ROUNDING_S.
 
     The average is computed exactly from the integral of the position. It never leaves the convex
     hull of the points, never exceeds the speed on the lines, and has a continuous velocity.
@@ -157,7 +160,7 @@ class RoundedLines:
 
 @dataclass(frozen=True, slots=True)
 class SmoothPath:
-    """Cubic spline through samples of a motion, at rest at both ends.
+    """A cubic spline through samples of a motion, at rest at both ends.
 
     Between samples at intervals h the error is about h^4 / 100 times the fourth derivative of the
     motion. For a reach of 10 mm in 50 ms, sampled every 4 ms, it is below a micrometre.
@@ -259,7 +262,7 @@ def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class FingerState:
-    """True state of the fingertip at one time.
+    """The true state of the fingertip at one time.
 
     position, velocity: (3,) in m and m/s.
     path_time_s: time since the first point of the path; negative during the reach to it.
@@ -276,7 +279,8 @@ class FingerState:
 
 @dataclass(frozen=True, slots=True)
 class FingerMotion:
-    """Motion of the fingertip: a reach to the first point of a path, the path, and unsteadiness.
+    """The motion of the fingertip: a reach to the first point of a path, the path, and
+    unsteadiness.
 
     start, start_velocity: position and velocity when the path was given, without unsteadiness.
     ease_s: duration of the reach to the first point.

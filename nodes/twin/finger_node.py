@@ -36,12 +36,12 @@ from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 JITTER_STREAM = 1
-"""Second element of the random seed for the jitter of exposure times, which makes it independent of
-the image noise."""
+"""The second element of the random seed for the jitter of exposure times, which makes it
+independent of the image noise."""
 
 
 class TwinFingerParameters(SimulatorParameters):
-    """Parameters of the simulated finger and stereo camera."""
+    """The parameters of the simulated finger and stereo camera."""
 
     seed: int = Field(
         default=2006,

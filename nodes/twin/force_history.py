@@ -22,28 +22,28 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.nodes.arrays import Floats
 
 REFERENCE_S = 1.0
-"""Age of a force at which the relaxation function is one."""
+"""The age of a force at which the relaxation function is one."""
 
 TIME_CONSTANTS_S = 10.0 ** np.arange(-1.0, 4.0)
-"""Time constants of the relaxation function; forces relax from about 50 ms to some hours."""
+"""The time constants of the relaxation function; forces relax from about 50 ms to some hours."""
 
 REVERSAL_RATIO = 0.1
-"""Relative change of the elastic force within which the factor of the hysteresis approaches its new
-value to 1/e."""
+"""The relative change of the elastic force within which the factor of the hysteresis approaches its
+new value to 1/e."""
 
 MIN_FORCE_N = 1e-3
-"""Elastic force below which a change does not reverse the hysteresis."""
+"""The elastic force below which a change does not reverse the hysteresis."""
 
 CREEP_LOSS_RATIO = math.pi**2 / (4.0 * math.log(10.0))
-"""Fraction of the energy that a load cycle loses by creep, divided by the creep per decade."""
+"""The fraction of the energy that a load cycle loses by creep, divided by the creep per decade."""
 
 MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
-"""Time in which the force of a push rises to the evaluated force. Ratio of the largest force, at
-which the finger reverses, to the evaluated force."""
+"""The time in which the force of a push rises to the evaluated force. Ratio of the largest force,
+at which the finger reverses, to the evaluated force."""
 
 
 class ForceHistory:
-    """State of the hysteresis and creep of one force of the sheet.
+    """The state of the hysteresis and creep of one force of the sheet.
 
     hysteresis_ratio: fraction of the loading energy that a cycle from zero force loses, including
         the loss by creep.

@@ -26,17 +26,17 @@ from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 CELLS = 12
-"""Number of cells per side of the mesh; the force differs by 1 % from that with 32 cells."""
+"""The number of cells per side of the mesh; the force differs by 1 % from that with 32 cells."""
 
 STATED_STANDARD_DEVIATION_N = 0.02
-"""Uncertainty that the gauge's data sheet states, which the node publishes with each force."""
+"""The uncertainty that the gauge's data sheet states, which the node publishes with each force."""
 
 GAUGE_STREAM = 3
-"""Second element of the random seed, which makes the noise independent of other simulators."""
+"""The second element of the random seed, which makes the noise independent of other simulators."""
 
 
 class TwinGaugeParameters(SimulatorParameters):
-    """Parameters of the simulated gauge."""
+    """The parameters of the simulated gauge."""
 
     seed: int = Field(default=2006, description="random seed of the noise")
     rate_hz: Positive = Field(
@@ -47,7 +47,7 @@ class TwinGaugeParameters(SimulatorParameters):
 
 
 class TrueSheetForce:
-    """Force of the simulated sheet on the finger along the sheet's normal, from the true poses."""
+    """The force of the simulated sheet on the finger along the sheet's normal, from the true poses."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
         true_scene = apply_apparatus(scene, apparatus)
@@ -82,7 +82,7 @@ class TrueSheetForce:
 
 @dataclass(slots=True)
 class GaugeErrors:
-    """Gain, offset and noise of the simulated gauge."""
+    """The gain, offset and noise of the simulated gauge."""
 
     truth: GaugeTruth
     random: np.random.Generator

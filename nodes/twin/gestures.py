@@ -43,7 +43,8 @@ from flexsheet.nodes.twin.finger import minimum_jerk_profile
 from flexsheet.nodes.twin.paths import map_to_surface, place_path, touchable
 
 Sampled = tuple[Floats, Floats]
-"""Times (n,) in s, from zero, and surface positions (n, 3) or distances (n,) in m at these times.
+"""The times (n,) in s, from zero, and surface positions (n, 3) or distances (n,) in m at these
+times.
 """
 
 SAMPLE_S = 0.004
@@ -55,10 +56,10 @@ HOVER_M = 0.04
 APPROACH_S = 0.8
 REST_S = 0.3
 TOUCH_M = 0.001
-"""Depth below the surface of a light touch."""
+"""The depth below the surface of a light touch."""
 
 PRESS_M = 0.002
-"""Depth below the surface of a tap."""
+"""The depth below the surface of a tap."""
 
 EXPLORE_M_PER_S = 0.086
 REACH_PEAK_M_PER_S = 0.35

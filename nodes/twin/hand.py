@@ -28,22 +28,22 @@ from flexsheet.nodes.twin.sheet_reaction import SheetReaction
 from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
 
 VoluntaryPath = Callable[[float], tuple[Floats, Floats]]
-"""Voluntary position (3,) m and velocity (3,) m/s at a time, s."""
+"""The voluntary position (3,) m and velocity (3,) m/s at a time, s."""
 
 Edges = Callable[[float], tuple[Floats, Floats]]
-"""Poses (4, 4) of the left and the right edge of the sheet at a time, s."""
+"""The poses (4, 4) of the left and the right edge of the sheet at a time, s."""
 
 STEP_S = 0.0005
-"""Maximum time step of the normal motion: a tenth of a radian of the fastest oscillation."""
+"""The maximum time step of the normal motion: a tenth of a radian of the fastest oscillation."""
 
 INTERVAL_S = 0.004
-"""Maximum interval over which the voluntary path and the sheet are interpolated."""
+"""The maximum interval over which the voluntary path and the sheet are interpolated."""
 
 NEAR_M = 0.005
-"""Distance from the sheet beyond which no force is computed."""
+"""The distance from the sheet beyond which no force is computed."""
 
 MAX_EXTRAPOLATION_S = 0.02
-"""Time after the newest pose of the edges for which they are assumed to keep their velocity."""
+"""The time after the newest pose of the edges for which they are assumed to keep their velocity."""
 
 MAX_PREDICTION_S = 0.1
 
@@ -52,7 +52,7 @@ UP = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class HandImpedance:
-    """Mechanical impedance of a hand at the fingertip, equal in all directions.
+    """The mechanical impedance of a hand at the fingertip, equal in all directions.
 
     The default is a finger whose wrist moves too. Its natural frequency in the air is 5 Hz (Lakie
     et al. 2015: 6 to 12 Hz with less mass).
@@ -87,7 +87,7 @@ class HandImpedance:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """Local state of the sheet below the finger at one time.
+    """The local state of the sheet below the finger at one time.
 
     origin: point (3,) of the unloaded sheet's tangent plane. normal: (3,) towards the user.
     curve_n: normal forces at the depths in the force table `SheetReaction`.
@@ -99,7 +99,7 @@ class Touch:
 
 
 class TrueSheet:
-    """Force of the simulated sheet on the finger, for given poses of its edges."""
+    """The force of the simulated sheet on the finger, for given poses of its edges."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None, reaction: SheetReaction) -> None:
         self.step_m = float(reaction.depths_m[1])
@@ -132,7 +132,7 @@ class TrueSheet:
 
 
 class EdgeTrack:
-    """Poses of the sheet's edges, linearly inter- and extrapolated in time from two samples."""
+    """The poses of the sheet's edges, linearly inter- and extrapolated in time from two samples."""
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, Floats]] = []
@@ -157,7 +157,7 @@ class EdgeTrack:
 
 
 class CoupledFinger:
-    """Deviation of the finger from its voluntary path, integrated over time.
+    """The deviation of the finger from its voluntary path, integrated over time.
 
     path: voluntary motion, which may be replaced at any time. deviation_m, rate_m_per_s: (3,).
     force_n: (3,) force of the sheet on the finger, mean over the last interval.

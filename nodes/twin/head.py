@@ -12,12 +12,12 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.finger import SineSum
 
 MIN_SWAY_FREQUENCY_RATIO = 0.1
-"""Lowest frequency of the head's sway, relative to the highest."""
+"""The lowest frequency of the head's sway, relative to the highest."""
 
 
 @dataclass(frozen=True, slots=True)
 class HeadSway:
-    """Random motion of the head, as a function of time.
+    """A random motion of the head, as a function of time.
 
     sway_m: standard deviation per axis.
     """

@@ -24,17 +24,17 @@ from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
 from flexsheet.nodes.twin.truth import find_display_delay_s
 
 CELLS = 8
-"""Number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
+"""The number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
 
 SOLVE_PERIOD_NS = 500_000_000
 MAX_FINGER_MOTION_M = 5e-4
-"""Period in which the sheet's shape is solved, and motion of a pushing finger since the last
+"""The period in which the sheet's shape is solved, and motion of a pushing finger since the last
 solution beyond which the marks are not drawn, because the shape is not known."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Heights:
-    """Heights (n,) of the sheet at the marks, above the plane of its edges.
+    """The heights (n,) of the sheet at the marks, above the plane of its edges.
 
     finger_sheet_m: position (3,) of the fingertip in the frame of this plane. pushed: whether the
     finger deforms the sheet.
@@ -46,7 +46,7 @@ class _Heights:
 
 
 class LitMarks:
-    """Points of the simulated sheet that the projected marks light.
+    """The points of the simulated sheet that the projected marks light.
 
     The sheet moves with the true arms. Its deflection by the finger and by its weight is solved in
     the background.

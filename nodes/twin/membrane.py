@@ -30,33 +30,37 @@ from flexsheet.nodes.arrays import Bools, Floats
 Indices = NDArray[np.intp]
 
 CELLS = 32
-"""Number of intervals between nodes along each side; an element spans two of them."""
+"""The number of intervals between nodes along each side; an element spans two of them."""
 MIN_CELL_FRACTION = 0.008
-"""Distance between nodes under the finger, as a fraction of the side: 1.9 mm of 240 mm."""
+"""The distance between nodes under the finger, as a fraction of the side: 1.9 mm of 240 mm."""
 
 SLACK_TENSION = 2e-4
-"""Isotropic tension added everywhere, in units of the shear modulus. Without it the equilibrium of
-slack and wrinkled regions would not be unique."""
+"""The isotropic tension added everywhere, in units of the shear modulus. Without it the equilibrium
+of slack and wrinkled regions would not be unique."""
 
 CONTACT_PA_PER_M = 1e10
-"""Contact pressure per penetration depth; 10 N on 1 cm2 penetrate 0.01 mm."""
+"""The contact pressure per penetration depth; 10 N on 1 cm2 penetrate 0.01 mm."""
 
 MAX_STEP_RADII = 0.7
-"""Maximum advance of the finger per step, in radii; in a longer step it could cross the sheet."""
+"""The maximum advance of the finger per step, in radii; in a longer step it could cross the sheet.
+"""
 
 MAX_ITERATIONS = 80
 UNDAMPED_ROUNDS, MAX_FRICTION_ROUNDS = 6, 20
-"""Limits of the number of equilibria that are solved per finger step while nodes slip. Above the
-first limit, changes of the friction forces are halved, since they may alternate. The second limit
-is the maximum."""
+"""The limits of the number of equilibria that are solved per finger step while nodes slip. Above
+the first limit, changes of the friction forces are halved, since they may alternate. The second
+limit is the maximum."""
 FRICTION_TOLERANCE = 0.01
-"""Relative change of the friction forces between two equilibria below which they are accepted."""
+"""The relative change of the friction forces between two equilibria below which they are accepted.
+"""
 GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
-"""Gravitational acceleration in the world frame, whose y axis points up."""
+"""The gravitational acceleration in the world frame, whose y axis points up."""
 
 
 class NotConvergedError(FlexsheetError, RuntimeError):
-    """Raised when the membrane's equilibrium is not found; the text gives the residual force."""
+    """The error that is raised when the membrane's equilibrium is not found; the text gives the
+    residual force.
+    """
 
     code = "membrane"
     remedy = "Reduce the depth of the push: the simulated membrane has no solution for it."
@@ -64,7 +68,7 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class TrueRubber:
-    """Dimensions and material of the simulated sheet at rest.
+    """The dimensions and material of the simulated sheet at rest.
 
     width_m: free length between the clamps of the unstretched sheet; height_m: length along them.
     density_kg_per_m3: 0 for a sheet without weight.
@@ -82,7 +86,7 @@ class TrueRubber:
 
 @dataclass(frozen=True, slots=True)
 class DeformedSheet:
-    """Equilibrium of the sheet.
+    """The equilibrium of the sheet.
 
     rest_m: (rows, columns, 2) node positions at rest, measured from the bottom left corner.
     positions: (rows, columns, 3) node positions in the world frame.
@@ -145,7 +149,7 @@ def _quadratic(t: Floats) -> tuple[Floats, Floats]:
 
 
 class _Mesh:
-    """Rectangular finite-element mesh, which assembles the elastic forces and stiffness.
+    """A rectangular finite-element mesh, which assembles the elastic forces and stiffness.
 
     x, y: coordinates of the nodes. Element boundaries have even indices; nodes with odd indices
     are midway between their neighbours.
@@ -334,7 +338,7 @@ def relaxed_stress(
 
 
 class _Finger:
-    """Fingertip as a rigid sphere: a penalty force keeps nodes outside, and touched nodes stick.
+    """A fingertip as a rigid sphere: a penalty force keeps nodes outside, and touched nodes stick.
 
     stuck: (nodes,) whether a node sticks to the finger at its position in `anchor` (nodes, 3).
     friction_coefficient: Coulomb coefficient; None if touched nodes never slip.

@@ -39,36 +39,39 @@ _JOINTS, _PULSES, _CURRENT = (2, 5, 8), 3, 11
 _MORE_AT = (64, 108, 152)
 
 TORQUE_PER_PERCENT_NM = np.array([0.3, 0.3, 0.2, 0.05, 0.05, 0.03])
-"""Torque of each simulated joint per percent of its motor's rated current."""
+"""The torque of each simulated joint per percent of its motor's rated current."""
 
 UNLOADED_PERCENT = np.array([0.0, 22.0, 30.0, 0.0, 8.0, 0.0])
-"""Currents that hold the simulated arm without a load; their change with the pose is neglected."""
+"""The currents that hold the simulated arm without a load; their change with the pose is neglected.
+"""
 
 FRICTION_PERCENT = 6.0
-"""Maximum current that the simulated gears take up by static friction, in either direction."""
+"""The maximum current that the simulated gears take up by static friction, in either direction."""
 
 FILTER_S = 0.01
-"""Time constant of the low-pass filter that the manufacturer recommends for `Mxt`."""
+"""The time constant of the low-pass filter that the manufacturer recommends for `Mxt`."""
 
 FRICTION_STREAM = 11
-"""Second element of the random seed of the static friction."""
+"""The second element of the random seed of the static friction."""
 
 FIRST_STEP_RAD = 0.01
-"""Maximum difference of each joint between the first set-point and the measured joints."""
+"""The maximum difference of each joint between the first set-point and the measured joints."""
 
 STEP_CYCLES = 2.0
-"""Maximum step between set-points, as the number of cycles that it would take at full speed."""
+"""The maximum step between set-points, as the number of cycles that it would take at full speed."""
 
 
 class MxtError(FlexsheetError):
-    """Raised when an invalid command ends the robot program; the text gives the reason."""
+    """The error that is raised when an invalid command ends the robot program; the text gives the
+    reason.
+    """
 
     code = "mxt-program"
     remedy = "No action is needed: the simulated controller's program restarts."
 
 
 class MxtController:
-    """Simulated controller of one arm, which receives and answers one packet per cycle.
+    """A simulated controller of one arm, which receives and answers one packet per cycle.
 
     An error ends the robot program: the arm brakes, and no packet is answered until `restart`.
     Errors are: a move before a packet that only requests the state; an unknown command or data
@@ -303,7 +306,7 @@ class MxtController:
 
 
 class MxtServer:
-    """UDP server through which clients command a simulated controller."""
+    """A UDP server through which clients command a simulated controller."""
 
     def __init__(
         self, controller: MxtController, *, host: str, port: int, before: Callable[[], None]

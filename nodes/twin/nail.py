@@ -14,13 +14,13 @@ from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.twin.clutter import FINGER_DIRECTION, FINGER_LENGTH_M
 
 THICKNESS_RATIO = 0.6
-"""Thickness of a finger from pad to nail, 10 mm when the pad yields, divided by its breadth of 16
-to 18 mm (sources: `tolerance_table.py`)."""
+"""The thickness of a finger from pad to nail, 10 mm when the pad yields, divided by its breadth of
+16 to 18 mm (sources: `tolerance_table.py`)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nail:
-    """Placement of the marker, and direction of the finger, as vectors in the world frame.
+    """The placement of the marker, and direction of the finger, as vectors in the world frame.
 
     marker_offset_m: (3,) from the fingertip (contact point of the finger pad) to the centre of the
         marker.

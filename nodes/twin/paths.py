@@ -27,24 +27,24 @@ FAR_M = 2.0
 MAX_DISTANCE_M = 0.5
 STRIDE_M = 0.001
 GRID_M = 0.003
-"""Distance of an imaginary viewer, maximum length of geodesics (straightest lines on the surface),
-their step, and the spacing of the interpolation grid."""
+"""The distance of an imaginary viewer, maximum length of geodesics (straightest lines on the
+surface), their step, and the spacing of the interpolation grid."""
 
 WITHIN_ENDS = 0.8
 OF_WIDTH = 0.7
 OF_HEIGHT = 0.9
-"""Fractions that the finger can stroke: of the length of an object with ends, of the width of the
-sheet, and of its usable half-height."""
+"""The fractions that the finger can stroke: of the length of an object with ends, of the width of
+the sheet, and of its usable half-height."""
 
 MAX_CACHED_SURFACE_MAPS = 4
 _SURFACE_MAPS: dict[bytes, SurfaceMap] = {}
 
 SPEED_FRACTION = 0.8
-"""Maximum speed of a path, as a fraction of the scene's finger speed. The rest is a reserve, since
-wander and tremor are added to the path."""
+"""The maximum speed of a path, as a fraction of the scene's finger speed. The rest is a reserve,
+since wander and tremor are added to the path."""
 
 PRESS_FRACTION = 1.0 / 6.0
-"""Maximum depth to which a recorded path pushes, as a fraction of the scene's push depth."""
+"""The maximum depth to which a recorded path pushes, as a fraction of the scene's push depth."""
 
 
 def map_to_surface(scene: Scene, places: Floats) -> Floats:
@@ -62,7 +62,7 @@ def touchable(scene: Scene) -> tuple[float, float]:
 
 
 class SurfaceMap:
-    """Map from surface positions on a scene's object to world points.
+    """A map from surface positions on a scene's object to world points.
 
     The distances `along` and `arc` are measured on geodesics, which are computed on a grid. Points
     between are interpolated by bicubic splines and projected onto the surface, so that a mapped

@@ -38,51 +38,56 @@ from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.rig import pixel_of, pixels_of, pixels_per_slope, slopes_of
 
 Window = tuple[slice, slice]
-"""Rows and columns of a rectangular part of an image."""
+"""The rows and columns of a rectangular part of an image."""
 
 Position = Callable[[float], Floats]
-"""Function that returns the fingertip position (3,) at a time in seconds from mid-exposure."""
+"""The function that returns the fingertip position (3,) at a time in seconds from mid-exposure."""
 
 MOTION_STEP_PX = 0.7
-"""Maximum distance between the positions at which a moving object is drawn during one exposure. The
-lens blur closes the gaps; motion within a step, which is ignored, would widen it by at most 4 %."""
+"""The maximum distance between the positions at which a moving object is drawn during one exposure.
+The lens blur closes the gaps; motion within a step, which is ignored, would widen it by at most 4
+%."""
 
 LIGHT = np.array([-0.6, 0.7, 0.4])
-"""World direction towards the lamp at the upper left, of about unit length."""
+"""The world direction towards the lamp at the upper left, of about unit length."""
 
 SHADE = 0.35
-"""Fraction by which skin is darker at the outline of a limb than along its centre line."""
+"""The fraction by which skin is darker at the outline of a limb than along its centre line."""
 
 SIDE_LIGHT = 0.2
-"""Fraction by which the side of a limb that faces the lamp is brighter, and the other darker."""
+"""The fraction by which the side of a limb that faces the lamp is brighter, and the other darker.
+"""
 
 MIN_DEPTH_M = 0.02
 """Objects closer to a camera than this are not drawn."""
 
 ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
-"""Positions along a limb (0: start, 1: end) that are projected to find the window with the limb."""
+"""The positions along a limb (0: start, 1: end) that are projected to find the window with the
+limb."""
 
 EMPTY_FRACTION = 1.2
 """Two overlapping windows are joined if the joined area is at most this multiple of their sum."""
 
 LIT_RADIUS_M, LIT_LEVEL = 0.0028, 150.0
-"""Radius of a projected mark that has the area of 10 x 10 pixels of 0.5 mm, and the grey level that
-it adds to the sheet."""
+"""The radius of a projected mark that has the area of 10 x 10 pixels of 0.5 mm, and the grey level
+that it adds to the sheet."""
 
 NO_POINTS = np.zeros((0, 3))
 
 SPOTS = 61
-"""Number of Gaussian spots that make up a flat marker."""
+"""The number of Gaussian spots that make up a flat marker."""
 
 GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
 GRAIN = 1 << 21
-"""Length of the stored sequence of normal deviates; images take their noise from random parts."""
+"""The length of the stored sequence of normal deviates; images take their noise from random parts.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Properties of the image sensor and lens; grey levels (0..255) are proportional to the light.
+    """The properties of the image sensor and lens; grey levels (0..255) are proportional to the
+    light.
 
     photons_per_level: full-well capacity in photons, divided by 255. The variance of the photon
     noise at level L is L / photons_per_level.
@@ -182,7 +187,7 @@ class CameraView:
 
 
 class TwinCamera:
-    """Simulated stereo camera, which renders image pairs; `seed` determines the noise."""
+    """A simulated stereo camera, which renders image pairs; `seed` determines the noise."""
 
     def __init__(
         self,

@@ -27,23 +27,23 @@ from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
 
 RAYS = 2
-"""Number of rays per camera pixel in each direction."""
+"""The number of rays per camera pixel in each direction."""
 
 ROOM_LEVEL, LIT_LEVEL, DARK_LEVEL = 14.0, 150.0, 9.0
-"""Grey levels of the room behind the sheet, and of the sheet: the level that full light adds, and
-the level where black is projected."""
+"""The grey levels of the room behind the sheet, and of the sheet: the level that full light adds,
+and the level where black is projected."""
 
 SPREAD_PX = 0.5
-"""Blur (standard deviation) of a projected pixel on the sheet, due to lens and rubber."""
+"""The blur (standard deviation) of a projected pixel on the sheet, due to lens and rubber."""
 
 WINDOW_MARGIN = 0.05
-"""Margin around the outline of the sheet in an image, in slopes x/z and y/z of rays."""
+"""The margin around the outline of the sheet in an image, in slopes x/z and y/z of rays."""
 
 FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
 OFFSET_DEVIATION_M, ROTATION_DEVIATION_RAD = 0.004, 0.006
 RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
-"""Standard deviations of the true projector from the scene's: focal length (relative), principal
-point, position, rotation and distortion."""
+"""The standard deviations of the true projector from the scene's: focal length (relative),
+principal point, position, rotation and distortion."""
 
 
 def make_true_projector(projector: Projector, *, seed: int) -> Projector:
@@ -113,7 +113,7 @@ def sheet_poses(count: int) -> list[Floats]:
 
 
 class LitSheet:
-    """Stereo camera in front of a flat sheet that the projector lights from behind."""
+    """A stereo camera in front of a flat sheet that the projector lights from behind."""
 
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
         """Store the simulated devices; camera, projector: true parameters."""

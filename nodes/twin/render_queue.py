@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Generic, TypeVar
 
 Key = tuple[str, ...]
-"""Label, correction and viewpoint of a frame, which identify a job."""
+"""The label, correction and viewpoint of a frame, which identify a job."""
 
 J = TypeVar("J")
 
 
 class RenderQueue(Generic[J]):
-    """Queue of rendering jobs in order of arrival, which prevents repeated rendering.
+    """A queue of rendering jobs in order of arrival, which prevents repeated rendering.
 
     max_length: maximum number of waiting jobs.
     min_interval_s: minimum time before a job with the same key is rendered again.

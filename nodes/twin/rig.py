@@ -20,26 +20,26 @@ from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 T = TypeVar("T", float, Floats)
 
 FOCAL_DEVIATION = 0.005
-"""Relative standard deviation of the focal length between devices of one model."""
+"""The relative standard deviation of the focal length between devices of one model."""
 
 ASPECT_DEVIATION = 0.0005
-"""Relative standard deviation of fy from fx, which is small since pixels are nearly square."""
+"""The relative standard deviation of fy from fx, which is small since pixels are nearly square."""
 
 CENTRE_DEVIATION_PX = 4.0
-"""Standard deviation of the principal point, due to the mounting of the sensor, for an image 640 px
-wide."""
+"""The standard deviation of the principal point, due to the mounting of the sensor, for an image
+640 px wide."""
 
 RADIAL = (-0.30, 0.11)
 RADIAL_DEVIATION = (0.015, 0.01)
-"""Mean and standard deviation of k1 and k2 for typical lenses with 66 degrees of horizontal field
-of view; data sheets do not state them."""
+"""The mean and standard deviation of k1 and k2 for typical lenses with 66 degrees of horizontal
+field of view; data sheets do not state them."""
 
 TANGENTIAL_DEVIATION = 0.0004
 OFFSET_DEVIATION_M = 0.0001
-"""Standard deviation, per axis, of the right camera's position."""
+"""The standard deviation, per axis, of the right camera's position."""
 
 ROTATION_DEVIATION_RAD = 0.004
-"""Standard deviation, per axis, of the right camera's rotation: 0.23 degrees."""
+"""The standard deviation, per axis, of the right camera's rotation: 0.23 degrees."""
 
 NEWTON_STEPS = 12
 

@@ -18,8 +18,8 @@ from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, TrueRubber, solve
 
 CELLS = 8
-"""Number of node intervals per side of the sheet's mesh. Without a finger, the force differs by 1 %
-from that with 32."""
+"""The number of node intervals per side of the sheet's mesh. Without a finger, the force differs by
+1 % from that with 32."""
 
 STRETCHES = (1.0, 1.01, 1.03, 1.06, 1.1, 1.15, 1.2, 1.3)
 
@@ -44,7 +44,7 @@ def true_friction(apparatus: Apparatus | None) -> float | None:
 
 @dataclass(slots=True)
 class SheetPull:
-    """Force with which the sheet pulls on both arms, and the compliance of the arms.
+    """The force with which the sheet pulls on both arms, and the compliance of the arms.
 
     The force of a finger on the sheet is neglected, since it is small compared with the tension.
     distances_m, forces_n: (n,) tension as a function of the distance between the clamped edges.

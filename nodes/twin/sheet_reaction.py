@@ -23,16 +23,17 @@ from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 VERSION = 1
-"""Version of the computation; tables of another version are computed again."""
+"""The version of the computation; tables of another version are computed again."""
 
 CELLS = 16
-"""Number of cells per side of the mesh; the force differs by 1 to 4 % from that with 32 cells."""
+"""The number of cells per side of the mesh; the force differs by 1 to 4 % from that with 32 cells.
+"""
 
 DEPTH_FRACTIONS = np.array([0.04, 0.12, 0.25, 0.45, 0.7, 1.0])
-"""Depths of the solved pushes, as fractions of the scene's maximum push depth."""
+"""The depths of the solved pushes, as fractions of the scene's maximum push depth."""
 
 POSITION_FRACTIONS = np.array([0.0, 0.2, 0.375])
-"""Distances of the pushes from the sheet's centre, as fractions of its width and height."""
+"""The distances of the pushes from the sheet's centre, as fractions of its width and height."""
 
 STRETCH_NODES = 3
 STRETCH_MARGIN = 0.01
@@ -41,7 +42,7 @@ DEPTH_STEPS = 256
 
 @dataclass(frozen=True, slots=True)
 class SheetReaction:
-    """Normal force (N) of the sheet on a finger over stretch, position and indentation.
+    """The normal force (N) of the sheet on a finger over stretch, position and indentation.
 
     width_m, height_m: dimensions of the sheet at rest, (1,). stretches (s,): stretch ratios.
     depths_m (d,): depths in equal steps from 0. centre_n (s, d): force at the centre. ratios

@@ -21,20 +21,24 @@ from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 CELLS = 8
-"""Membrane elements per side. The sag at the usable height differs by 0.3 % from that with 32."""
+"""The membrane elements per side. The sag at the usable height differs by 0.3 % from that with 32.
+"""
 
 STRETCH_NODES = 4
 LEANS = np.array([0.35, 0.7, 1.0])
-"""Vertical components of the sheet normal at which the membrane is solved; at 0 there is no sag."""
+"""The vertical components of the sheet normal at which the membrane is solved; at 0 there is no
+sag."""
 
 STRETCH_MARGIN = 0.005
-"""Extension of the table beyond the scene's range of stretch ratios; further values are clipped."""
+"""The extension of the table beyond the scene's range of stretch ratios; further values are
+clipped."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPlanes:
-    """Planes at n times: points (n, 3) m, unit normals and x axes (n, 3), and distances between the
-    clamped edges (n,) m. For planes through the edges, the points are midway between both edges.
+    """The planes at n times: points (n, 3) m, unit normals and x axes (n, 3), and distances between
+    the clamped edges (n,) m. For planes through the edges, the points are midway between both
+    edges.
     """
 
     points: Floats
@@ -44,7 +48,7 @@ class SheetPlanes:
 
 
 class SagTable:
-    """Table of the unloaded sheet's sag over stretch, tilt and position, solved by the membrane."""
+    """A table of the unloaded sheet's sag over stretch, tilt and position, solved by the membrane."""
 
     def __init__(
         self, rubber: TrueRubber, min_stretch_ratio: float, max_stretch_ratio: float
@@ -118,7 +122,7 @@ def _cached_table(rubber: TrueRubber, low: float, high: float) -> SagTable:
 
 @dataclass(frozen=True, slots=True)
 class SheetSurface:
-    """Surface of a scene's unloaded sheet. table: its sag; None for a sheet without weight."""
+    """The surface of a scene's unloaded sheet. table: its sag; None for a sheet without weight."""
 
     table: SagTable | None
 

@@ -23,11 +23,11 @@ from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
 
 MAX_DEVIATION_SIGMAS = 3.0
-"""Limit of normal random samples; a laboratory would notice and correct a larger deviation."""
+"""The limit of normal random samples; a laboratory would notice and correct a larger deviation."""
 
 
 class Profile(StrEnum):
-    """Generation of the laboratory's equipment.
+    """The generation of the laboratory's equipment.
 
     modern: a 60 Hz camera with a short read-out, and robot controllers with a short period.
     paper: equipment as in Furukawa et al. 2007. The camera has 15 to 48 Hz and reads out for most
@@ -39,7 +39,7 @@ class Profile(StrEnum):
 
 
 class Distribution(Protocol):
-    """Interface of a probability distribution of one quantity."""
+    """An interface of a probability distribution of one quantity."""
 
     def draw(self, random: np.random.Generator) -> Any:
         """Return a random sample."""
@@ -52,7 +52,7 @@ class Distribution(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """Normal distribution, limited to MAX_DEVIATION_SIGMAS and to the range `low` to `high`."""
+    """A normal distribution, limited to MAX_DEVIATION_SIGMAS and to the range `low` to `high`."""
 
     mean: float
     sigma: float
@@ -69,7 +69,7 @@ class Normal:
 
 @dataclass(frozen=True, slots=True)
 class LogNormal:
-    """Log-normal distribution, limited to MAX_DEVIATION_SIGMAS."""
+    """A log-normal distribution, limited to MAX_DEVIATION_SIGMAS."""
 
     median: float
     sigma_ln: float
@@ -84,7 +84,7 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True)
 class HalfNormal:
-    """Distribution of the absolute value of a normal deviate, limited to MAX_DEVIATION_SIGMAS."""
+    """A distribution of the absolute value of a normal deviate, limited to MAX_DEVIATION_SIGMAS."""
 
     sigma: float
 
@@ -97,7 +97,7 @@ class HalfNormal:
 
 @dataclass(frozen=True, slots=True)
 class Uniform:
-    """Uniform distribution from `low` to `high`."""
+    """A uniform distribution from `low` to `high`."""
 
     low: float
     high: float
@@ -112,7 +112,7 @@ class Uniform:
 
 @dataclass(frozen=True, slots=True)
 class LogUniform:
-    """Distribution from `low` to `high` whose logarithm is uniform."""
+    """A distribution from `low` to `high` whose logarithm is uniform."""
 
     low: float
     high: float
@@ -127,7 +127,7 @@ class LogUniform:
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """Choice of one of a few values in ascending order, all equally likely."""
+    """A choice of one of a few values in ascending order, all equally likely."""
 
     values: tuple[float, ...]
 
@@ -141,7 +141,7 @@ class OneOf:
 
 @dataclass(frozen=True, slots=True)
 class Always:
-    """Constant value, without tolerance."""
+    """A constant value, without tolerance."""
 
     value: float | str
 
@@ -154,7 +154,7 @@ class Always:
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """Row of the table: the distribution of one parameter of the apparatus.
+    """A row of the table: the distribution of one parameter of the apparatus.
 
     key: dotted path in the apparatus; "*" stands for both arms or both lenses.
     unit, scale: unit in tables, and the factor from SI units to it.
@@ -343,7 +343,7 @@ NOT_SIMULATED: dict[str, str] = {
     "finger.hand_damping_ratio": _ONLY_COUPLED,
     "finger.hand_stiffness_n_per_m": _ONLY_COUPLED,
 }
-"""Keys of an apparatus without effect in the shipped graphs, with the reason."""
+"""The keys of an apparatus without effect in the shipped graphs, with the reason."""
 
 
 def expand_key(key: str) -> tuple[str, ...]:

@@ -21,17 +21,17 @@ from flexsheet.nodes.models.shapes.triangles import find_degenerate, nearest_in_
 Indices = NDArray[np.intp]
 
 AROUND, ALONG = 160, 40
-"""Number of vertices around the x axis, and of rows along it (twice for rounded shapes)."""
+"""The number of vertices around the x axis, and of rows along it (twice for rounded shapes)."""
 PLANE_CELLS = 64
 MAX_EDGE_M = 0.004
-"""Maximum edge length of the triangles of a mesh object after subdivision."""
+"""The maximum edge length of the triangles of a mesh object after subdivision."""
 NEAREST_VERTICES = 3
-"""Number of skin vertices near a point whose triangles are searched for its nearest point."""
+"""The number of skin vertices near a point whose triangles are searched for its nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrueObject:
-    """Mesh of the virtual object's surface at one time.
+    """A mesh of the virtual object's surface at one time.
 
     vertices: (vertices, 3) in the world frame; they are doubled along sharp edges.
     triangles: (triangles, 3) indices of vertices, facing outward.
@@ -48,7 +48,7 @@ class TrueObject:
 
 
 class TrueBody:
-    """Virtual object of a scene, of any shape; a plane is the rectangle that can be touched."""
+    """A virtual object of a scene, of any shape; a plane is the rectangle that can be touched."""
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object

@@ -35,7 +35,7 @@ from flexsheet.nodes.node import NodeParameters
 
 
 class SimulatorParameters(NodeParameters):
-    """Parameters of a simulator node; no other nodes receive the apparatus."""
+    """The parameters of a simulator node; no other nodes receive the apparatus."""
 
     apparatus: Apparatus | None = Field(
         default=None,

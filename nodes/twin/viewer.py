@@ -15,7 +15,7 @@ from flexsheet.nodes.twin.membrane import DeformedSheet
 Floats = NDArray[np.float64]
 
 ALIGNMENT_RAD = 1e-3
-"""Standard deviation per axis of the angle between two points that appear aligned to an eye.
+"""The standard deviation per axis of the angle between two points that appear aligned to an eye.
 
 A bead 0.13 m in front of a sheet at 0.4 m is out of focus by 1.2 dioptres. With a pupil of 3 mm it
 appears as a disc of 3.6 mrad. A person can locate its centre to about a quarter of this diameter.
@@ -23,7 +23,7 @@ appears as a disc of 3.6 mrad. A person can locate its centre to about a quarter
 
 
 class Viewer:
-    """Person with the eyes of `true_scene`; sway: motion of the head, or None if it is at rest."""
+    """A person with the eyes of `true_scene`; sway: motion of the head, or None if it is at rest."""
 
     def __init__(
         self, true_scene: Scene, sway: HeadSway | None, random: np.random.Generator
