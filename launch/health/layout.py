@@ -85,7 +85,7 @@ class ContactSample:
 
 @dataclass(frozen=True, slots=True)
 class LayoutSamples:
-    """The sheet poses that the arms must reach, with tilt (n,), push depth (n,) and contact (n, 3)."""
+    """The sheet poses that the arms must reach: tilts (n,), push depths (n,), contacts (n, 3)."""
 
     poses: SheetPoses
     tilt_rad: Floats
@@ -103,7 +103,7 @@ class LayoutRemedy:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The result of the check: the reach of each arm, blocked paths between samples, and remedies."""
+    """The result of the layout check: the reach of each arm, blocked paths, and remedies."""
 
     scene: Scene
     samples: LayoutSamples

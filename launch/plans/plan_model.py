@@ -76,7 +76,7 @@ class RestartSpec(StrictModel):
 
 
 class Writer(StrictModel):
-    """A writer of a topic, with an ipc endpoint for readers on its host and a tcp one for others."""
+    """A writer of a topic, with an ipc endpoint for readers on its host and a tcp endpoint."""
 
     name: str
     host: str
@@ -194,7 +194,7 @@ class OmittedNode(StrictModel):
 
 
 class ResolvedGraph(StrictModel):
-    """A resolved launch file: nodes and hosts with all defaults, and the endpoints of all topics."""
+    """A resolved launch file: nodes and hosts with all defaults, and endpoints of all topics."""
 
     launch_file: str
     launch_text: str

@@ -37,7 +37,7 @@ TARGET_TOPIC = "sheet_target"
 
 
 class StopPath(StrEnum):
-    """The means by which an e-stop was sent: a socket, a topic, or a signal that kills a process."""
+    """The means of sending an e-stop: a socket, a topic, or a signal that kills a process."""
 
     LAUNCHER = "launcher"
     NODE = "node"

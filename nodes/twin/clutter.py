@@ -2,8 +2,8 @@
 
 Positions are in m; `pixels.py` renders the objects. The path of an object is in the world frame,
 or relative to the fingertip if the object is `carried`. `views` names the cameras that see the
-object. Levels are grey levels (0 to 255) at normal exposure, at which the marker on the fingertip
-has a level of about 215.
+object. Levels are grey levels (0 to 255) at normal exposure. The marker on the fingertip has a
+level of about 215.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ Views = Literal["both", "left", "right"]
 MARKER_RADIUS_M = 0.003
 FINGER_LENGTH_M = 0.06
 FINGER_DIRECTION: Point = (0.0, -0.5, 0.866)
-"""The world direction from the fingertip to the knuckle; the finger must not hide the marker."""
+"""The world direction from the fingertip to the knuckle, for which the finger does not hide the
+marker."""
 
 
 class Trajectory(Protocol):
-    """An interface of a position as a function of simulation time."""
+    """The interface of a position as a function of simulation time."""
 
     def at(self, time_s: float) -> Floats:
         """Return the position (3,) in the world frame, or relative to the fingertip, m."""
@@ -55,7 +56,7 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Oscillation:
-    """A sinusoidal oscillation about the centre `middle` with the amplitude `reach`."""
+    """A sinusoidal trajectory about the centre `middle` with the amplitude `reach` (3,), m."""
 
     middle: Point
     reach: Point
@@ -94,7 +95,8 @@ class SecondMarker:
 class Highlight:
     """A reflection of a lamp: a small spot whose light is added to the background.
 
-    It saturates above 255. On a curved surface it often appears in only one of the two images.
+    The image saturates above the grey level 255. A reflection on a curved surface often appears in
+    only one of the two images.
     """
 
     path: Trajectory
@@ -161,10 +163,10 @@ def touching_highlight(
 
 
 def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clutter:
-    """Make an occluder whose straight edge hides the fraction `share` of the marker's area.
+    """Make an occluder whose straight edge hides the fraction `share` (0 to 1) of the marker.
 
-    It comes from +x. At `share` = 1 it hides the marker with its blur. With `views`, it hides the
-    marker from one camera only.
+    The occluder comes from +x. At `share` = 1 it also hides the blur of the marker.
+    views: cameras from which the marker is hidden.
     """
     radius_m = 0.05
     if share >= 1.0:
@@ -184,10 +186,12 @@ def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clut
 
 
 def together(*parts: Clutter) -> Clutter:
-    """Combine sets of clutter; raises ValueError if several contain a sheet."""
+    """Combine sets of clutter; raise ValueError if several sets contain a sheet."""
     sheets = [part.sheet for part in parts if part.sheet is not None]
     if len(sheets) > 1:
-        raise ValueError(f"{len(sheets)} sheets found; give one, since it fills the plane z = 0")
+        raise ValueError(
+            f"the clutter has {len(sheets)} sheets; give one, because a sheet fills the plane z = 0"
+        )
     return Clutter(
         sheet=sheets[0] if sheets else None,
         limbs=tuple(limb for part in parts for limb in part.limbs),
@@ -260,4 +264,4 @@ CLUTTER = {
     "lab": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS),
     "crowded": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS, PASSING),
 }
-"""The sets of clutter by their names in launch files."""
+"""The sets of clutter by their names in launch files, such as "lab"."""

@@ -27,14 +27,16 @@ CELLS = 8
 """The number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
 
 SOLVE_PERIOD_NS = 500_000_000
+"""The minimum time between two solutions of the sheet's shape, ns."""
+
 MAX_FINGER_MOTION_M = 5e-4
-"""The period in which the sheet's shape is solved, and motion of a pushing finger since the last
-solution beyond which the marks are not drawn, because the shape is not known."""
+"""The maximum motion of a pushing finger since the last solution of the sheet's shape. After a
+larger motion the shape is unknown, and no marks are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Heights:
-    """The heights (n,) of the sheet at the marks, above the plane of its edges.
+    """The heights (n,) of the sheet at the projected marks, above the plane of its edges.
 
     finger_sheet_m: position (3,) of the fingertip in the frame of this plane. pushed: whether the
     finger deforms the sheet.
@@ -53,9 +55,10 @@ class LitMarks:
     """
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
-        """Store the devices.
+        """Store the true devices.
 
-        scene: scene with the true devices. apparatus: their deviations from the nodes' scene.
+        scene: scene with the true devices. apparatus: deviations of the devices from the scene that
+        the nodes assume.
         """
         self._scene, self._apparatus = scene, apparatus
         projector = require_projector(scene)
@@ -82,7 +85,10 @@ class LitMarks:
             self._frames.append((frame.light_ns + late_ns, frame.marks_px))
 
     def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
-        """Return the lit points (n, 3) in the world at `at_ns`; empty if they are unknown."""
+        """Return the lit world points (n, 3), m, at `at_ns`; empty if the points are unknown.
+
+        finger: position (3,) of the fingertip.
+        """
         shown = [pixels for light_ns, pixels in self._frames if light_ns <= at_ns]
         if not shown:
             return np.zeros((0, 3))
@@ -155,7 +161,7 @@ class LitMarks:
 
 
 def _plane_of(left: Floats, right: Floats) -> Floats:
-    """Return the pose (4, 4) of the plane through two edges (4, 4); z points towards the user."""
+    """Return the pose (4, 4) of the plane through both edges (4, 4); z points towards the user."""
     across = right[:3, 3] - left[:3, 3]
     across = across / np.linalg.norm(across)
     normal = np.cross(across, left[:3, 1] + right[:3, 1])

@@ -21,8 +21,8 @@ from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 CELLS = 8
-"""The membrane elements per side. The sag at the usable height differs by 0.3 % from that with 32.
-"""
+"""The number of membrane elements per side. The sag at the usable height differs by 0.3 % from the
+sag with 32 elements."""
 
 STRETCH_NODES = 4
 LEANS = np.array([0.35, 0.7, 1.0])
@@ -48,7 +48,7 @@ class SheetPlanes:
 
 
 class SagTable:
-    """A table of the unloaded sheet's sag over stretch, tilt and position, solved by the membrane."""
+    """A table of the unloaded sheet's sag over stretch, tilt and position."""
 
     def __init__(
         self, rubber: TrueRubber, min_stretch_ratio: float, max_stretch_ratio: float
@@ -65,14 +65,14 @@ class SagTable:
     def evaluate(
         self, distances_m: Floats, leans: Floats, x_m: Floats, y_m: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the sag along the normal (n,) m, and its derivatives along x and y (n,).
+        """Return the sag along the normal (n,), m, and its derivatives along x and y (n,).
 
-        distances_m: between the edges. leans: vertical component of the sheet normal. x_m, y_m:
-        position relative to the sheet's centre.
+        distances_m: distances (n,) between the edges. leans: vertical components (n,) of the sheet
+        normals. x_m, y_m: positions (n,) relative to the sheet's centre.
         """
         stretches = np.clip(distances_m / self._width_m, *self._range)
-        by_stretch = _lagrange(self._stretches, stretches) / _compute_tension(stretches)
-        by_lean = leans * _lagrange(LEANS**2, leans**2) / LEANS[:, None]
+        by_stretch = lagrange(self._stretches, stretches) / _compute_tension(stretches)
+        by_lean = leans * lagrange(LEANS**2, leans**2) / LEANS[:, None]
         across = np.clip(x_m / distances_m + 0.5, 0.0, 1.0)
         result = np.zeros((3, len(x_m)))
         for fields, tension, weights in zip(
@@ -85,15 +85,16 @@ class SagTable:
 
 
 def _compute_tension(stretch: Floats) -> Floats:
-    """Return the normalized tension of a uniaxially stretched neo-Hookean sheet.
+    """Return the normalized tension (n,) of a uniaxially stretched neo-Hookean sheet.
 
-    The product of sag and tension hardly depends on the stretch, so it is interpolated accurately.
+    The product of sag and tension hardly depends on the stretch, which makes its interpolation
+    accurate.
     """
     return stretch - stretch**-2
 
 
-def _lagrange(nodes: Floats, at: Floats) -> Floats:
-    """Return the values (nodes, n) of the Lagrange polynomials of `nodes` at positions (n,)."""
+def lagrange(nodes: Floats, at: Floats | float) -> Floats:
+    """Return the values (nodes, ...) of the Lagrange polynomials of `nodes` at positions (...)."""
     factors = [
         np.prod([(at - other) / (node - other) for other in nodes if other != node], axis=0)
         for node in nodes
@@ -104,7 +105,10 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
 def _solve_sag(
     rubber: TrueRubber, stretch: float, lean: float
 ) -> scipy.interpolate.RectBivariateSpline:
-    """Solve the sag of a tilted sheet over the position between the edges (0..1) and y (m)."""
+    """Solve the sag (m) of a tilted sheet as a function of x and y.
+
+    x: position between the edges (0..1). y: m. lean: vertical component of the sheet normal.
+    """
     cosine = np.sqrt(1.0 - lean**2)
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, cosine, lean], [0.0, -lean, cosine]])
     half_m = 0.5 * stretch * rubber.width_m
