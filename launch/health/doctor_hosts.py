@@ -50,9 +50,7 @@ MAX_NAMES_SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class HostFinding:
-    """The result of one check of one host; `what`: the finding; `remedy`: empty if the check
-    passed.
-    """
+    """The result of a check of a host. `what` is the finding; `remedy` is empty after success."""
 
     host: str
     check: str
@@ -79,7 +77,7 @@ NETWORK_FAULTS: dict[Reachability, tuple[str, str]] = {
         "open the TCP ports {first}-{last} of {address} for the other hosts in the firewall",
     ),
 }
-"""The finding and remedy if the host cannot be reached."""
+"""The finding and remedy by cause, for hosts that cannot be reached."""
 
 LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.CLOSED: (
@@ -90,7 +88,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.HANDSHAKE_TIMEOUT: (
         "launcher",
-        "accepts connections, but does not complete the handshake",
+        "the host accepts connections, but does not complete the handshake",
         "the launcher hangs, or another program uses its ports; on {host}: flexsheet doctor",
     ),
     Reachability.NO_RESPONSE: (
@@ -100,7 +98,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.KEY_MISMATCH: (
         "keys",
-        "its key is not the one in the launch file of this computer",
+        "the host's key differs from its key in the launch file of this computer",
         "on {host}: flexsheet keys show {host}; here: flexsheet keys install {file} {host} 'KEY'",
     ),
     Reachability.KEY_REJECTED: (
@@ -110,7 +108,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.UNENCRYPTED: (
         "keys",
-        "the host does not encrypt, or another program uses its ports",
+        "the host does not encrypt its messages, or another program uses its ports",
         "copy {file} from here to {host} and restart the launcher there",
     ),
     Reachability.OWN_KEY_INVALID: (
@@ -119,10 +117,10 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
         "correct the key of this computer first; see the findings of {here}",
     ),
 }
-"""The check, finding and remedy if the host is on, but its launcher does not report."""
+"""The check, finding and remedy by cause, for hosts that are on, but whose launcher is silent."""
 
 SELF_CHECK = "self-check"
-"""The name of the check that lists the causes of error which the nodes of a host suspect."""
+"""The name of the check that lists the calibration errors that the nodes of a host suspect."""
 
 
 def evaluate_probes(
@@ -160,7 +158,7 @@ REQUIRED_FOR_CHECKS = {
     "touch_point_world_m": "the marker on the finger",
     "sheet_calibration": "the sheet's modulus (`flexsheet calibrate sheet`)",
 }
-"""The name of each optional check, by the parameter that enables it."""
+"""The names of the optional checks, by the node parameter that enables the check."""
 
 
 def check_apparatus(
@@ -208,7 +206,7 @@ def _check_reachability(
         what, remedy = NETWORK_FAULTS[probe.reachability]
         problem = what.format(**fields)
         yield HostFinding(host, "reachable", "failed", problem, remedy.format(**fields))
-        yield HostFinding(host, "all else", "not asked", "the host cannot be reached")
+        yield HostFinding(host, "other checks", "not asked", "the host cannot be reached")
         return
     yield HostFinding(
         host, "reachable", "ok", f"{address}, {'this computer' if host == here else 'by TCP'}"
@@ -231,7 +229,7 @@ def _check_reachability(
             "warning" if probe.reachability == Reachability.CLOSED and not running else "failed"
         )
         yield HostFinding(host, check, state, what.format(**fields), remedy.format(**fields))
-        yield HostFinding(host, "all else", "not asked", "its launcher does not report")
+        yield HostFinding(host, "other checks", "not asked", "the host's launcher does not report")
     for text in probe.failed_handshakes[:MAX_NAMES_SHOWN]:
         # The first handshake of this probe succeeded, so the keys are correct.
         remedy = "the host is very busy or the network is slow; run this check again"
@@ -261,7 +259,8 @@ def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[Ho
             probe.host,
             "plan",
             "failed",
-            f"runs plan {probe.status.plan_hash}; {plan.launch_file} resolves to {plan.hash}",
+            f"the host runs plan {probe.status.plan_hash}, but {plan.launch_file} resolves to plan "
+            f"{plan.hash}",
             remedy,
         )
     if probe.status.estop is not None:
@@ -269,8 +268,8 @@ def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[Ho
             probe.host,
             "e-stop",
             "warning",
-            f"engaged: {probe.status.estop}",
-            "when it is safe, on a host that may reset: flexsheet arms reset",
+            f"an e-stop is engaged: {probe.status.estop}",
+            "when it is safe, run on a host that may reset it: flexsheet arms reset",
         )
 
 
@@ -284,7 +283,7 @@ def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
             probe.host,
             "keys",
             "failed",
-            f"its keys differ from this launch file for {', '.join(other)}",
+            f"the host's keys differ from this launch file for {', '.join(other)}",
             f"copy {plan.launch_file} to {probe.host}; its launcher reloads it automatically",
         )
     return HostFinding(
@@ -323,7 +322,7 @@ def _check_clocks(
             probe.host,
             "clocks",
             "failed",
-            "its clock node does not publish",
+            "the clock node of the host does not publish",
             "see the log of the clock node",
         )
     limit_s = probe.clocks.max_offset_uncertainty_s
@@ -361,7 +360,11 @@ def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     log = f"{probe.status.run}/logs in the folder of runs on {probe.host}"
     if missing:
         return HostFinding(
-            probe.host, "nodes", "failed", f"not ready: {', '.join(missing)}", f"see {log}"
+            probe.host,
+            "nodes",
+            "failed",
+            f"these nodes are not ready: {', '.join(missing)}",
+            f"see {log}",
         )
     if restarted:
         what = f"{len(nodes)} ready; restarts: {', '.join(restarted)}"
@@ -395,7 +398,7 @@ def _check_rates(probe: HostProbe) -> HostFinding:
 
 
 def find_rate_problem(port: PortStatus) -> str | None:
-    """Return why a port's message rate is outside the range of its topic; None if it is inside."""
+    """Return why a port's message rate is outside the range of its topic, or None if it is not."""
     topic = TOPICS.get(port.topic)
     if topic is None or topic.rate_hz is None or topic.many_writers:
         return None
@@ -418,7 +421,7 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
         f"check OpenGL on that host: flexsheet doctor; {OPENGL_REMEDY}",
     ),
 }
-"""The name of the check and remedy for nodes that must publish, by role."""
+"""The name and the remedy of the check that a node publishes, by role of the node."""
 
 
 def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[HostFinding]:
@@ -526,7 +529,7 @@ def _shorten(texts: Sequence[str]) -> list[str]:
 
 
 def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
-    """Return why the key of this computer cannot be used to probe hosts; None if it can."""
+    """Return why the key of this computer cannot be used to probe hosts, or None if it can."""
     if not plan.keys:
         return None
     file = secret_file(here)
@@ -553,7 +556,8 @@ def check_before_start(
             here,
             "address",
             "failed",
-            f"{address} is not this computer's; it has {', '.join(sorted(list_own_addresses()))}",
+            f"{address} is not an address of this computer, which has "
+            f"{', '.join(sorted(list_own_addresses()))}",
             "name the right host with --host, or correct the launch file on all hosts",
         )
     if key_problem is not None:
@@ -616,7 +620,7 @@ def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
 
 
 def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
-    """Check that an arm's controller accepts connections; call it while no graph is running."""
+    """Check that an arm's controller accepts connections, while no graph is running."""
     check = f"arm {node.arm_side}"
     if node.device_address is None:
         return HostFinding(here, check, "not asked", f"{node.name} uses its own driver")

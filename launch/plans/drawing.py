@@ -107,14 +107,14 @@ def svg(drawing: GraphDrawing) -> str:
 
 
 MARGIN, COLUMN, ROW, HOST_GAP = 30, 230, 75, 45
-"""The outer margin, column and row pitch, and gap between hosts in an automatic layout, px."""
+"""The outer margin, the column pitch, the row pitch, and the gap between hosts in a drawing, px."""
 
 
 def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
     """Return the topics that connect each pair of nodes (writer, reader).
 
-    Topics with any number of writers, such as estop and status, are omitted. So are the inputs of
-    nodes that read all published topics, such as a recorder.
+    Topics with any number of writers, such as estop and status, are omitted. Inputs of nodes that
+    read all published topics, such as a recorder, are also omitted.
     """
     links: dict[tuple[str, str], list[str]] = {}
     for node in plan.nodes.values():
@@ -128,7 +128,10 @@ def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
 
 
 def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """Assign each node a column right of all nodes whose topics it reads; ignore loops."""
+    """Assign each node a column to the right of all nodes whose topics it reads; ignore loops.
+
+    links: pairs (writer, reader).
+    """
     order: list[str] = []
     seen: set[str] = set()
 
@@ -176,7 +179,7 @@ def lay_out(plan: ResolvedGraph) -> GraphDrawing:
 
 
 def _connect(boxes: dict[str, Position], writer: str, reader: str, topics: Sequence[str]) -> Arrow:
-    """Return an arrow: straight to a reader on the right, below both boxes to other readers."""
+    """Return a straight arrow to a reader on the right, or an arrow below both boxes otherwise."""
     (x1, y1), (x2, y2) = boxes[writer], boxes[reader]
     if x2 > x1:
         start, end = (x1 + WIDTH / 2, y1), (x2 - WIDTH / 2, y2)

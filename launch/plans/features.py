@@ -1,4 +1,4 @@
-"""Parts of the display that a run can omit; a module of its own, so that commands start fast."""
+"""Define the parts of the display that a run can omit, in a module that commands import fast."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from flexsheet.messages.types import EStop
 
 STATE_VARIABLE = "FLEXSHEET_STATE"
-"""The environment variable that replaces the default folder of state that survives a reboot."""
+"""The environment variable that replaces the default folder of persistent state."""
 
 
 def directory() -> Path:

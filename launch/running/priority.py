@@ -1,4 +1,4 @@
-"""Determine how far the user may raise the priority of processes (negative niceness)."""
+"""Determine the highest priority (minimum niceness) that the user may give to processes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _has_cap_sys_nice() -> bool:
 
 
 def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Describe which nodes have a niceness that is not permitted; None if there are none."""
+    """Describe the nodes whose niceness is not permitted; return None if there are none."""
     minimum = min_nice_step()
     names = [node.name for node in nodes if node.nice < minimum]
     if not names:

@@ -146,23 +146,19 @@ class Clutter:
     occluders: tuple[Occluder, ...] = ()
 
 
-def second_marker(offset_m: Point, *, level: float = 215.0, views: Views = "both") -> Clutter:
-    """Make a second marker at a fixed offset from the fingertip."""
-    return Clutter(
-        markers=(SecondMarker(FixedPoint(offset_m), level=level, carried=True, views=views),)
-    )
+def second_marker(offset_m: Point) -> Clutter:
+    """Make a second marker at a fixed offset (3,) from the fingertip, m."""
+    return Clutter(markers=(SecondMarker(FixedPoint(offset_m), carried=True),))
 
 
-def touching_highlight(
-    overlap: float, *, radius_m: float = 0.0015, level: float = 300.0, views: Views = "both"
-) -> Clutter:
+def touching_highlight(overlap: float, *, radius_m: float = 0.0015) -> Clutter:
     """Make a highlight beside the marker (+x) that covers a fraction of the marker's diameter."""
     aside_m = MARKER_RADIUS_M + radius_m - overlap * 2.0 * MARKER_RADIUS_M
-    spot = Highlight(FixedPoint((aside_m, 0.0, 0.0)), radius_m, level, carried=True, views=views)
+    spot = Highlight(FixedPoint((aside_m, 0.0, 0.0)), radius_m, 300.0, carried=True)
     return Clutter(highlights=(spot,))
 
 
-def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clutter:
+def covered(share: float, *, views: Views = "both") -> Clutter:
     """Make an occluder whose straight edge hides the fraction `share` (0 to 1) of the marker.
 
     The occluder comes from +x. At `share` = 1 it also hides the blur of the marker.
@@ -180,9 +176,7 @@ def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clut
         )
     middle_m = edge * MARKER_RADIUS_M + radius_m
     ends = [FixedPoint((middle_m, y, 0.0)) for y in (-0.02, 0.02)]
-    return Clutter(
-        occluders=(Occluder(ends[0], ends[1], radius_m, level, carried=True, views=views),)
-    )
+    return Clutter(occluders=(Occluder(ends[0], ends[1], radius_m, carried=True, views=views),))
 
 
 def together(*parts: Clutter) -> Clutter:

@@ -124,9 +124,7 @@ class TwinEyeNode(Node):
         if self.scene.message is None or self.twin__arms.message is None:
             self.note = "waits for the scene and the simulated arms"
         elif frame.stereo != "mono" and frame.eye == "both":
-            self.note = (
-                f'frame "{frame.label}" is not rendered, because it has two views ({frame.stereo})'
-            )
+            self.note = f'frame "{frame.label}" with two views ({frame.stereo}) cannot be rendered'
         elif self._queue.is_full:
             if self._queue.reject(key):
                 self.report_error(

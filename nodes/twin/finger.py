@@ -361,7 +361,8 @@ class FingerMotion:
             at = int(np.argmax(speeds))
             raise FingerPathError(
                 f"path: the speed {speeds[at]:.3g} m/s after times_s[{at}] = {times_s[at]:.6g} "
-                f"exceeds finger.max_speed_m_per_s = {max_speed_m_per_s:.3g} m/s; increase the times"
+                f"exceeds finger.max_speed_m_per_s = {max_speed_m_per_s:.3g} m/s; increase the "
+                "times"
             )
         start, start_velocity, amplitudes = self._steady(at_s)
         distance_m = float(np.linalg.norm(points[0] - start))

@@ -23,6 +23,7 @@ from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.membrane import solve
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_surface import make_edge_plane
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 CELLS = 12
@@ -68,11 +69,9 @@ class TrueSheetForce:
         tip: position (3,), m. left, right: poses (4, 4). time_s must not decrease between calls.
         """
         edges = left @ self._clamps[0], right @ self._clamps[1]
-        across = edges[1][:3, 3] - edges[0][:3, 3]
-        normal = np.cross(across, edges[0][:3, 1] + edges[1][:3, 1])
-        normal /= np.linalg.norm(normal)
-        elastic_n = 0.0
-        if (tip - 0.5 * (edges[0][:3, 3] + edges[1][:3, 3])) @ normal < 0.0:
+        plane = make_edge_plane(*edges)
+        normal, elastic_n = plane[:3, 2], 0.0
+        if (tip - plane[:3, 3]) @ normal < 0.0:
             pressed = solve(
                 self._rubber,
                 *edges,

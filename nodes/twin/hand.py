@@ -25,7 +25,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.sheet_reaction import SheetReaction
-from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
+from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface, make_edge_plane
 
 VoluntaryPath = Callable[[float], tuple[Floats, Floats]]
 """A function from a time, s, to the voluntary position (3,), m, and velocity (3,), m/s."""
@@ -118,18 +118,14 @@ class TrueSheet:
         edges: poses (4, 4) of the left and right edges. tip: world position (3,), m.
         """
         left, right = edges
-        across = right[:3, 3] - left[:3, 3]
-        distance_m = float(np.linalg.norm(across))
-        x_axis = across / distance_m
-        normal = np.cross(x_axis, left[:3, 1] + right[:3, 1])
-        normal /= np.linalg.norm(normal)
-        middle = 0.5 * (left[:3, 3] + right[:3, 3])
+        distance_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
+        x_axis, y_axis, normal, middle = make_edge_plane(left, right)[:3].T
         if float((tip - middle) @ normal) > NEAR_M:
             return Touch(middle, normal, np.zeros(2))
         plane = SheetPlanes(middle[None], normal[None], x_axis[None], np.array([distance_m]))
         surface = self._surface.find_tangent_planes(plane, tip[None], UP)
         x_m = float((tip - middle) @ x_axis)
-        y_m = float((tip - middle) @ np.cross(normal, x_axis))
+        y_m = float((tip - middle) @ y_axis)
         sag_m = 0.0
         if surface is not plane:
             sag_m = float((surface.points[0] - middle) @ normal)

@@ -21,6 +21,7 @@ from flexsheet.nodes.twin.membrane import DeformedSheet, NotConvergedError, solv
 from flexsheet.nodes.twin.projector import on_plane
 from flexsheet.nodes.twin.rig import slopes_of
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_surface import make_edge_plane
 from flexsheet.nodes.twin.truth import find_display_delay_s
 
 CELLS = 8
@@ -93,7 +94,7 @@ class LitMarks:
         if not shown:
             return np.zeros((0, 3))
         edges = self._edges(arms)
-        plane = _plane_of(*edges)
+        plane = make_edge_plane(*edges)
         local = apply(inverse(plane), finger)
         self._solve_if_due(edges, plane, finger, shown[-1], at_ns)
         heights = self._heights
@@ -158,13 +159,3 @@ class LitMarks:
         heights = np.where(lands, apply(inverse(plane), points)[:, 2], 0.0)
         local = apply(inverse(plane), finger)
         return _Heights(heights, local, bool(np.any(sheet.finger_force_n)))
-
-
-def _plane_of(left: Floats, right: Floats) -> Floats:
-    """Return the pose (4, 4) of the plane through both edges (4, 4); z points towards the user."""
-    across = right[:3, 3] - left[:3, 3]
-    across = across / np.linalg.norm(across)
-    normal = np.cross(across, left[:3, 1] + right[:3, 1])
-    normal /= np.linalg.norm(normal)
-    rotation = np.column_stack([across, np.cross(normal, across), normal])
-    return transform(rotation, 0.5 * (left[:3, 3] + right[:3, 3]))

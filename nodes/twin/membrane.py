@@ -429,7 +429,6 @@ def solve(
     finger_radius_m: float = 0.007,
     friction_coefficient: float | None = None,
     cells: int = CELLS,
-    slack_tension: float = SLACK_TENSION,
 ) -> DeformedSheet:
     """Solve the equilibrium of the sheet between its edges, pushed by a fingertip.
 
@@ -445,7 +444,6 @@ def solve(
         finger_radius_m=finger_radius_m,
         friction_coefficient=friction_coefficient,
         cells=cells,
-        slack_tension=slack_tension,
     )[-1]
 
 

@@ -198,7 +198,7 @@ class MxtController:
         self._filtered_rad = self._filtered_rad + self._filter_share * (wanted - self._filtered_rad)
 
     def _acting(self) -> Floats:
-        """Return the set-point (6,), rad, that takes effect now: the latest one before latency."""
+        """Return the set-point (6,), rad, that takes effect now, after the latency."""
         late_s = self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
         if not late_s:
             self._late.clear()
@@ -253,7 +253,7 @@ class MxtController:
                 "measured joint angles"
             )
         if (step > self._max_step_rad).any():
-            raise MxtError("the set-point is too far from the previous set-point")
+            raise MxtError("the step from the previous set-point is too large")
         self._moved, self.wanted_rad = True, joints
 
     def _set_point(self, send_type: int, data: Floats) -> Floats:

@@ -19,9 +19,10 @@ from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
     pose_matrix,
+    rotation_from_rpy,
     rotation_from_vector,
+    rpy_from_rotation,
     transform,
-    transform_from_rpy,
 )
 from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
@@ -76,23 +77,9 @@ def make_true_projector(projector: Projector, *, seed: int) -> Projector:
             ),
             "world_from_projector": Pose(
                 position_m=pose.position_m + OFFSET_DEVIATION_M * deviation(3),
-                rpy_rad=_rpy(turned @ transform_from_rpy([0.0] * 3, pose.rpy_rad)[:3, :3]),
+                rpy_rad=rpy_from_rotation(turned @ rotation_from_rpy(pose.rpy_rad)),
             ),
         }
-    )
-
-
-def _rpy(rotation: Floats) -> Floats:
-    """Convert a rotation matrix (3, 3) to roll, pitch, yaw (3,) about fixed x, y, z axes, rad.
-
-    The angles are not unique at a pitch of +-90 degrees.
-    """
-    return np.array(
-        [
-            np.arctan2(rotation[2, 1], rotation[2, 2]),
-            -np.arcsin(np.clip(rotation[2, 0], -1.0, 1.0)),
-            np.arctan2(rotation[1, 0], rotation[0, 0]),
-        ]
     )
 
 

@@ -117,7 +117,7 @@ def compute_reaction(
     """
 
     def push_n(stretch: float, across: float, along: float) -> Floats:
-        """Return the forces (n,), N; the position is in fractions of the sheet's width and height."""
+        """Return the forces (n,), N, at a position in fractions of the sheet's width and height."""
         half_m = 0.5 * stretch * rubber.width_m
         edges = [transform(np.eye(3), [side * half_m, 0.0, 0.0]) for side in (-1.0, 1.0)]
         at = 2.0 * across * half_m, along * rubber.height_m

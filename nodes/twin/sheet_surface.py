@@ -47,6 +47,19 @@ class SheetPlanes:
     distances_m: Floats
 
 
+def make_edge_plane(left: Floats, right: Floats) -> Floats:
+    """Return the pose (4, 4) of the plane through both edges (4, 4) of the sheet.
+
+    The origin is midway between the edges, x points to the right edge and z towards the user.
+    """
+    across = right[:3, 3] - left[:3, 3]
+    across = across / np.linalg.norm(across)
+    normal = np.cross(across, left[:3, 1] + right[:3, 1])
+    normal /= np.linalg.norm(normal)
+    rotation = np.column_stack([across, np.cross(normal, across), normal])
+    return transform(rotation, 0.5 * (left[:3, 3] + right[:3, 3]))
+
+
 class SagTable:
     """A table of the unloaded sheet's sag over stretch, tilt and position."""
 

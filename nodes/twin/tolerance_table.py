@@ -391,11 +391,8 @@ def deviate_apparatus(
     period_s = 1.0 / scene.camera.rate_hz if profile in row.frame_periods else 1.0
     for path in expand_key(key):
         like = value_at(values, path)
-        each = (
-            given
-            if isinstance(given, tuple)
-            else (given,) * (len(like) if isinstance(like, list) else 1)
-        )
+        count = len(like) if isinstance(like, list) else 1
+        each = given if isinstance(given, tuple) else (given,) * count
         found = [one.at(sigmas) for one in each]
         set_value(values, path, found if isinstance(like, list) else _timed(found[0], period_s))
     return Apparatus.model_validate(values)
