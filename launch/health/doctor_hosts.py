@@ -11,6 +11,7 @@ import shutil
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -119,6 +120,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
 }
 """The check, finding and remedy by cause, for hosts that are on, but whose launcher is silent."""
 
+SAME_COMMIT_REMEDY = "use the same commit on all hosts: git pull, make setup, and start again"
 SELF_CHECK = "self-check"
 """The name of the check that lists the calibration errors that the nodes of a host suspect."""
 
@@ -168,17 +170,12 @@ def check_apparatus(
     checks = [one for status in probe.nodes.values() for one in status.self_checks]
     suspected = [one for one in checks if one.suspected]
     for one in suspected:
-        yield HostFinding(
-            probe.host,
-            SELF_CHECK,
-            "warning",
-            describe_self_check(one),
-            SELF_CHECK_REMEDIES[one.cause],
-        )
+        what, remedy = describe_self_check(one), SELF_CHECK_REMEDIES[one.cause]
+        yield HostFinding(probe.host, SELF_CHECK, "warning", what, remedy)
     missing = [
-        f"{what}: set `{parameter}` of {node.name}"
+        f"{subject}: set `{parameter}` of {node.name}"
         for node in nodes
-        for parameter, what in REQUIRED_FOR_CHECKS.items()
+        for parameter, subject in REQUIRED_FOR_CHECKS.items()
         if parameter in node.parameters and not node.parameters[parameter]
     ]
     projects = scene is not None and scene.projector is not None and not shows_check_marks(scene)
@@ -208,20 +205,15 @@ def _check_reachability(
         yield HostFinding(host, "reachable", "failed", problem, remedy.format(**fields))
         yield HostFinding(host, "other checks", "not asked", "the host cannot be reached")
         return
-    yield HostFinding(
-        host, "reachable", "ok", f"{address}, {'this computer' if host == here else 'by TCP'}"
-    )
+    what = f"{address}, {'this computer' if host == here else 'by TCP'}"
+    yield HostFinding(host, "reachable", "ok", what)
     if probe.status is not None:
         up = f"up for {probe.status.uptime_s:.0f} s, run {probe.status.run}"
         yield HostFinding(host, "launcher", "ok", up)
     elif probe.reachability == Reachability.LOCAL:
-        yield HostFinding(
-            host,
-            "launcher",
-            "failed" if running else "warning",
-            "no graph runs here",
-            f"flexsheet launch {plan.launch_file} --host {host}",
-        )
+        remedy = f"flexsheet launch {plan.launch_file} --host {host}"
+        fault: State = "failed" if running else "warning"
+        yield HostFinding(host, "launcher", fault, "no graph runs here", remedy)
     else:
         check, what, remedy = LAUNCHER_FAULTS[probe.reachability]
         # A closed port is not a fault before any graph is started.
@@ -235,13 +227,7 @@ def _check_reachability(
         remedy = "the host is very busy or the network is slow; run this check again"
         yield HostFinding(host, "keys", "warning", text, remedy)
     for text in probe.refused[:MAX_NAMES_SHOWN]:
-        yield HostFinding(
-            host,
-            "messages",
-            "failed",
-            text,
-            "use the same commit on all hosts: git pull, make setup, and start again",
-        )
+        yield HostFinding(host, "messages", "failed", text, SAME_COMMIT_REMEDY)
 
 
 def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[HostFinding]:
@@ -255,22 +241,15 @@ def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[Ho
                 "the file was changed after the start, or --set was used: start again; to check "
                 "the running graph: flexsheet doctor hosts"
             )
-        yield HostFinding(
-            probe.host,
-            "plan",
-            "failed",
+        what = (
             f"the host runs plan {probe.status.plan_hash}, but {plan.launch_file} resolves to plan "
-            f"{plan.hash}",
-            remedy,
+            f"{plan.hash}"
         )
+        yield HostFinding(probe.host, "plan", "failed", what, remedy)
     if probe.status.estop is not None:
-        yield HostFinding(
-            probe.host,
-            "e-stop",
-            "warning",
-            f"an e-stop is engaged: {probe.status.estop}",
-            "when it is safe, run on a host that may reset it: flexsheet arms reset",
-        )
+        what = f"an e-stop is engaged: {probe.status.estop}"
+        remedy = "when it is safe, run on a host that may reset it: flexsheet arms reset"
+        yield HostFinding(probe.host, "e-stop", "warning", what, remedy)
 
 
 def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
@@ -279,16 +258,11 @@ def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     names = sorted(theirs.keys() | plan.keys.keys())
     other = [name for name in names if theirs.get(name) != plan.keys.get(name)]
     if other:
-        return HostFinding(
-            probe.host,
-            "keys",
-            "failed",
-            f"the host's keys differ from this launch file for {', '.join(other)}",
-            f"copy {plan.launch_file} to {probe.host}; its launcher reloads it automatically",
-        )
-    return HostFinding(
-        probe.host, "keys", "ok", f"accepts the same keys as this computer: {', '.join(names)}"
-    )
+        what = f"the host's keys differ from this launch file for {', '.join(other)}"
+        remedy = f"copy {plan.launch_file} to {probe.host}; its launcher reloads it automatically"
+        return HostFinding(probe.host, "keys", "failed", what, remedy)
+    what = f"the host accepts the same keys as this computer: {', '.join(names)}"
+    return HostFinding(probe.host, "keys", "ok", what)
 
 
 def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFinding:
@@ -306,9 +280,8 @@ def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFi
         if theirs != ours
     ]
     if other:
-        remedy = "use the same commit on all hosts: git pull, make setup, and start again"
         what += f"; different from this computer: {', '.join(other)}"
-        return HostFinding(probe.host, "software", "warning", what, remedy)
+        return HostFinding(probe.host, "software", "warning", what, SAME_COMMIT_REMEDY)
     return HostFinding(probe.host, "software", "ok", what)
 
 
@@ -316,15 +289,10 @@ def _check_clocks(
     plan: ResolvedGraph, probe: HostProbe, probes: Mapping[str, HostProbe]
 ) -> HostFinding:
     """Compare the measured clock offsets to the other hosts with the limit of the graph."""
-    remedy = "check chrony and the load of the network: docs/clocks.md"
+    finding = partial(HostFinding, probe.host, "clocks")
     if probe.clocks is None:
-        return HostFinding(
-            probe.host,
-            "clocks",
-            "failed",
-            "the clock node of the host does not publish",
-            "see the log of the clock node",
-        )
+        what = "the clock node of the host does not publish"
+        return finding("failed", what, "see the log of the clock node")
     limit_s = probe.clocks.max_offset_uncertainty_s
     known = {one.clock_id: one for one in probe.clocks.offsets}
     texts, bad = [], False
@@ -345,11 +313,11 @@ def _check_clocks(
                 + (f", stepped {offset.resets} times" if offset.resets else "")
             )
     if not texts:
-        return HostFinding(probe.host, "clocks", "not asked", "no other host reports")
+        return finding("not asked", "no other host reports")
     what = f"{'; '.join(texts)}; {1e3 * limit_s:g} {NodeNote.CLOCK_UNCERTAIN.phrase}"
     if bad:
-        return HostFinding(probe.host, "clocks", "failed", what, remedy)
-    return HostFinding(probe.host, "clocks", "ok", what)
+        return finding("failed", what, "check chrony and the load of the network: docs/clocks.md")
+    return finding("ok", what)
 
 
 def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
@@ -357,19 +325,14 @@ def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     nodes = probe.status.nodes
     missing = [one.name for one in nodes if one.state != "ready"]
     restarted = [f"{one.name} {one.restarts}" for one in nodes if one.restarts]
-    log = f"{probe.status.run}/logs in the folder of runs on {probe.host}"
+    remedy = f"see {probe.status.run}/logs in the folder of runs on {probe.host}"
+    finding = partial(HostFinding, probe.host, "nodes")
     if missing:
-        return HostFinding(
-            probe.host,
-            "nodes",
-            "failed",
-            f"these nodes are not ready: {', '.join(missing)}",
-            f"see {log}",
-        )
+        return finding("failed", f"these nodes are not ready: {', '.join(missing)}", remedy)
     if restarted:
-        what = f"{len(nodes)} ready; restarts: {', '.join(restarted)}"
-        return HostFinding(probe.host, "nodes", "warning", what, f"see {log}")
-    return HostFinding(probe.host, "nodes", "ok", f"{len(nodes)} ready")
+        what = f"{len(nodes)} nodes are ready; restarts: {', '.join(restarted)}"
+        return finding("warning", what, remedy)
+    return finding("ok", f"{len(nodes)} nodes are ready")
 
 
 def _check_rates(probe: HostProbe) -> HostFinding:
@@ -405,11 +368,8 @@ def find_rate_problem(port: PortStatus) -> str | None:
     low, high = topic.rate_hz
     if port.rate_hz == 0.0:
         return f"no {port.topic}"
-    if (
-        not low * (1 - RATE_TOLERANCE_RATIO) - 1
-        <= port.rate_hz
-        <= high * (1 + RATE_TOLERANCE_RATIO) + 1
-    ):
+    low_hz, high_hz = low * (1 - RATE_TOLERANCE_RATIO) - 1, high * (1 + RATE_TOLERANCE_RATIO) + 1
+    if not low_hz <= port.rate_hz <= high_hz:
         return f"{port.topic} at {port.rate_hz:.0f} Hz, expected {low:g} to {high:g}"
     return None
 
@@ -424,29 +384,30 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
 """The name and the remedy of the check that a node publishes, by role of the node."""
 
 
+def _report_devices(
+    host: str, devices: Sequence[str], missing: Sequence[str]
+) -> Iterator[HostFinding]:
+    if missing:
+        what = f"these device files do not exist: {', '.join(missing)}"
+        remedy = "check the cable and the device number: v4l2-ctl --list-devices"
+        yield HostFinding(host, "devices", "failed", what, remedy)
+    elif devices:
+        yield HostFinding(host, "devices", "ok", ", ".join(devices))
+
+
 def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[HostFinding]:
     assert probe.status is not None
     host, missing = probe.host, probe.status.missing_devices
     devices = list_device_files(nodes)
-    if missing:
-        yield HostFinding(
-            host,
-            "devices",
-            "failed",
-            f"missing: {', '.join(missing)}",
-            "check the cable and the device number: v4l2-ctl --list-devices",
-        )
-    elif devices:
-        yield HostFinding(host, "devices", "ok", ", ".join(devices))
+    yield from _report_devices(host, devices, missing)
     for node in nodes:
         if node.role not in OUTPUT_CHECKS:
             continue
         check, remedy = OUTPUT_CHECKS[node.role]
         status = probe.nodes.get(node.name)
         if status is None:
-            yield HostFinding(
-                host, check, "failed", f"{node.name} does not report", "see the node's log"
-            )
+            what = f"{node.name} does not report"
+            yield HostFinding(host, check, "failed", what, "see the node's log")
             continue
         sent = max((one.rate_hz for one in status.outputs if one.topic != "status"), default=0.0)
         what = f"{sent:.0f} Hz; {status.note or 'no note'}"
@@ -484,9 +445,8 @@ def _check_arm(node: ResolvedNode, probe: HostProbe) -> HostFinding:
 def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostFinding:
     status = probe.nodes.get(node.name)
     if status is None:
-        return HostFinding(
-            probe.host, check, "failed", f"{node.name} does not report", "see the node's log"
-        )
+        what = f"{node.name} does not report"
+        return HostFinding(probe.host, check, "failed", what, "see the node's log")
     assert probe.status is not None
     starts = any(one.state == "starting" for one in probe.status.nodes)
     where = "" if node.device_address is None else f" at {node.device_address}"
@@ -498,13 +458,12 @@ def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
     status = probe.status
     assert status is not None
     yield _check_disk(probe.host, status.disk_free_bytes)
+    finding = partial(HostFinding, probe.host, "memory")
     what = f"{status.memory_free_bytes / 2**30:.1f} GiB free"
     if status.memory_free_bytes < MIN_FREE_MEMORY_BYTES:
-        yield HostFinding(
-            probe.host, "memory", "warning", what, "find the largest programs on that host: top"
-        )
+        yield finding("warning", what, "find the largest programs on that host: top")
     else:
-        yield HostFinding(probe.host, "memory", "ok", what)
+        yield finding("ok", what)
 
 
 def _check_load(status: HostStatus) -> HostFinding:
@@ -548,18 +507,13 @@ def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
 def check_before_start(
     plan: ResolvedGraph, here: str, key_problem: str | None
 ) -> Iterator[HostFinding]:
-    address, nodes = plan.hosts[here], plan.nodes_on(here)
-    if is_loopback(address) or address in list_own_addresses():
+    address, nodes, own = plan.hosts[here], plan.nodes_on(here), list_own_addresses()
+    if is_loopback(address) or address in own:
         yield HostFinding(here, "address", "ok", f"{address} is an address of this computer")
     else:
-        yield HostFinding(
-            here,
-            "address",
-            "failed",
-            f"{address} is not an address of this computer, which has "
-            f"{', '.join(sorted(list_own_addresses()))}",
-            "name the right host with --host, or correct the launch file on all hosts",
-        )
+        what = f"{address} is not an address of this computer, which has {', '.join(sorted(own))}"
+        remedy = "name the right host with --host, or correct the launch file on all hosts"
+        yield HostFinding(here, "address", "failed", what, remedy)
     if key_problem is not None:
         remedy = f"flexsheet keys install {plan.launch_file} {here}, then copy it to all hosts"
         yield HostFinding(here, "keys", "failed", key_problem, remedy)
@@ -567,27 +521,14 @@ def check_before_start(
         what = f"{secret_file(here)} matches the launch file; only its owner can read it"
         yield HostFinding(here, "keys", "ok", what)
     elif not all(map(is_loopback, plan.hosts.values())):
-        remedy = (
-            "flexsheet keys new on each host, then flexsheet keys install for each: docs/deploy.md"
-        )
+        remedy = "run flexsheet keys new on each host, then flexsheet keys install: docs/deploy.md"
         yield HostFinding(here, "keys", "failed", "the launch file has no keys", remedy)
     libraries = check_libraries()
-    yield HostFinding(
-        here,
-        "software",
-        libraries.state,
-        f"python {python_version()}, {software()}; {libraries.what}",
-        libraries.remedy,
-    )
+    what = f"python {python_version()}, {software()}; {libraries.what}"
+    yield HostFinding(here, "software", libraries.state, what, libraries.remedy)
     yield _check_ports(plan, here)
     devices = list_device_files(nodes)
-    missing = [one for one in devices if not os.path.exists(one)]
-    if missing:
-        remedy = "check the cable and the device number: v4l2-ctl --list-devices"
-        what = f"missing: {', '.join(missing)}"
-        yield HostFinding(here, "devices", "failed", what, remedy)
-    elif devices:
-        yield HostFinding(here, "devices", "ok", ", ".join(devices))
+    yield from _report_devices(here, devices, [one for one in devices if not os.path.exists(one)])
     if any(node.role is NodeRole.RENDERER for node in nodes):
         problem = find_opengl_problem()
         if problem is None:
@@ -614,28 +555,27 @@ def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
     used += [port for _, port in plan.listening_nodes(here) if not is_free("127.0.0.1", port)]
     if used:
         remedy = "find the program with ss -ltnp; another user may run a graph"
-        what = f"in use: {', '.join(map(str, sorted(used)))}"
+        what = f"these ports are in use: {', '.join(map(str, sorted(used)))}"
         return HostFinding(here, "ports", "failed", what, remedy)
-    return HostFinding(here, "ports", "ok", f"{len(ports)} are free")
+    return HostFinding(here, "ports", "ok", f"{len(ports)} ports are free")
 
 
 def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
     """Check that an arm's controller accepts connections, while no graph is running."""
-    check = f"arm {node.arm_side}"
+    finding = partial(HostFinding, here, f"arm {node.arm_side}")
     if node.device_address is None:
-        return HostFinding(here, check, "not asked", f"{node.name} uses its own driver")
+        return finding("not asked", f"{node.name} uses its own driver")
     address, _, port = node.device_address.rpartition(":")
     if is_loopback(address):
-        what = f"{address}:{port} is simulated and starts with the graph"
-        return HostFinding(here, check, "not asked", what)
+        return finding("not asked", f"{address}:{port} is simulated and starts with the graph")
     if node.parameters.get("driver") not in TCP_DRIVERS:
-        return HostFinding(here, check, "not asked", f"{address}:{port} uses UDP")
+        return finding("not asked", f"{address}:{port} uses UDP")
     try:
         socket.create_connection((address, int(port)), CONTROLLER_S).close()
     except OSError as error:
         remedy = f"check that the controller is on at {address} and its Modbus server runs"
-        return HostFinding(here, check, "failed", f"{address}:{port}: {error}", remedy)
-    return HostFinding(here, check, "ok", f"{address}:{port} accepts connections")
+        return finding("failed", f"{address}:{port}: {error}", remedy)
+    return finding("ok", f"{address}:{port} accepts connections")
 
 
 def list_own_addresses() -> set[str]:

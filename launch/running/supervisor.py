@@ -82,7 +82,7 @@ Report = Callable[[str, str], None]
 
 
 class NodeFailedError(FlexsheetError, RuntimeError):
-    """A node exited, hung or was not ready in time more often than its restart policy allows."""
+    """The error that is raised if a node fails more often than its restart policy allows."""
 
     code = "node-failed"
     remedy = (

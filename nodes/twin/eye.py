@@ -617,20 +617,16 @@ class EyeCamera:
             self._scene, self._body = situation.scene, TrueBody(situation.scene)
             self._expected = None
         skin, triangles = situation.skin_vertices, situation.skin_triangles
-        displacement = situation.displacement
-        moved = displacement is not None and bool(displacement.any())
+        moved = situation.displacement
         settings = np.array([*eye, situation.flat, situation.metres_per_px])
         key: tuple[bytes, ...] = (settings.tobytes(),)
-        if skin is not None and displacement is not None and moved:
-            key += (skin.tobytes(), displacement.tobytes())
+        deformation = None
+        if skin is not None and triangles is not None and moved is not None and moved.any():
+            key += (skin.tobytes(), moved.tobytes())
+            deformation = skin.astype(np.float64), triangles, moved.astype(np.float64)
         if self._expected is None or self._expected[0] != key:
-            true_object = (
-                self._body.displaced(
-                    skin.astype(np.float64), triangles, displacement.astype(np.float64)
-                )
-                if moved and skin is not None and triangles is not None and displacement is not None
-                else self._body.at_rest()
-            )
+            body = self._body
+            true_object = body.displaced(*deformation) if deformation else body.at_rest()
             picture = render_expected(
                 true_object, eye=eye, flat=situation.flat, metres_per_px=situation.metres_per_px
             )
