@@ -39,7 +39,7 @@ SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
 SUFFIXES = (".obj", ".stl")
 MAX_BYTES = 64 << 20
 MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0
-"""The minimum and maximum plausible extent of an object; others probably have a wrong unit."""
+"""The minimum and maximum plausible extent of an object; a wrong unit gives another extent."""
 MAX_COORDINATE = 1e9
 """The maximum coordinate in a mesh file, in its unit, which causes no overflow."""
 

@@ -36,8 +36,7 @@ holds the tilts of the same poses."""
 
 MARGIN_PX = 6.0
 MIN_CHARUCO_FRACTION = 0.6
-"""The minimum visible fraction of the corners of a ChArUco board; the image may cut off the others.
-"""
+"""The minimum fraction of the corners of a ChArUco board that must be visible in both images."""
 
 CHARUCO_NEARER = 1.2
 """The factor by which a ChArUco board appears larger than a chessboard, since its markers are

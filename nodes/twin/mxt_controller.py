@@ -233,7 +233,7 @@ class MxtController:
     def _stay(self, sender: Address) -> None:
         """Process a packet that only requests the state.
 
-        The arm stops. Like the first set-point, the next one must agree with the measured joints.
+        The arm stops. The next set-point must agree with the measured joints, as at the start.
         """
         self._master = sender
         if self._moved:

@@ -109,8 +109,7 @@ class SurfaceMap:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return the length of a stroke in one direction, m, and whether the object's end limits
-        it.
+        """Return the maximum stroke in one direction, m, and whether an end limits the stroke.
 
         The other limit is the tilt of the normal from the user, whose cosine is `most`. The length
         is measured from the front along the geodesic that begins in direction `heading` (3,).
