@@ -43,8 +43,7 @@ from flexsheet.nodes.planner.sheet_force import make_force_model
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 FINGERTIP_AGE_S = 0.012
-"""The age of a fingertip position at its publication: half an exposure, read-out and computation.
-"""
+"""The age of a published fingertip position: half an exposure, read-out and computation."""
 
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """The push depths in the report, as fractions of the maximum push depth."""

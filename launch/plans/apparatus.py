@@ -34,8 +34,7 @@ TOPIC = "twin/apparatus"
 _SEED = re.compile(r"seed:(?P<seed>\d{1,18})(?P<words>(?:,[a-z]+)*)")
 CALIBRATED = "calibrated"
 COMMISSION_STATE = "commission.json"
-"""The name of the file that names the scene before commissioning, in the folder of the new scene.
-"""
+"""The file that names the scene before commissioning, in the folder of the new scene."""
 
 PROFILES = tuple(one.value for one in Profile)
 

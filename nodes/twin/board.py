@@ -39,8 +39,7 @@ MIN_CHARUCO_FRACTION = 0.6
 """The minimum fraction of the corners of a ChArUco board that must be visible in both images."""
 
 CHARUCO_NEARER = 1.2
-"""The factor by which a ChArUco board appears larger than a chessboard, since its markers are
-small."""
+"""The factor by which a ChArUco board appears larger than a chessboard in the images."""
 
 
 class BoardError(FlexsheetError, ValueError):

@@ -21,8 +21,7 @@ Views = Literal["both", "left", "right"]
 MARKER_RADIUS_M = 0.003
 FINGER_LENGTH_M = 0.06
 FINGER_DIRECTION: Point = (0.0, -0.5, 0.866)
-"""The world direction from the fingertip to the knuckle, for which the finger does not hide the
-marker."""
+"""The world direction from the fingertip to the knuckle. The finger does not hide the marker."""
 
 
 class Trajectory(Protocol):

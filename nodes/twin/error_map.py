@@ -32,8 +32,7 @@ position.
 """
 
 COARSE_LIGHT = 0.1
-"""The fraction of full blue below which a pixel counts as black; the object has at least twice
-that."""
+"""The fraction of full blue below which a pixel counts as black and not as the object."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,15 +27,13 @@ from flexsheet.nodes.twin.sheet_surface import make_edge_plane
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 CELLS = 12
-"""The number of cells per side of the mesh; the force differs by 1 % from the force with 32 cells.
-"""
+"""The number of cells per side of the mesh. With 32 cells, the force differs by 1 %."""
 
 STATED_STANDARD_DEVIATION_N = 0.02
 """The standard uncertainty in the gauge's data sheet, which the node publishes with each force."""
 
 GAUGE_STREAM = 3
-"""The second element of the random seed, which makes the gauge's noise independent of other noise.
-"""
+"""The second element of the random seed, which makes the gauge's noise independent."""
 
 
 class TwinGaugeParameters(SimulatorParameters):

@@ -43,8 +43,7 @@ from flexsheet.nodes.twin.finger import minimum_jerk_profile
 from flexsheet.nodes.twin.paths import map_to_surface, place_path, touchable
 
 Sampled = tuple[Floats, Floats]
-"""Times (n,) in s, from zero, and surface positions (n, 3) or distances (n,) in m at these times.
-"""
+"""Times (n,), s, from zero, and surface positions (n, 3) or distances (n,), m, at these times."""
 
 SAMPLE_S = 0.004
 WANDER_M = 0.0005

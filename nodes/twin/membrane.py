@@ -42,8 +42,7 @@ CONTACT_PA_PER_M = 1e10
 """The contact pressure per penetration depth, Pa/m; a force of 10 N on 1 cm2 penetrates 0.01 mm."""
 
 MAX_STEP_RADII = 0.7
-"""The maximum advance of the finger per step, in radii; in a longer step it could cross the sheet.
-"""
+"""The maximum advance of the finger per step, in radii; a longer step could cross the sheet."""
 
 MAX_ITERATIONS = 80
 
@@ -55,8 +54,7 @@ MAX_FRICTION_ROUNDS = 20
 """The maximum number of equilibria that are solved per finger step while nodes slip."""
 
 FRICTION_TOLERANCE = 0.01
-"""The relative change of the friction forces between two equilibria below which they are accepted.
-"""
+"""The maximum relative change of the friction forces between two accepted equilibria."""
 GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
 """The gravitational acceleration in the world frame, whose y axis points up."""
 

@@ -58,8 +58,7 @@ FIRST_STEP_RAD = 0.01
 """The maximum difference of each joint between the first set-point and the measured joints."""
 
 STEP_CYCLES = 2.0
-"""The maximum step between set-points, as the number of cycles that the step takes at full speed.
-"""
+"""The maximum step between set-points, in cycles that the step takes at full speed."""
 
 
 class MxtError(FlexsheetError):

@@ -61,8 +61,7 @@ MIN_DEPTH_M = 0.02
 """The minimum distance from a camera, in metres, at which objects are drawn."""
 
 ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
-"""The positions along a limb (0: start, 1: end) that are projected to find the window with the
-limb."""
+"""The projected positions along a limb (0: start, 1: end) that determine its window."""
 
 EMPTY_FRACTION = 1.2
 """The maximum ratio of the area of two joined windows to the sum of the areas of both windows."""

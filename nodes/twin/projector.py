@@ -43,8 +43,7 @@ WINDOW_MARGIN = 0.05
 FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
 OFFSET_DEVIATION_M, ROTATION_DEVIATION_RAD = 0.004, 0.006
 RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
-"""The standard deviations of the true projector's radial and tangential distortion coefficients
-from those in the scene."""
+"""The standard deviations of the true projector's radial and tangential distortion."""
 
 
 def make_true_projector(projector: Projector, *, seed: int) -> Projector:

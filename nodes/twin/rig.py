@@ -26,8 +26,7 @@ ASPECT_DEVIATION = 0.0005
 """The relative standard deviation of fy from fx, which is small since pixels are nearly square."""
 
 CENTRE_DEVIATION_PX = 4.0
-"""The standard deviation of the principal point, due to the mounting of the sensor, for an image
-640 px wide."""
+"""The standard deviation of the principal point between devices, in an image 640 px wide."""
 
 # k1 and k2 of typical lenses with 66 degrees of horizontal field of view, which data sheets omit.
 RADIAL = (-0.30, 0.11)

@@ -28,8 +28,7 @@ VERSION = 1
 """The version of the computation; cached tables of other versions are computed again."""
 
 CELLS = 16
-"""The number of cells per side of the mesh; the force differs by 1 to 4 % from the force with 32
-cells."""
+"""The number of cells per side of the mesh. With 32 cells, the force differs by 1 to 4 %."""
 
 DEPTH_FRACTIONS = np.array([0.04, 0.12, 0.25, 0.45, 0.7, 1.0])
 """The depths of the solved pushes, as fractions of the scene's maximum push depth."""

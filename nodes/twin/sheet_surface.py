@@ -26,12 +26,10 @@ sag with 32 elements."""
 
 STRETCH_NODES = 4
 LEANS = np.array([0.35, 0.7, 1.0])
-"""The vertical components of the sheet normal at which the membrane is solved; at 0 there is no
-sag."""
+"""The vertical components of the sheet normal in the sag table; the sag is zero at 0."""
 
 STRETCH_MARGIN = 0.005
-"""The extension of the table beyond the scene's range of stretch ratios; further values are
-clipped."""
+"""The extension of the sag table beyond the scene's range of stretch ratios at both ends."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,7 @@ PLANE_CELLS = 64
 MAX_EDGE_M = 0.004
 """The maximum edge length of the triangles of a mesh object after subdivision."""
 NEAREST_VERTICES = 3
-"""The number of nearest skin vertices whose triangles are searched for the point nearest to a given
-point."""
+"""The number of skin vertices near a point whose triangles are searched for the nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
