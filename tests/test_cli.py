@@ -281,7 +281,7 @@ def test_a_message_of_any_size_is_taken_as_json(
     printed = flexsheet("topic", "pub", "skin", f"@{file}")
     assert 'topic "skin" is not part of the graph' in printed.err, "it was read, and whole"
     for text, word in (
-        ('{"engaged": true, "engaged": false, "reason": ""}', "contains the same key twice"),
+        ('{"engaged": true, "engaged": false, "reason": ""}', "duplicate key"),
         ('{"engaged": NaN, "reason": ""}', "MESSAGE (EStop): engaged"),
         ("[" * 100_000, "lists or mappings are nested"),
     ):
