@@ -28,7 +28,6 @@ from flexsheet.nodes.twin.arms import (
 from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
-from flexsheet.nodes.twin.head import HeadSway
 from flexsheet.nodes.twin.membrane import TrueRubber, solve
 from flexsheet.nodes.twin.mxt_controller import MxtController
 from flexsheet.nodes.twin.nail import Nail
@@ -37,6 +36,7 @@ from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.sheet_pull import SheetPull, true_rubber
 from flexsheet.nodes.twin.tolerance_table import Profile, sample_apparatus
 from flexsheet.nodes.twin.truth import apply_apparatus
+from flexsheet.nodes.twin.viewer import HeadSway
 from tests.node_harness import build_node
 from tests.test_compliance_experiment import held
 

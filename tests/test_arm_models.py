@@ -283,8 +283,11 @@ def test_two_arms_hold_the_sheet_and_stroke_within_their_limits(
     [
         ("rv-9x", 'unknown arm "rv-9x"'),
         ("{urdf: none.urdf, base: a, tip: b, start_rad: [0, 0, 0, 0, 0, 0]}", "check the path"),
-        (ur5e_model().replace("tool0", "tool9"), "no chain of joints"),
-        (ur5e_model().replace("tip: tool0", "tip: wrist_2_link"), "5 rotary joints"),
+        (ur5e_model().replace("tool0", "tool9"), "no chain of joints leads from link"),
+        (
+            ur5e_model().replace("tip: tool0", "tip: wrist_2_link"),
+            "has 5 rotary joints; 6 are required",
+        ),
         (ur5e_model((0.0, 0.0, 200.0, 0.0, 0.0, 0.0)), "J3: start_rad"),
     ],
 )
@@ -298,10 +301,10 @@ def test_an_unusable_model_names_the_key(tmp_path: Path, model: str, text: str) 
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ("<", "", "not a valid URDF file"),
+        ("<", "", "the file is not valid URDF"),
         ('type="revolute"', 'type="prismatic"', "only independent rotary joints"),
         (' velocity="3.141592653589793"', "", "velocity"),
-        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>', "its axis is zero"),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>', "the axis is zero; give a direction"),
     ],
 )
 def test_an_unusable_urdf_says_what_is_wrong(tmp_path: Path, old: str, new: str, text: str) -> None:

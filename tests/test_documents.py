@@ -17,7 +17,10 @@ from flexsheet.launch.plans.plan import load_graph
 MAX_TOKENS = 20 * MAX_VALUES
 
 HOSTILE = {
-    "many keys": ("".join(f"k{i}: {i}\n" for i in range(20_000)), "more than 5000 values"),
+    "many keys": (
+        "".join(f"k{i}: {i}\n" for i in range(20_000)),
+        "the file has more than 5000 values",
+    ),
     "keys in one line": ("{" + ", ".join(f"k{i}: 1" for i in range(20_000)) + "}", "values"),
     "many items": ("a:\n" + "- 1\n" * 60_000, "values"),
     "deep brackets": ("a: " + "[" * 5000 + "]" * 5000, "nested"),
@@ -38,9 +41,9 @@ HOSTILE = {
     "a huge number": ("a: " + "9" * 100_000, "cannot be read"),
     "an odd tag": ("a: !!python/object/apply:os.system [ls]\n", ""),
     "a key that is a list": ("? [1, 2]\n: 3\n", "a key is a list or a mapping"),
-    "a list": ("- 1\n", "is a list"),
-    "a text": ("hello\n", "is a text"),
-    "nothing": ("", "is empty"),
+    "a list": ("- 1\n", "the file is a list"),
+    "a text": ("hello\n", "the file is a text"),
+    "nothing": ("", "the file is empty"),
 }  # fmt: skip
 
 
@@ -78,7 +81,7 @@ def test_a_hostile_file_is_rejected_with_little_work(
 def test_what_is_no_utf_8_is_rejected(tmp_path: Path) -> None:
     file = tmp_path / "graph.yaml"
     file.write_bytes(b"nodes: {a: \xff\xfe}\n")
-    with pytest.raises(BadInputError, match="is not UTF-8 text"):
+    with pytest.raises(BadInputError, match="the file is not UTF-8 text"):
         read_document(file)
 
 

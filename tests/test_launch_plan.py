@@ -100,9 +100,9 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
 @pytest.mark.parametrize(
     ("text", "printed"),
     [
-        ("", "is empty"),
+        ("", "the file is empty"),
         ("- a\n", "write a mapping of keys and values"),
-        ("nodes: {a: [}\n", "graph.yaml:1: not YAML"),
+        ("nodes: {a: [}\n", "graph.yaml:1: the file is not valid YAML"),
         ("nodes: {}\n", "the graph has no node"),
         ("nodes:\n  a: {type: x}\n  a: {type: y}\n", "duplicate key"),
         (GRAPH + "hots: {}\n", 'graph.yaml:9: hots: unknown key "hots"; did you mean "hosts"?'),
@@ -334,7 +334,7 @@ nodes:
         ("extends: graph.yaml\n", "graph.yaml:1: extends: "),
         ("extends: demo\nscene: nowhere\n", 'graph.yaml:2: scene: "nowhere" does not exist'),
         ("extends: demo\nnodes: {planner: {nise: 1}}\n", "graph.yaml:2: nodes.planner.nise: unkno"),
-        ((ROOT / "launch/scenes/plane.yaml").read_text(), "is a scene, not a launch file"),
+        ((ROOT / "launch/scenes/plane.yaml").read_text(), "the file is a scene, not a launch file"),
     ],
 )
 def test_an_error_of_an_extension_is_one_line(tmp_path: Path, text: str, printed: str) -> None:

@@ -238,15 +238,18 @@ def near(change: Floats | float) -> Floats:
 @pytest.mark.parametrize(
     ("packets", "words"),
     [
-        ([encode_joints(JOINTS)], "ahead of the first packet"),
-        ([encode(COMMAND_NONE), encode_joints(near(0.02))], "first set-point away"),
+        ([encode_joints(JOINTS)], "before a packet that only requests the state"),
+        (
+            [encode(COMMAND_NONE), encode_joints(near(0.02))],
+            "the first set-point differs by more than 0.01 rad from the measured joint angles",
+        ),
         (
             [encode(COMMAND_NONE), encode_joints(JOINTS), encode_joints(near(0.06))],
-            "set-point too far",
+            "the step from the previous set-point is too large",
         ),
         ([encode(COMMAND_NONE), encode(COMMAND_MOVE)], "type 0"),
         ([encode(COMMAND_NONE), encode(COMMAND_MOVE, send_type=3)], "type 3"),
-        ([encode(COMMAND_NONE), encode(7)], "unknown command 7"),
+        ([encode(COMMAND_NONE), encode(7)], "the packet has the unknown command 7"),
         (
             [encode(COMMAND_NONE), encode(COMMAND_MOVE, send_type=TYPE_JOINTS, data=[np.nan] * 6)],
             "not finite",
@@ -256,7 +259,7 @@ def near(change: Floats | float) -> Floats:
             "outside the allowed range",
         ),
         ([encode(COMMAND_NONE), encode(COMMAND_MOVE, send_type=1, data=[9e3] * 3)], "type 1"),
-        ([encode(COMMAND_NONE), *[b""] * 20], "no packet in time"),
+        ([encode(COMMAND_NONE), *[b""] * 20], "no packet arrived in 14 cycles"),
     ],
 )
 def test_what_it_must_not_do_ends_its_program(packets: list[bytes], words: str) -> None:

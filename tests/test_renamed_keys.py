@@ -237,7 +237,8 @@ def test_a_removed_method_in_a_scene_gets_an_error_with_a_remedy(tmp_path: Path,
     content["methods"] = {key: "any"}
     file = tmp_path / "scene.yaml"
     YAML().dump(content, file)
-    with pytest.raises(BadInputError, match=f'unknown key "{key}"; remove it'):
+    words = f'unknown key "{key}"; remove the key, because only one method is left'
+    with pytest.raises(BadInputError, match=words):
         load_scene(file)
 
 

@@ -202,14 +202,14 @@ def test_a_boards_images_come_from_the_seed(rig: StereoCamera) -> None:
 
 def test_boards_that_cannot_be_drawn_are_rejected(rig: StereoCamera, chessboard: TwinBoard) -> None:
     for change, printed in (
-        ({"marker_m": None}, "needs marker_m"),
+        ({"marker_m": None}, "needs the keys marker_m and dictionary"),
         ({"marker_m": 0.03}, "does not fit"),
-        ({"dictionary": "DICT_9X9"}, "OpenCV has none"),
+        ({"dictionary": "DICT_9X9"}, "OpenCV has no dictionary DICT_9X9"),
         ({"columns": 30}, "larger dictionary"),
     ):
         with pytest.raises(BoardError, match=printed):
             TwinBoard(rig, CHARUCO.model_copy(update=change), seed=1)
-    with pytest.raises(BoardError, match="further away"):
+    with pytest.raises(BoardError, match="hold the board farther away"):
         chessboard.pair(transform(np.eye(3), [0.0, 0.0, -0.3]))
 
 

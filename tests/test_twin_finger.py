@@ -213,7 +213,7 @@ def test_the_real_recording_is_laid_on_the_object(scene: Scene) -> None:
         ("", "no column t_s"),
         ("t_s,x_mm,y_mm\n0,1,2\n", "no column z_mm"),
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,a,2,3\n", "line 3"),
-        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,nan,2,3\n", "line 3: not a finite"),
+        ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n1,nan,2,3\n", "line 3: a value is not finite"),
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n0,1,2,3\n", "line 3: t_s does not increase"),
         ("t_s,x_mm,y_mm,z_mm\n0,1,2,3\n", "a path needs at least two"),
     ],

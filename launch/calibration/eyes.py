@@ -28,13 +28,12 @@ from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Eyes, Scene
 from flexsheet.messages.types import Side
-from flexsheet.nodes.twin.head import HeadSway
 from flexsheet.nodes.twin.membrane import solve
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
-from flexsheet.nodes.twin.viewer import Viewer
+from flexsheet.nodes.twin.viewer import HeadSway, Viewer
 
 Floats = NDArray[np.float64]
 

@@ -43,18 +43,18 @@ from flexsheet.nodes.planner.sheet_force import make_force_model
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 FINGERTIP_AGE_S = 0.012
-"""Age of a fingertip when it is published: half an exposure, the read-out and the computation."""
+"""The age of a published fingertip position: half an exposure, read-out and computation."""
 
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Push depths in the report, as fractions of the maximum push depth."""
+"""The push depths in the report, as fractions of the maximum push depth."""
 
 
 def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
-    """Return the object's force against depth (n, 2), m and N, on the side that faces the user.
+    """Return rows (n, 2) of depth, m, and the object's force, N, on the side that faces the user.
 
-    The complete nonlinear table of the object is computed and cached if it is missing, which takes
-    minutes. The linear method is used if the scene chooses it. So the result does not depend on the
-    cache. cache_dir: None for the user's cache folder.
+    The linear method is used only if the scene chooses it. Otherwise, a missing nonlinear table of
+    the object is computed and cached, which takes minutes. cache_dir: None for the user's cache
+    folder.
     """
     factory = SoftBodyFactory(
         skin_spacing_m=SKIN_SPACING_M,
@@ -81,17 +81,17 @@ def compute_compliance(
 ) -> Compliance:
     """Compute the sheet offsets by which the planner renders the object's force.
 
-    max_depth_m: maximum push depth; None for the scene's. bounds: limits that keep the loop of
-    sheet and hand stable.
+    max_depth_m: maximum push depth; None for the depth in the scene. bounds: limits that keep the
+    feedback loop of sheet and hand stable; None for no limits.
     """
     limits = make_stretch_limits(scene.sheet, law, bounds)
     return fit_compliance(curve, law, limits, scene, max_depth_m=max_depth_m)
 
 
 class LoopRisk(StrEnum):
-    """Risk that the feedback loop of sheet and hand is unstable or renders the force wrongly.
+    """The risk that the feedback loop of sheet and hand is unstable or renders a wrong force.
 
-    OSCILLATION: a hand of low damping can oscillate, since the sheet moves away too late.
+    OSCILLATION: a hand of low damping can oscillate, because the sheet moves away too late.
     DELAY: the delay limits the stable offset of the sheet too much to render the object's force.
     SHEET: the sheet cannot render the object's force, even without delay.
     """
@@ -103,9 +103,9 @@ class LoopRisk(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopFinding:
-    """Risk of the feedback loop of sheet and hand, as found by `find_loop_risk`.
+    """The risk of the feedback loop of sheet and hand, as found by `find_loop_risk`.
 
-    delay_s: time from a measured depth until the sheet has moved accordingly. error_ratio: largest
+    delay_s: time from the measurement of a depth until the sheet has moved. error_ratio: largest
     relative error of the rendered force within the stable bounds.
     """
 
@@ -119,7 +119,8 @@ class LoopFinding:
         match self.risk:
             case LoopRisk.OSCILLATION:
                 return (
-                    f"a hand of low damping can oscillate at a delay of {delay_ms:.0f} ms; reduce "
+                    f"a hand of low damping can oscillate, because the sheet follows the finger "
+                    f"with a delay of {delay_ms:.0f} ms; reduce "
                     "the delay or use a stiffer object"
                 )
             case LoopRisk.DELAY:
@@ -157,11 +158,11 @@ def find_loop_risk(
 
 
 def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
-    """Return the risk of the feedback loop of sheet and hand in a graph, before it starts.
+    """Return the risk of the feedback loop of sheet and hand in a graph, before the graph starts.
 
-    The delay is that of the planner's parameters. Only cached data are used, since computing them
-    takes up to minutes. If the stability bounds or the body of the chosen method are not
-    cached, None is returned; the planner reports the risk when they have been computed.
+    The planner's parameters determine the delay. Only cached data are used, because their
+    computation takes up to minutes. Return None if there is no risk, or if the stability bounds or
+    the soft body are not cached; the planner reports the risk later.
     """
     scene = plan.scene_message()
     planners, solvers = plan.nodes_of_type("planner"), plan.nodes_of_type("fem_solver")
@@ -197,13 +198,12 @@ def compliance_result(
     curve: ObjectCurve,
     *,
     delay_s: float,
-    cache_dir: Path | None = None,
 ) -> dict[str, Any]:
     """Return the result of `flexsheet doctor compliance --json`.
 
-    delay_s: time from a measured depth until the sheet has moved accordingly.
+    delay_s: time from the measurement of a depth until the sheet has moved.
     """
-    table = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
+    table = load_or_compute_bounds(scene.camera.rate_hz, None)
     shown = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
     bandwidth, stable = shown.choose_bandwidth_rad_per_s()
     finding = find_loop_risk(scene, law, curve, table, delay_s)

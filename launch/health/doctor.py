@@ -1,4 +1,4 @@
-"""Check the computer that runs flexsheet; each problem that is found has a remedy."""
+"""Check the computer that runs flexsheet, and name a remedy for each problem."""
 
 from __future__ import annotations
 
@@ -26,13 +26,16 @@ CLOCK_SOURCES = Path("/sys/devices/system/clocksource/clocksource0")
 FAST_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "xen")
 MIN_FREE_DISK_BYTES = 2 << 30
 MIN_CORES = 2
-PROBE_S, PROBE_PERIOD_S, PROBE_RUN_S = 1.0, 1.0 / 140.0, 0.001
-"""Duration of the check of the load; cycle period and processor time per cycle of an arm bridge."""
+PROBE_S = 1.0
+"""The duration of the check of the processor load."""
+
+PROBE_PERIOD_S, PROBE_RUN_S = 1.0 / 140.0, 0.001
+"""The cycle period of an arm bridge, and the processor time per cycle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of one check; `what` is the finding, `remedy` is empty if the check passed."""
+    """The result of a check. `what` is the finding; `remedy` is empty if the check passed."""
 
     check: str
     state: Literal["ok", "warning", "failed"]
@@ -63,7 +66,8 @@ def check_all() -> Iterator[Finding]:
 def check_load() -> Finding:
     """Check whether a process with the load of an arm bridge gets a processor in time.
 
-    This process computes for PROBE_RUN_S in each PROBE_PERIOD_S and measures its waiting time.
+    The calling process computes for PROBE_RUN_S in each PROBE_PERIOD_S and measures its waiting
+    time.
     """
     watch, own = CpuWatch(), {"this check": os.getpid()}
     watch.update(own, measure_programs=True)
@@ -97,7 +101,7 @@ def check_libraries() -> Finding:
         requirements = requires("flexsheet") or []
     except PackageNotFoundError:
         return Finding(
-            "libraries", "warning", "the package flexsheet is not installed", "make setup"
+            "libraries", "warning", "the package flexsheet is not installed", "run: make setup"
         )
     missing = []
     names = [
@@ -111,7 +115,8 @@ def check_libraries() -> Finding:
         except PackageNotFoundError:
             missing.append(name)
     if missing:
-        return Finding("libraries", "failed", f"missing: {', '.join(missing)}", "make setup")
+        what = f"these required libraries are not installed: {', '.join(missing)}"
+        return Finding("libraries", "failed", what, "run: make setup")
     return Finding("libraries", "ok", f"all {len(names)} are installed")
 
 
@@ -120,7 +125,7 @@ def check_opencv() -> Finding:
     try:
         import cv2
     except ImportError as error:
-        return Finding("opencv", "failed", str(error), "make setup")
+        return Finding("opencv", "failed", str(error), "run: make setup")
     registry = cv2.videoio_registry
     names = dict.fromkeys(registry.getBackendName(one) for one in registry.getBackends())
     return Finding("opencv", "ok", f"{cv2.__version__}, cameras and files by {', '.join(names)}")
@@ -146,7 +151,8 @@ def check_cores() -> Finding:
     """Check the number of processor cores."""
     cores = len(os.sched_getaffinity(0))
     if cores < MIN_CORES:
-        return Finding("cores", "warning", str(cores), f"the demo needs {MIN_CORES}")
+        what = f"this computer has only {cores} processor core"
+        return Finding("cores", "warning", what, f"use a computer with at least {MIN_CORES} cores")
     return Finding("cores", "ok", str(cores))
 
 

@@ -11,6 +11,7 @@ import shutil
 import socket
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -41,7 +42,7 @@ from flexsheet.nodes.arm_bridge.link_drivers import TCP_DRIVERS
 
 State = Literal["ok", "warning", "failed", "not asked"]
 RATE_TOLERANCE_RATIO = 0.1
-"""Relative tolerance of message rates, which are measured over one second."""
+"""The relative tolerance of message rates, which are measured over one second."""
 
 MIN_FREE_MEMORY_BYTES = 256 << 20
 CONTROLLER_S = 2.0
@@ -50,7 +51,7 @@ MAX_NAMES_SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class HostFinding:
-    """Result of one check of one host; `what`: the finding; `remedy`: empty if the check passed."""
+    """The result of a check of a host. `what` is the finding; `remedy` is empty after success."""
 
     host: str
     check: str
@@ -77,7 +78,7 @@ NETWORK_FAULTS: dict[Reachability, tuple[str, str]] = {
         "open the TCP ports {first}-{last} of {address} for the other hosts in the firewall",
     ),
 }
-"""Finding and remedy if the host cannot be reached."""
+"""The finding and remedy by cause, for hosts that cannot be reached."""
 
 LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.CLOSED: (
@@ -88,7 +89,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.HANDSHAKE_TIMEOUT: (
         "launcher",
-        "accepts connections, but does not complete the handshake",
+        "the host accepts connections, but does not complete the handshake",
         "the launcher hangs, or another program uses its ports; on {host}: flexsheet doctor",
     ),
     Reachability.NO_RESPONSE: (
@@ -98,7 +99,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.KEY_MISMATCH: (
         "keys",
-        "its key is not the one in the launch file of this computer",
+        "the host's key differs from its key in the launch file of this computer",
         "on {host}: flexsheet keys show {host}; here: flexsheet keys install {file} {host} 'KEY'",
     ),
     Reachability.KEY_REJECTED: (
@@ -108,7 +109,7 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     ),
     Reachability.UNENCRYPTED: (
         "keys",
-        "the host does not encrypt, or another program uses its ports",
+        "the host does not encrypt its messages, or another program uses its ports",
         "copy {file} from here to {host} and restart the launcher there",
     ),
     Reachability.OWN_KEY_INVALID: (
@@ -117,10 +118,11 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
         "correct the key of this computer first; see the findings of {here}",
     ),
 }
-"""Check, finding and remedy if the host is on, but its launcher does not report."""
+"""The check, finding and remedy by cause, for hosts that are on, but whose launcher is silent."""
 
+SAME_COMMIT_REMEDY = "use the same commit on all hosts: git pull, make setup, and start again"
 SELF_CHECK = "self-check"
-"""Name of the check that lists the causes of error which the nodes of a host suspect."""
+"""The name of the check that lists the calibration errors that the nodes of a host suspect."""
 
 
 def evaluate_probes(
@@ -158,7 +160,7 @@ REQUIRED_FOR_CHECKS = {
     "touch_point_world_m": "the marker on the finger",
     "sheet_calibration": "the sheet's modulus (`flexsheet calibrate sheet`)",
 }
-"""Name of each optional check, by the parameter that enables it."""
+"""The names of the optional checks, by the node parameter that enables the check."""
 
 
 def check_apparatus(
@@ -168,17 +170,12 @@ def check_apparatus(
     checks = [one for status in probe.nodes.values() for one in status.self_checks]
     suspected = [one for one in checks if one.suspected]
     for one in suspected:
-        yield HostFinding(
-            probe.host,
-            SELF_CHECK,
-            "warning",
-            describe_self_check(one),
-            SELF_CHECK_REMEDIES[one.cause],
-        )
+        what, remedy = describe_self_check(one), SELF_CHECK_REMEDIES[one.cause]
+        yield HostFinding(probe.host, SELF_CHECK, "warning", what, remedy)
     missing = [
-        f"{what}: set `{parameter}` of {node.name}"
+        f"{subject}: set `{parameter}` of {node.name}"
         for node in nodes
-        for parameter, what in REQUIRED_FOR_CHECKS.items()
+        for parameter, subject in REQUIRED_FOR_CHECKS.items()
         if parameter in node.parameters and not node.parameters[parameter]
     ]
     projects = scene is not None and scene.projector is not None and not shows_check_marks(scene)
@@ -206,22 +203,17 @@ def _check_reachability(
         what, remedy = NETWORK_FAULTS[probe.reachability]
         problem = what.format(**fields)
         yield HostFinding(host, "reachable", "failed", problem, remedy.format(**fields))
-        yield HostFinding(host, "all else", "not asked", "the host cannot be reached")
+        yield HostFinding(host, "other checks", "not asked", "the host cannot be reached")
         return
-    yield HostFinding(
-        host, "reachable", "ok", f"{address}, {'this computer' if host == here else 'by TCP'}"
-    )
+    what = f"{address}, {'this computer' if host == here else 'by TCP'}"
+    yield HostFinding(host, "reachable", "ok", what)
     if probe.status is not None:
         up = f"up for {probe.status.uptime_s:.0f} s, run {probe.status.run}"
         yield HostFinding(host, "launcher", "ok", up)
     elif probe.reachability == Reachability.LOCAL:
-        yield HostFinding(
-            host,
-            "launcher",
-            "failed" if running else "warning",
-            "no graph runs here",
-            f"flexsheet launch {plan.launch_file} --host {host}",
-        )
+        remedy = f"flexsheet launch {plan.launch_file} --host {host}"
+        fault: State = "failed" if running else "warning"
+        yield HostFinding(host, "launcher", fault, "no graph runs here", remedy)
     else:
         check, what, remedy = LAUNCHER_FAULTS[probe.reachability]
         # A closed port is not a fault before any graph is started.
@@ -229,19 +221,13 @@ def _check_reachability(
             "warning" if probe.reachability == Reachability.CLOSED and not running else "failed"
         )
         yield HostFinding(host, check, state, what.format(**fields), remedy.format(**fields))
-        yield HostFinding(host, "all else", "not asked", "its launcher does not report")
+        yield HostFinding(host, "other checks", "not asked", "the host's launcher does not report")
     for text in probe.failed_handshakes[:MAX_NAMES_SHOWN]:
         # The first handshake of this probe succeeded, so the keys are correct.
         remedy = "the host is very busy or the network is slow; run this check again"
         yield HostFinding(host, "keys", "warning", text, remedy)
     for text in probe.refused[:MAX_NAMES_SHOWN]:
-        yield HostFinding(
-            host,
-            "messages",
-            "failed",
-            text,
-            "use the same commit on all hosts: git pull, make setup, and start again",
-        )
+        yield HostFinding(host, "messages", "failed", text, SAME_COMMIT_REMEDY)
 
 
 def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[HostFinding]:
@@ -255,21 +241,15 @@ def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[Ho
                 "the file was changed after the start, or --set was used: start again; to check "
                 "the running graph: flexsheet doctor hosts"
             )
-        yield HostFinding(
-            probe.host,
-            "plan",
-            "failed",
-            f"runs plan {probe.status.plan_hash}; {plan.launch_file} resolves to {plan.hash}",
-            remedy,
+        what = (
+            f"the host runs plan {probe.status.plan_hash}, but {plan.launch_file} resolves to plan "
+            f"{plan.hash}"
         )
+        yield HostFinding(probe.host, "plan", "failed", what, remedy)
     if probe.status.estop is not None:
-        yield HostFinding(
-            probe.host,
-            "e-stop",
-            "warning",
-            f"engaged: {probe.status.estop}",
-            "when it is safe, on a host that may reset: flexsheet arms reset",
-        )
+        what = f"an e-stop is engaged: {probe.status.estop}"
+        remedy = "when it is safe, run on a host that may reset it: flexsheet arms reset"
+        yield HostFinding(probe.host, "e-stop", "warning", what, remedy)
 
 
 def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
@@ -278,16 +258,11 @@ def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     names = sorted(theirs.keys() | plan.keys.keys())
     other = [name for name in names if theirs.get(name) != plan.keys.get(name)]
     if other:
-        return HostFinding(
-            probe.host,
-            "keys",
-            "failed",
-            f"its keys differ from this launch file for {', '.join(other)}",
-            f"copy {plan.launch_file} to {probe.host}; its launcher reloads it automatically",
-        )
-    return HostFinding(
-        probe.host, "keys", "ok", f"accepts the same keys as this computer: {', '.join(names)}"
-    )
+        what = f"the host's keys differ from this launch file for {', '.join(other)}"
+        remedy = f"copy {plan.launch_file} to {probe.host}; its launcher reloads it automatically"
+        return HostFinding(probe.host, "keys", "failed", what, remedy)
+    what = f"the host accepts the same keys as this computer: {', '.join(names)}"
+    return HostFinding(probe.host, "keys", "ok", what)
 
 
 def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFinding:
@@ -305,9 +280,8 @@ def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFi
         if theirs != ours
     ]
     if other:
-        remedy = "use the same commit on all hosts: git pull, make setup, and start again"
         what += f"; different from this computer: {', '.join(other)}"
-        return HostFinding(probe.host, "software", "warning", what, remedy)
+        return HostFinding(probe.host, "software", "warning", what, SAME_COMMIT_REMEDY)
     return HostFinding(probe.host, "software", "ok", what)
 
 
@@ -315,15 +289,10 @@ def _check_clocks(
     plan: ResolvedGraph, probe: HostProbe, probes: Mapping[str, HostProbe]
 ) -> HostFinding:
     """Compare the measured clock offsets to the other hosts with the limit of the graph."""
-    remedy = "check chrony and the load of the network: docs/clocks.md"
+    finding = partial(HostFinding, probe.host, "clocks")
     if probe.clocks is None:
-        return HostFinding(
-            probe.host,
-            "clocks",
-            "failed",
-            "its clock node does not publish",
-            "see the log of the clock node",
-        )
+        what = "the clock node of the host does not publish"
+        return finding("failed", what, "see the log of the clock node")
     limit_s = probe.clocks.max_offset_uncertainty_s
     known = {one.clock_id: one for one in probe.clocks.offsets}
     texts, bad = [], False
@@ -344,11 +313,11 @@ def _check_clocks(
                 + (f", stepped {offset.resets} times" if offset.resets else "")
             )
     if not texts:
-        return HostFinding(probe.host, "clocks", "not asked", "no other host reports")
+        return finding("not asked", "no other host reports")
     what = f"{'; '.join(texts)}; {1e3 * limit_s:g} {NodeNote.CLOCK_UNCERTAIN.phrase}"
     if bad:
-        return HostFinding(probe.host, "clocks", "failed", what, remedy)
-    return HostFinding(probe.host, "clocks", "ok", what)
+        return finding("failed", what, "check chrony and the load of the network: docs/clocks.md")
+    return finding("ok", what)
 
 
 def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
@@ -356,15 +325,14 @@ def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     nodes = probe.status.nodes
     missing = [one.name for one in nodes if one.state != "ready"]
     restarted = [f"{one.name} {one.restarts}" for one in nodes if one.restarts]
-    log = f"{probe.status.run}/logs in the folder of runs on {probe.host}"
+    remedy = f"see {probe.status.run}/logs in the folder of runs on {probe.host}"
+    finding = partial(HostFinding, probe.host, "nodes")
     if missing:
-        return HostFinding(
-            probe.host, "nodes", "failed", f"not ready: {', '.join(missing)}", f"see {log}"
-        )
+        return finding("failed", f"these nodes are not ready: {', '.join(missing)}", remedy)
     if restarted:
-        what = f"{len(nodes)} ready; restarts: {', '.join(restarted)}"
-        return HostFinding(probe.host, "nodes", "warning", what, f"see {log}")
-    return HostFinding(probe.host, "nodes", "ok", f"{len(nodes)} ready")
+        what = f"{len(nodes)} nodes are ready; restarts: {', '.join(restarted)}"
+        return finding("warning", what, remedy)
+    return finding("ok", f"{len(nodes)} nodes are ready")
 
 
 def _check_rates(probe: HostProbe) -> HostFinding:
@@ -393,18 +361,15 @@ def _check_rates(probe: HostProbe) -> HostFinding:
 
 
 def find_rate_problem(port: PortStatus) -> str | None:
-    """Return why a port's message rate is outside the range of its topic; None if it is inside."""
+    """Return why a port's message rate is outside the range of its topic, or None if it is not."""
     topic = TOPICS.get(port.topic)
     if topic is None or topic.rate_hz is None or topic.many_writers:
         return None
     low, high = topic.rate_hz
     if port.rate_hz == 0.0:
         return f"no {port.topic}"
-    if (
-        not low * (1 - RATE_TOLERANCE_RATIO) - 1
-        <= port.rate_hz
-        <= high * (1 + RATE_TOLERANCE_RATIO) + 1
-    ):
+    low_hz, high_hz = low * (1 - RATE_TOLERANCE_RATIO) - 1, high * (1 + RATE_TOLERANCE_RATIO) + 1
+    if not low_hz <= port.rate_hz <= high_hz:
         return f"{port.topic} at {port.rate_hz:.0f} Hz, expected {low:g} to {high:g}"
     return None
 
@@ -416,32 +381,33 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
         f"check OpenGL on that host: flexsheet doctor; {OPENGL_REMEDY}",
     ),
 }
-"""Name of the check and remedy for nodes that must publish, by role."""
+"""The name and the remedy of the check that a node publishes, by role of the node."""
+
+
+def _report_devices(
+    host: str, devices: Sequence[str], missing: Sequence[str]
+) -> Iterator[HostFinding]:
+    if missing:
+        what = f"these device files do not exist: {', '.join(missing)}"
+        remedy = "check the cable and the device number: v4l2-ctl --list-devices"
+        yield HostFinding(host, "devices", "failed", what, remedy)
+    elif devices:
+        yield HostFinding(host, "devices", "ok", ", ".join(devices))
 
 
 def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[HostFinding]:
     assert probe.status is not None
     host, missing = probe.host, probe.status.missing_devices
     devices = list_device_files(nodes)
-    if missing:
-        yield HostFinding(
-            host,
-            "devices",
-            "failed",
-            f"missing: {', '.join(missing)}",
-            "check the cable and the device number: v4l2-ctl --list-devices",
-        )
-    elif devices:
-        yield HostFinding(host, "devices", "ok", ", ".join(devices))
+    yield from _report_devices(host, devices, missing)
     for node in nodes:
         if node.role not in OUTPUT_CHECKS:
             continue
         check, remedy = OUTPUT_CHECKS[node.role]
         status = probe.nodes.get(node.name)
         if status is None:
-            yield HostFinding(
-                host, check, "failed", f"{node.name} does not report", "see the node's log"
-            )
+            what = f"{node.name} does not report"
+            yield HostFinding(host, check, "failed", what, "see the node's log")
             continue
         sent = max((one.rate_hz for one in status.outputs if one.topic != "status"), default=0.0)
         what = f"{sent:.0f} Hz; {status.note or 'no note'}"
@@ -479,9 +445,8 @@ def _check_arm(node: ResolvedNode, probe: HostProbe) -> HostFinding:
 def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostFinding:
     status = probe.nodes.get(node.name)
     if status is None:
-        return HostFinding(
-            probe.host, check, "failed", f"{node.name} does not report", "see the node's log"
-        )
+        what = f"{node.name} does not report"
+        return HostFinding(probe.host, check, "failed", what, "see the node's log")
     assert probe.status is not None
     starts = any(one.state == "starting" for one in probe.status.nodes)
     where = "" if node.device_address is None else f" at {node.device_address}"
@@ -493,13 +458,12 @@ def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
     status = probe.status
     assert status is not None
     yield _check_disk(probe.host, status.disk_free_bytes)
+    finding = partial(HostFinding, probe.host, "memory")
     what = f"{status.memory_free_bytes / 2**30:.1f} GiB free"
     if status.memory_free_bytes < MIN_FREE_MEMORY_BYTES:
-        yield HostFinding(
-            probe.host, "memory", "warning", what, "find the largest programs on that host: top"
-        )
+        yield finding("warning", what, "find the largest programs on that host: top")
     else:
-        yield HostFinding(probe.host, "memory", "ok", what)
+        yield finding("ok", what)
 
 
 def _check_load(status: HostStatus) -> HostFinding:
@@ -524,7 +488,7 @@ def _shorten(texts: Sequence[str]) -> list[str]:
 
 
 def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
-    """Return why the key of this computer cannot be used to probe hosts; None if it can."""
+    """Return why the key of this computer cannot be used to probe hosts, or None if it can."""
     if not plan.keys:
         return None
     file = secret_file(here)
@@ -543,17 +507,13 @@ def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
 def check_before_start(
     plan: ResolvedGraph, here: str, key_problem: str | None
 ) -> Iterator[HostFinding]:
-    address, nodes = plan.hosts[here], plan.nodes_on(here)
-    if is_loopback(address) or address in list_own_addresses():
+    address, nodes, own = plan.hosts[here], plan.nodes_on(here), list_own_addresses()
+    if is_loopback(address) or address in own:
         yield HostFinding(here, "address", "ok", f"{address} is an address of this computer")
     else:
-        yield HostFinding(
-            here,
-            "address",
-            "failed",
-            f"{address} is not this computer's; it has {', '.join(sorted(list_own_addresses()))}",
-            "name the right host with --host, or correct the launch file on all hosts",
-        )
+        what = f"{address} is not an address of this computer, which has {', '.join(sorted(own))}"
+        remedy = "name the right host with --host, or correct the launch file on all hosts"
+        yield HostFinding(here, "address", "failed", what, remedy)
     if key_problem is not None:
         remedy = f"flexsheet keys install {plan.launch_file} {here}, then copy it to all hosts"
         yield HostFinding(here, "keys", "failed", key_problem, remedy)
@@ -561,27 +521,14 @@ def check_before_start(
         what = f"{secret_file(here)} matches the launch file; only its owner can read it"
         yield HostFinding(here, "keys", "ok", what)
     elif not all(map(is_loopback, plan.hosts.values())):
-        remedy = (
-            "flexsheet keys new on each host, then flexsheet keys install for each: docs/deploy.md"
-        )
+        remedy = "run flexsheet keys new on each host, then flexsheet keys install: docs/deploy.md"
         yield HostFinding(here, "keys", "failed", "the launch file has no keys", remedy)
     libraries = check_libraries()
-    yield HostFinding(
-        here,
-        "software",
-        libraries.state,
-        f"python {python_version()}, {software()}; {libraries.what}",
-        libraries.remedy,
-    )
+    what = f"python {python_version()}, {software()}; {libraries.what}"
+    yield HostFinding(here, "software", libraries.state, what, libraries.remedy)
     yield _check_ports(plan, here)
     devices = list_device_files(nodes)
-    missing = [one for one in devices if not os.path.exists(one)]
-    if missing:
-        remedy = "check the cable and the device number: v4l2-ctl --list-devices"
-        what = f"missing: {', '.join(missing)}"
-        yield HostFinding(here, "devices", "failed", what, remedy)
-    elif devices:
-        yield HostFinding(here, "devices", "ok", ", ".join(devices))
+    yield from _report_devices(here, devices, [one for one in devices if not os.path.exists(one)])
     if any(node.role is NodeRole.RENDERER for node in nodes):
         problem = find_opengl_problem()
         if problem is None:
@@ -608,28 +555,27 @@ def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
     used += [port for _, port in plan.listening_nodes(here) if not is_free("127.0.0.1", port)]
     if used:
         remedy = "find the program with ss -ltnp; another user may run a graph"
-        what = f"in use: {', '.join(map(str, sorted(used)))}"
+        what = f"these ports are in use: {', '.join(map(str, sorted(used)))}"
         return HostFinding(here, "ports", "failed", what, remedy)
-    return HostFinding(here, "ports", "ok", f"{len(ports)} are free")
+    return HostFinding(here, "ports", "ok", f"{len(ports)} ports are free")
 
 
 def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
-    """Check that an arm's controller accepts connections; call it while no graph is running."""
-    check = f"arm {node.arm_side}"
+    """Check that an arm's controller accepts connections, while no graph is running."""
+    finding = partial(HostFinding, here, f"arm {node.arm_side}")
     if node.device_address is None:
-        return HostFinding(here, check, "not asked", f"{node.name} uses its own driver")
+        return finding("not asked", f"{node.name} uses its own driver")
     address, _, port = node.device_address.rpartition(":")
     if is_loopback(address):
-        what = f"{address}:{port} is simulated and starts with the graph"
-        return HostFinding(here, check, "not asked", what)
+        return finding("not asked", f"{address}:{port} is simulated and starts with the graph")
     if node.parameters.get("driver") not in TCP_DRIVERS:
-        return HostFinding(here, check, "not asked", f"{address}:{port} uses UDP")
+        return finding("not asked", f"{address}:{port} uses UDP")
     try:
         socket.create_connection((address, int(port)), CONTROLLER_S).close()
     except OSError as error:
         remedy = f"check that the controller is on at {address} and its Modbus server runs"
-        return HostFinding(here, check, "failed", f"{address}:{port}: {error}", remedy)
-    return HostFinding(here, check, "ok", f"{address}:{port} accepts connections")
+        return finding("failed", f"{address}:{port}: {error}", remedy)
+    return finding("ok", f"{address}:{port} accepts connections")
 
 
 def list_own_addresses() -> set[str]:

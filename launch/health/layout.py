@@ -2,14 +2,14 @@
 
 The range is sampled over contact points on the object, sheet poses, push depths, stretches and
 motions. "Rolling" tilts the sheet over the object without slip, so that the contact also moves on
-the sheet. The sheet poses follow the planner's rules (`flexsheet.nodes.planner.rolling`), the reach
-of an arm those of its bridge (`flexsheet.nodes.arm_bridge.reach`).
+the sheet. The sheet poses follow the planner's rules (`flexsheet.nodes.planner.rolling`). The reach
+of an arm follows the rules of its bridge (`flexsheet.nodes.arm_bridge.reach`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -46,30 +46,31 @@ from flexsheet.nodes.planner.rolling import (
 Progress = Callable[[str], None]
 
 TILTS, SIDE_TILTS, DEPTHS = 17, 5, 6
-"""Number of samples over the vertical tilts, the horizontal tilts and the depths."""
+"""The number of samples over the vertical tilts, the horizontal tilts and the depths."""
 
 VIEW_DISTANCE_M = 1.0
 DUPLICATE_DISTANCE_M, DUPLICATE_NORMAL = 0.004, 0.02
-"""Two contacts are duplicates if the differences of positions and of normals are below these."""
+"""The maximum differences of the positions and of the unit normals of two duplicate contacts."""
 
 ROLL_STARTS = 24
-"""Number of contacts from which the sheet is rolled to find other contacts on the sheet."""
+"""The number of contacts from which the sheet is rolled to other contacts."""
 
 CLAMP_MARGIN_M = 0.03
-"""Minimum distance between the finger and a clamped edge of the sheet."""
+"""The minimum distance between the finger and a clamped edge of the sheet."""
 
 OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
-"""Offsets along each world axis at which a base position is tried as a remedy."""
+"""The offsets of an arm's base along each world axis that are tried as a remedy."""
 
 REACHED_COLOR = "#dcefdc"
 
 THINNED_COUNT = 600
-"""Number of samples that are checked first; only a base that reaches them gets a complete check."""
+"""The number of samples that are checked first. All samples are checked only for a base position
+from which the arm reaches these."""
 
 
 @dataclass(frozen=True, slots=True)
 class ContactSample:
-    """Contact of the finger with the object, and a pose of the sheet there without push.
+    """A contact of the finger with the object, and the pose of the sheet before a push.
 
     tilt_rad: angle between the surface normal and the direction towards the user, positive upwards.
     world_from_sheet: (4, 4). twists_world: velocities (k, 6) of the sheet when the finger strokes
@@ -84,7 +85,7 @@ class ContactSample:
 
 @dataclass(frozen=True, slots=True)
 class LayoutSamples:
-    """Sheet poses that the arms must reach, with tilt (n,), push depth (n,) and contact (n, 3)."""
+    """The sheet poses that the arms must reach: tilts (n,), push depths (n,), contacts (n, 3)."""
 
     poses: SheetPoses
     tilt_rad: Floats
@@ -94,7 +95,7 @@ class LayoutSamples:
 
 @dataclass(frozen=True, slots=True)
 class LayoutRemedy:
-    """Change that makes the whole range reachable, as text and as values."""
+    """A change that makes the whole range reachable, as text and as values."""
 
     what: str
     values: dict[str, Any]
@@ -102,7 +103,7 @@ class LayoutRemedy:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Result of the check: the reach of each arm, blocked paths between samples, and remedies."""
+    """The result of the layout check: the reach of each arm, blocked paths, and remedies."""
 
     scene: Scene
     samples: LayoutSamples
@@ -126,7 +127,7 @@ class Layout:
     def speed_m_per_s(self, fraction: float) -> float:
         """Return the finger speed that the arms can follow at a fraction of reachable positions.
 
-        fraction: 0 to 1. The result is 0 if no sampled position is reachable.
+        fraction: 0 to 1. Return 0 if no sampled position is reachable.
         """
         if not self.reached.any():
             return 0.0
@@ -134,9 +135,10 @@ class Layout:
         return float(np.quantile(speeds[self.reached], 1.0 - fraction))
 
     def speeds_m_per_s(self, reach: ArmReach) -> Floats:
-        """Return the maximum finger speeds (n,) that an arm can follow; NaN where unreached.
+        """Return the maximum finger speeds (n,), m/s, that an arm can follow.
 
-        The speeds of arm and sheet are proportional to the speed of the finger.
+        The speed is NaN at unreachable samples. The speeds of arm and sheet are proportional to the
+        speed of the finger.
         """
         used = np.max([1.0 - reach.margins[limit] for limit in SPEED_LIMITS], axis=0)
         return np.asarray(self.scene.working_range.speed_m_per_s / used)
@@ -146,12 +148,12 @@ class Layout:
 
 
 def sample_contacts(scene: Scene) -> list[ContactSample]:
-    """Sample contact points on the object, and the poses of the sheet at each of them.
+    """Sample contact points on the object, and the poses of the sheet at each point.
 
     The object is viewed from all directions within the scene's tilt. At each point, the contact is
-    the centre of the sheet, or the point that results from rolling the sheet there from another
-    contact. For each axis of the sheet, the two rolls that end farthest from its centre are used,
-    limited to the sheet's usable size.
+    the centre of the sheet, or the point of the sheet that results from rolling the sheet from
+    another contact. For each axis of the sheet, the two rolls that end farthest from its centre are
+    used, limited to the sheet's usable size.
     """
     shape = make_shape(dict(scene.object.geometry))
     world_from_object = pose_matrix(scene.object.world_from_object)
@@ -218,17 +220,8 @@ def _find_touchable_points(
         )
         if not (near & similar).any():
             chosen.append(int(index))
-    return [
-        Nearest(
-            found.point[i],
-            found.normal[i],
-            found.height_m[i],
-            found.shape_operator[i],
-            found.on_edge[i],
-            found.undecided[i],
-        )
-        for i in chosen
-    ]
+    values = [getattr(found, field.name) for field in fields(Nearest)]
+    return [Nearest(*(value[i] for value in values)) for i in chosen]
 
 
 def _list_contacts(
@@ -247,8 +240,8 @@ def _list_contacts(
 def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSamples:
     """Combine every contact with every push depth and with the minimum and maximum stretch.
 
-    The push moves the sheet along its normal, by at most the push depth. Pushing at the working
-    speed is one of the motions that the arms must follow.
+    A push moves the sheet along its normal. A push at the working speed is one of the motions that
+    the arms must follow.
     """
     sheet = scene.sheet
     longest = stretch_for_edge_force(sheet.max_edge_force_n, sheet)
@@ -361,7 +354,7 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
 
 
 def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
-    """Return the scene with the base of one arm moved by an offset in the world frame."""
+    """Return the scene with the base of one arm moved by an offset (3,), m, in the world frame."""
     arms = scene.arms
     arm: ArmSpec = getattr(arms, side)
     base = Pose(
@@ -373,7 +366,7 @@ def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
 
 
 def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
-    """Return the smallest tried base offset with which the arm reaches all samples, or None."""
+    """Return the smallest base offset (3,), m, with which the arm reaches all samples, or None."""
     other: Side = "right" if side == "left" else "left"
     reach = layout.left if side == "left" else layout.right
     bad = np.flatnonzero(~reach.reachable)
@@ -432,7 +425,7 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
 
 
 def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
-    """Describe where a limit is violated; give its sample nearest to the front."""
+    """Return the fraction of samples that violate a limit, and the sample nearest to the front."""
     where = np.flatnonzero(binding == number)
     samples = layout.samples
     order = np.lexsort((samples.depth_m[where], np.round(np.abs(samples.tilt_rad[where]), 6)))
@@ -447,7 +440,7 @@ def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> 
 
 
 def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, float | str]]:
-    """Return the minimum margin of each kind of limit, with its limit, tilt and push depth."""
+    """Return the minimum margin of each kind of limit, with the limit, tilt and push depth."""
     kinds = {
         "joint range": (RANGES, "rad"),
         "shoulder singularity": (("shoulder singularity",), "m"),
@@ -477,7 +470,7 @@ def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, flo
 
 
 def draw_layout(layout: Layout, path: Path) -> None:
-    """Draw the violated limit and the possible speed of each arm over tilt and push depth."""
+    """Draw the violated limits and the possible speeds of both arms over tilt and push depth."""
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -515,7 +508,7 @@ def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True)
 class _TiltDepthGrid:
-    """Grid of cells over tilt and depth.
+    """A grid of cells over tilt and depth.
 
     rows, columns: cell indices (n,) of the samples. frame: plot options.
     """
@@ -544,7 +537,10 @@ class _TiltDepthGrid:
         return np.where(np.isfinite(cells), cells, np.nan)
 
     def colored(self, binding: NDArray[np.intp], colors: dict[int, str]) -> Floats:
-        """Return each cell's colour: that of its most frequent limit, paler for few samples."""
+        """Return the colour (DEPTHS, TILTS, 3) of the most frequent limit in each cell.
+
+        The colour is paler if fewer samples violate a limit.
+        """
         from matplotlib.colors import to_rgb
 
         cells = np.ones((DEPTHS, TILTS, 3))

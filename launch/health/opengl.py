@@ -9,16 +9,16 @@ import subprocess
 import sys
 
 OPENGL_PACKAGES = ("libegl1", "libgl1-mesa-dri")
-"""Debian packages that provide headless OpenGL."""
+"""The Debian packages that provide headless OpenGL."""
 
 OPENGL_REMEDY = f"on Debian: sudo apt-get install -y {' '.join(OPENGL_PACKAGES)}"
 
 
 def find_opengl_problem() -> str | None:
-    """Return why no headless OpenGL context can be created; None if one can.
+    """Return why no headless OpenGL context can be created, or None if a context can be created.
 
-    This is tried in another process, because a driver that has failed once fails again in the same
-    process.
+    Another process tries to create the context, because a driver that has failed once fails again
+    in the same process.
     """
     code = "import moderngl; moderngl.create_standalone_context(backend='egl').release()"
     result = subprocess.run(

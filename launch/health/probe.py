@@ -1,7 +1,7 @@
 """Probe every host of a graph over the network, from one of its hosts.
 
-A running launcher publishes the state of its host on the topics `host`, `status`, `clocks` and
-those of its arms. If nothing arrives from another host, the probe finds the step at which the
+A running launcher publishes the state of its host on the topics `host`, `status`, `clocks`, and the
+topics of its arms. If nothing arrives from another host, the probe finds the step at which the
 connection fails.
 """
 
@@ -30,19 +30,19 @@ from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
 
 CONNECT_S = 4.0
-"""Time limit of a connection; the kernel needs 3 s to report that no host has the address."""
+"""The time limit of a connection; the kernel needs 3 s to report that no host has the address."""
 
 HANDSHAKE_S = 3.0
 MIN_LISTEN_S = 1.2
-"""Minimum listening time; nodes publish the message rates of the last second once per second."""
+"""The minimum listening time, because nodes publish their message rates once per second."""
 
 POLL_PERIOD_S = 0.02
 SSH_PORT = 22
-"""Port whose reply, open or closed, shows that a host is on."""
+"""The port whose reply, open or closed, shows that a host is on."""
 
 
 class Reachability(StrEnum):
-    """Outcome of an attempt to connect to a host's launcher."""
+    """The outcome of an attempt to connect to a host's launcher."""
 
     RESPONDING = "responding"
     LOCAL = "local"
@@ -63,7 +63,7 @@ class Reachability(StrEnum):
     NO_RESPONSE = "no_response"
     """The handshake succeeded, but no host status arrived."""
     OWN_KEY_INVALID = "own_key_invalid"
-    """This computer's key cannot be used, so the host was not probed."""
+    """The host was not probed, because this computer's key cannot be used."""
 
 
 HANDSHAKES: dict[int, Reachability] = {
@@ -76,10 +76,10 @@ HANDSHAKES: dict[int, Reachability] = {
 
 @dataclass(slots=True)
 class HostProbe:
-    """Messages that one host published, and problems while receiving them.
+    """The messages that one host published, and the problems of their reception.
 
-    refused: messages that were not accepted. failed_handshakes: connections whose key became
-    invalid after an earlier connection with a valid key.
+    refused: reasons why messages were not accepted. failed_handshakes: connections that were
+    rejected after an earlier connection with a valid key.
     """
 
     host: str
@@ -98,8 +98,8 @@ async def probe_all(
 ) -> dict[str, HostProbe]:
     """Probe all hosts concurrently and return the results by host.
 
-    here: name of this host. keys: its key ring; None if there is none or it cannot be used. run:
-    its running graph; None if no graph runs here.
+    here: name of this host. keys: key ring of this host; None if no key can be used. run: run of
+    the graph on this host; None if no graph runs here.
     """
     probes = await asyncio.gather(
         *(
@@ -146,7 +146,7 @@ async def _probe_remote(
 
 
 async def probe_port(address: str, port: int) -> Reachability:
-    """Return at which step a TCP connection to a port fails; RESPONDING if it is accepted."""
+    """Return the step at which a TCP connection to a port fails; RESPONDING if it succeeds."""
     number = await _connect(address, port)
     if number == 0:
         return Reachability.RESPONDING
@@ -160,7 +160,7 @@ async def probe_port(address: str, port: int) -> Reachability:
 
 
 async def _connect(address: str, port: int) -> int:
-    """Return the error number of an attempt to connect by TCP; 0 if it succeeded."""
+    """Return the error number of an attempt to connect by TCP; 0 means success."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
@@ -202,9 +202,9 @@ async def _listen(
     find_source: Callable[[Writer], Source],
     timeout_s: float,
 ) -> None:
-    """Read what a host publishes until all expected messages have arrived, at most for `timeout_s`.
+    """Read the messages of a host until all expected messages have arrived or `timeout_s` is over.
 
-    If no host status arrives, the probe's result becomes NO_RESPONSE.
+    The reachability of the probe becomes NO_RESPONSE if no host status arrives.
     """
 
     def on_host(status: HostStatus, header: Header) -> None:

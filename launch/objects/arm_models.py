@@ -14,43 +14,46 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
-from flexsheet.launch.plans.documents import BadInputError, Document, validate
+from flexsheet.launch.plans.documents import Document, validate
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import JointChain, Pose, Six
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rpy_from_rotation
-
-Floats = NDArray[np.float64]
 
 JOINTS = 6
 MAX_BYTES = 4 << 20
 CONTINUOUS_RANGE_RAD = 2.0 * np.pi
-"""Assumed range (+-) of a joint without limits: two revolutions, to protect the cables."""
+"""The assumed range (+-) of a joint without limits, which protects the cables: one revolution."""
 
 
 class UrdfError(FlexsheetError, ValueError):
-    """Raised for a URDF file that does not describe a usable arm."""
+    """The error that is raised for a URDF file that does not describe a usable arm."""
 
     code = "urdf"
     remedy = "Correct the URDF file or the links `base` and `tip` of the scene file."
 
 
 class UrdfArm(LimitedModel):
-    """Model of an arm in a scene file that refers to a URDF file."""
+    """A model of an arm in a scene file that refers to a URDF file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     urdf: str = Field(description="path of the URDF file, relative to the scene file")
     base: str = Field(description="link at which the arm is mounted")
     tip: str = Field(description="link that is the flange")
-    start_rad: Six = Field(description="joints at which the arm reaches towards the sheet")
+    start_rad: Six = Field(
+        description="six joint angles, rad, at which the arm reaches towards the sheet"
+    )
 
 
 def load_arm_models(document: Document) -> None:
-    """Replace references to URDF files in a parsed scene file. Raises BadInputError."""
+    """Replace references to URDF files in a parsed scene file by joint chains.
+
+    Raises BadInputError for an invalid reference or file.
+    """
     arms = document.values.get("arms")
     for side in ("left", "right"):
         arm = arms.get(side) if isinstance(arms, dict) else None
@@ -64,19 +67,25 @@ def load_arm_models(document: Document) -> None:
                 document.path.parent / given.urdf, given.base, given.tip, given.start_rad
             )
         except UrdfError as error:
-            problem = document.problem((*at, "urdf"), f'"{given.urdf}": {error}', error.remedy)
-            raise BadInputError([problem]) from error
+            raise document.error((*at, "urdf"), f'"{given.urdf}": {error}', error.remedy) from error
         arm["model"] = chain.model_dump()
 
 
 def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
-    """Read the chain of six rotary joints between two links. Raises UrdfError."""
+    """Read the chain of six rotary joints between two links of a URDF file.
+
+    start_rad: joint angles at which the arm reaches towards the sheet. Raises UrdfError if the file
+    does not describe such a chain.
+    """
     joints = {joint.child: joint for joint in _load_joints(path)}
     chain: list[Any] = []
     link = tip
     while link != base:
         if link not in joints:
-            raise UrdfError(f'no chain of joints leads from link "{base}" to link "{tip}"')
+            raise UrdfError(
+                f'no chain of joints leads from link "{base}" to link "{tip}"; correct `base` or '
+                "`tip`"
+            )
         chain.insert(0, joints.pop(link))
         link = chain[0].parent
     origins, axes, limits = list[Floats](), list[Floats](), list[tuple[float, float, float]]()
@@ -90,12 +99,13 @@ def read_urdf(path: Path, base: str, tip: str, start_rad: Six) -> JointChain:
         axis = np.array([1.0, 0.0, 0.0] if joint.axis is None else joint.axis, dtype=np.float64)
         length = float(np.linalg.norm(axis))
         if not length > 0.0:
-            raise UrdfError(f'joint "{joint.name}": its axis is zero')
+            raise UrdfError(f'joint "{joint.name}": the axis is zero; give a direction')
         axes.append(axis / length)
         pending = np.eye(4)
     if len(origins) != JOINTS:
         raise UrdfError(
-            f'{len(origins)} rotary joints between "{base}" and "{tip}", expected {JOINTS}'
+            f'the chain from "{base}" to "{tip}" has {len(origins)} rotary joints; {JOINTS} are '
+            "required"
         )
     lowest, highest, speeds = zip(*limits, strict=True)
     try:
@@ -130,7 +140,7 @@ def _load_joints(path: Path) -> list[Any]:
     except UrdfError:
         raise
     except Exception as error:  # The library does not convert errors of XML and of number parsing.
-        raise UrdfError(f"not a valid URDF file: {error}") from error
+        raise UrdfError(f"the file is not valid URDF: {error}") from error
     return list(robot.robot.joints)
 
 

@@ -18,7 +18,7 @@ from pydantic import ConfigDict, Field
 
 from flexsheet.launch.objects.arm_models import load_arm_models
 from flexsheet.launch.objects.textures import load_image
-from flexsheet.launch.plans.documents import BadInputError, Document, Key, did_you_mean, validate
+from flexsheet.launch.plans.documents import Document, Key, did_you_mean, validate
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Mesh, Positive, Scene
 from flexsheet.nodes.models.shapes import GEOMETRIES, MeshError, SmoothMeshShape
@@ -35,23 +35,24 @@ from flexsheet.nodes.models.shapes.triangles import (
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
-"""Shape names that scene files may contain. There a mesh is given as a file, not as arrays."""
+"""The shape names that scene files may contain. In a scene file, a mesh is a file, not arrays."""
 SUFFIXES = (".obj", ".stl")
 MAX_BYTES = 64 << 20
 MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0
-"""Plausible extents of an object. Other extents probably result from a wrong unit."""
+"""The minimum and maximum plausible extent of an object; a wrong unit gives another extent."""
 MAX_COORDINATE = 1e9
-"""Maximum coordinate in a mesh file, in its unit. Larger ones cause overflows in computations."""
+"""The maximum coordinate in a mesh file, in its unit, which causes no overflow."""
 
 MAX_CUTTING_RATIO = 0.01
-"""Maximum ratio of the number of intersecting triangle pairs to the number of triangles.
+"""The maximum ratio of the number of intersecting triangle pairs to the number of triangles.
 
-Up to this ratio, the smooth surface bridges the intersections. A mesh with more is not one solid.
+Up to this ratio, the smooth surface bridges the intersections. With more intersections, a mesh is
+not a solid.
 """
 
 
 class MeshFile(LimitedModel):
-    """Geometry of an object in a scene file that refers to a mesh file."""
+    """The geometry of an object in a scene file that refers to a mesh file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -61,25 +62,28 @@ class MeshFile(LimitedModel):
         Positive, Field(description="unit of length in the mesh file, m: 0.001 for millimetres")
     ]
     smoothing_m: Positive | None = Field(
-        default=None, description="length over which the surface is smoothed, m; null: hide facets"
+        default=None,
+        description="length over which the surface is smoothed, m; null: the length that hides "
+        "the facets",
     )
 
 
 def make_scene(document: Document) -> Scene:
-    """Make the scene from a parsed scene file, including its mesh. Raises BadInputError."""
+    """Make the scene from a parsed scene file, including its mesh, image and arms.
+
+    Raises BadInputError for an invalid file.
+    """
     name = _find_shape_name(document)
     if name is not None and name not in SHAPE_NAMES:
         what = f'unknown shape "{name}"'
-        problem = document.problem((*GEOMETRY, "shape"), what, did_you_mean(name, SHAPE_NAMES))
-        raise BadInputError([problem])
+        raise document.error((*GEOMETRY, "shape"), what, did_you_mean(name, SHAPE_NAMES))
     if name == MESH_FILE:
         geometry = validate(MeshFile, document, at=GEOMETRY)
         path = document.path.parent / geometry.file
         try:
             mesh = read_mesh(path, geometry.metres_per_unit, geometry.smoothing_m)
         except MeshError as error:
-            problem = document.problem((*GEOMETRY, "file"), f'"{geometry.file}": {error}')
-            raise BadInputError([problem]) from error
+            raise document.error((*GEOMETRY, "file"), f'"{geometry.file}": {error}') from error
         document.values["object"]["geometry"] = dict(mesh)
     load_image(document)
     load_arm_models(document)
@@ -95,11 +99,11 @@ def _find_shape_name(document: Document) -> Any:
 
 
 def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> Mesh:
-    """Read a closed mesh from a file, in metres.
+    """Read a closed mesh from a file, convert its unit to metres, and repair it.
 
-    Merges duplicate vertices, removes degenerate and duplicate triangles and unused vertices, and
-    orients the triangles outwards. `Mesh.origin` lists the repairs. Raises MeshError for holes and
-    other faults that `check_mesh` rejects.
+    Repairs merge duplicate vertices, remove degenerate and duplicate triangles and unused vertices,
+    and orient the triangles outwards. `Mesh.origin` lists the repairs. Raises MeshError for holes
+    and other faults that cannot be repaired.
     """
     vertices, triangles, repairs = _repair(_load_trimesh(path), metres_per_unit)
     extent_m = float(np.ptp(vertices, axis=0).max())
@@ -131,9 +135,12 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
 
 
 def _load_trimesh(path: Path) -> Any:
-    """Read a mesh file as a `trimesh.Trimesh`, without changes. Raises MeshError."""
+    """Read a mesh file as an unchanged `trimesh.Trimesh`; raise MeshError for an invalid file."""
     if path.suffix.lower() not in SUFFIXES:
-        raise MeshError(f"unsupported mesh format; convert the file to {' or '.join(SUFFIXES)}")
+        raise MeshError(
+            f"the mesh format {path.suffix} is not supported; convert the file to "
+            f"{' or '.join(SUFFIXES)}"
+        )
     try:
         size = path.stat().st_size
     except OSError as error:
@@ -152,7 +159,7 @@ def _load_trimesh(path: Path) -> Any:
         mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
     # trimesh raises errors of many types for invalid files.
     except Exception as error:
-        raise MeshError(f"invalid mesh file: {error}; export it again") from error
+        raise MeshError(f"the mesh file is not valid: {error}; export the mesh again") from error
     faces = np.asarray(getattr(mesh, "faces", ()))
     if len(faces):
         _check_arrays(np.asarray(mesh.vertices), faces)

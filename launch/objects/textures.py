@@ -16,25 +16,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.plans.documents import BadInputError, Document, Key
+from flexsheet.launch.plans.documents import Document, Key
 from flexsheet.messages.errors import FlexsheetError
 
 APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_SIDE_PX = 2048
-"""Maximum width and height of a texture image. The projector has fewer pixels."""
+"""The maximum width and height of a texture image. The projector has fewer pixels."""
 
 
 class TextureError(FlexsheetError, ValueError):
-    """Raised if a file cannot be used as the texture of an object."""
+    """The error that is raised if a file cannot be used as the texture of an object."""
 
     code = "texture"
     remedy = "Use a PNG or JPEG file, and a mesh with texture coordinates."
 
 
 def load_image(document: Document) -> None:
-    """Replace the key `image_file` in a parsed scene file by the image. Raises BadInputError."""
+    """Replace the key `image_file` in a parsed scene file by the image.
+
+    Raises BadInputError if the file cannot be used.
+    """
     value: Any = document.values
     for key in APPEARANCE:
         value = value.get(key) if isinstance(value, dict) else None
@@ -43,18 +46,23 @@ def load_image(document: Document) -> None:
     name, where = value.pop(IMAGE_FILE), (*APPEARANCE, IMAGE_FILE)
     try:
         if value.get("texture") != "image":
-            raise TextureError("image_file requires texture: image; set it, or remove image_file")
+            raise TextureError(
+                "image_file requires `texture: image`; set texture, or remove image_file"
+            )
         if not isinstance(name, str):
-            raise TextureError("expected a file name; give the name of a PNG or JPEG file")
+            raise TextureError("the value is not a file name; give the name of a PNG or JPEG file")
         value["image"] = read_image(document.path.parent / name)
     except TextureError as error:
-        raise BadInputError([document.problem(where, f'"{name}": {error}')]) from error
+        raise document.error(where, f'"{name}": {error}') from error
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """Read an image file as RGB array (height, width, 3). Raises TextureError."""
+    """Read an image file as RGB array (height, width, 3); raise TextureError on failure."""
     if path.suffix.lower() not in SUFFIXES:
-        raise TextureError(f"unsupported image format; convert the file to {' or '.join(SUFFIXES)}")
+        raise TextureError(
+            f"the image format {path.suffix} is not supported; convert the file to "
+            f"{' or '.join(SUFFIXES)}"
+        )
     try:
         data = path.read_bytes()
     except OSError as error:

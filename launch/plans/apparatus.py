@@ -1,7 +1,7 @@
 """Load the apparatus given by `--apparatus`, and pass it to the simulator nodes of a graph.
 
-The apparatus is the set of true parameters of the simulated hardware. It differs from the scene,
-which contains the parameters that the other nodes assume.
+The apparatus is the set of true parameters of the simulated hardware. The scene contains the
+parameters that the other nodes assume.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ TOPIC = "twin/apparatus"
 _SEED = re.compile(r"seed:(?P<seed>\d{1,18})(?P<words>(?:,[a-z]+)*)")
 CALIBRATED = "calibrated"
 COMMISSION_STATE = "commission.json"
-"""File next to a commissioned scene that names the scene before commissioning."""
+"""The file that names the scene before commissioning, in the folder of the new scene."""
 
 PROFILES = tuple(one.value for one in Profile)
 
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """Random sample of an apparatus, parsed from `seed:N[,modern|paper][,calibrated]`."""
+    """A random sample of an apparatus, parsed from `seed:N[,modern|paper][,calibrated]`."""
 
     seed: int
     profile: Profile
@@ -49,7 +49,10 @@ class Draw:
 
 
 def parse_draw(text: str) -> Draw | None:
-    """Parse the value of `--apparatus`; return None if it is a file.  Raises BadInputError."""
+    """Parse the value of `--apparatus`; return None if the value is a file.
+
+    Raises BadInputError for an invalid random sample.
+    """
     if not text.startswith("seed:"):
         return None
     match = _SEED.fullmatch(text)
@@ -57,17 +60,11 @@ def parse_draw(text: str) -> Draw | None:
     profiles = [Profile(word) for word in words if word in PROFILES]
     known = len(profiles) + words.count(CALIBRATED) == len(words) == len(set(words))
     if match is None or not known or len(profiles) > 1:
-        remedy = "write seed:N, seed:N,paper or seed:N,paper,calibrated with a whole number N"
-        raise BadInputError(
-            [
-                Problem(
-                    "--apparatus",
-                    (),
-                    f'"{text}" is not a random sample',
-                    f"{remedy}; or name a file",
-                )
-            ]
+        remedy = (
+            "write seed:N, seed:N,paper or seed:N,paper,calibrated with a whole number N; "
+            "or name a file"
         )
+        raise BadInputError.single("--apparatus", (), f'"{text}" is not a random sample', remedy)
     profile = profiles[0] if profiles else Profile.MODERN
     return Draw(int(match["seed"]), profile, CALIBRATED in words)
 
@@ -75,8 +72,8 @@ def parse_draw(text: str) -> Draw | None:
 def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> Apparatus:
     """Read an apparatus from a file, or sample it from a text such as "seed:7".
 
-    scene_file: file of the scene. If a commissioning wrote it, uncalibrated hardware is sampled
-    around the scene before commissioning, in the world frame of the camera.
+    scene_file: file of the scene. If a commissioning wrote this file, uncalibrated hardware is
+    sampled around the scene before commissioning, in the world frame of the camera.
 
     Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.
@@ -101,7 +98,7 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
 
 
 def _load_base(scene_file: Path | None) -> Scene | None:
-    """Load the scene before commissioning; None if no commissioning wrote the scene file."""
+    """Load the scene before commissioning; return None if no commissioning wrote the scene file."""
     state = None if scene_file is None else scene_file.parent / COMMISSION_STATE
     if state is None or not state.is_file():
         return None
@@ -112,7 +109,7 @@ def _load_base(scene_file: Path | None) -> Scene | None:
     if not Path(named).is_file():
         what = f'the scene from which the commissioning started, "{named}", does not exist'
         remedy = f"restore it, or use --apparatus {state.parent / 'apparatus.yaml'}"
-        raise BadInputError([Problem(str(state), ("scene_file",), what, remedy)])
+        raise BadInputError.single(str(state), ("scene_file",), what, remedy)
     return make_scene(read_document(Path(named)))
 
 

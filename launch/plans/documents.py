@@ -54,7 +54,7 @@ M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
 MAX_DEPTH = 50
 MAX_VALUES = 5000
-"""Maximum number of values in a file. The parser needs about one second for so many values.
+"""The maximum number of values in a file, which the parser reads in about one second.
 
 The largest shipped file contains 300.
 """
@@ -74,18 +74,18 @@ SCALARS: tuple[tuple[type, type], ...] = (
     (ScalarInt, int),
     (ScalarString, str),
 )
-"""Pairs of a YAML parser type, which preserves formatting, and the Python type that replaces it."""
+"""The scalar types of the YAML parser, which preserve formatting, and their Python types."""
 
 MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
-"""Types of pydantic errors whose message names a Python class where the file needs a mapping."""
+"""The types of pydantic errors for values that should be mappings."""
 
 Key = tuple[str | int, ...]
-"""Path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
+"""The path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One error in an input file: location, key, what is wrong, and what to do."""
+    """An error in an input file: location, key, what is wrong, and what to do."""
 
     where: str
     key: Key
@@ -99,7 +99,7 @@ class Problem:
 
 
 class BadInputError(FlexsheetError, ValueError):
-    """Input that cannot be used; `problems` contains all errors."""
+    """The error that is raised for an input that cannot be used; `problems` lists all errors."""
 
     code = "bad-input"
     exit_code = 2
@@ -119,7 +119,7 @@ class BadInputError(FlexsheetError, ValueError):
 
 @dataclass(slots=True)
 class Document:
-    """Values of a YAML file, with the line of every key and the origin of overridden values."""
+    """The values of a YAML file, with the line of every key and the origin of overridden values."""
 
     path: Path
     values: dict[str, Any]
@@ -128,12 +128,12 @@ class Document:
     overrides: dict[Key, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     extended: dict[Key, Path] = field(default_factory=dict)
-    """Source file of each key that was inherited from another file by `extend`."""
+    """The source file of each key that was inherited from another file by `extend`."""
 
     def where(self, key: Key) -> str:
         """Return the location of `key` for error texts: "file:line", or the overriding option.
 
-        If `key` has no line, the line of its nearest parent is returned.
+        For a key without a line, return the line of its nearest parent.
         """
         for length in range(len(key), 0, -1):
             part = key[:length]
@@ -146,8 +146,8 @@ class Document:
     def folder(self, key: Key) -> Path:
         """Return the folder to which a relative path in the value of `key` refers.
 
-        This is the folder of the file that contains `key`. For a value that an option overrides, it
-        is the current folder.
+        Return the folder of the file that contains `key`, or the current folder for a value that an
+        option overrides.
         """
         if key in self.overrides:
             return Path.cwd()
@@ -173,7 +173,7 @@ class Document:
         return Problem(self.where(key), key, what, remedy)
 
     def report(self, key: Key, what: str, remedy: str = "") -> None:
-        """Store a problem, so that `raise_problems` raises all problems together."""
+        """Store a problem, which `raise_problems` raises together with other problems."""
         self.problems.append(self.problem(key, what, remedy))
 
     def error(self, key: Key, what: str, remedy: str = "") -> BadInputError:
@@ -188,7 +188,7 @@ class Document:
     def set(self, key: Key, value: Any, origin: str) -> None:
         """Override the value at `key`, and create missing parent mappings.
 
-        origin: option that sets the value; later errors name it as the location.
+        origin: option that sets the value, which later errors name as the location.
         """
         target: dict[Any, Any] = self.values
         for part in key[:-1]:
@@ -220,9 +220,9 @@ def parse_value(text: str) -> Any:
 
 @lru_cache(maxsize=32)
 def _parse_tree(text: str) -> Any:
-    """Parse text into a YAML tree that includes comments.  All errors are raised as YAMLError.
+    """Parse text into a YAML tree that includes comments.  Raises YAMLError for all errors.
 
-    The tree is shared by all calls with the same text: it must not be changed.
+    Callers must not change the tree, because all calls with the same text return the same tree.
     """
     try:
         _check_size(text)
@@ -256,14 +256,14 @@ def _check_size(text: str) -> None:
         if depth > MAX_DEPTH:
             raise YAMLError(f"more than {MAX_DEPTH} lists or mappings are nested")
         if values > 2 * MAX_VALUES:
-            raise YAMLError(f"more than {MAX_VALUES} values")
+            raise YAMLError(f"the file has more than {MAX_VALUES} values")
 
 
 def parse_json(text: str) -> Any:
     """Parse a JSON value of any size.
 
-    No size limit is needed: unlike YAML, JSON has no aliases that expand to more values.
-    Raises ValueError for invalid JSON, NaN, infinity and duplicate keys.
+    A size limit is unnecessary, because JSON has no aliases that expand to more values. Raises
+    ValueError for invalid JSON, NaN, infinity and duplicate keys.
     """
 
     def refuse(name: str) -> None:
@@ -272,7 +272,7 @@ def parse_json(text: str) -> Any:
     def mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found = dict(pairs)
         if len(found) < len(pairs):
-            raise ValueError("duplicate key")
+            raise ValueError("a mapping contains the same key twice; remove one of the two")
         return found
 
     try:
@@ -282,20 +282,20 @@ def parse_json(text: str) -> Any:
 
 
 def read_document(path: Path) -> Document:
-    """Read a YAML file that contains one mapping; raises BadInputError."""
+    """Read a YAML file that contains one mapping; raise BadInputError for an invalid file."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         reason = error.strerror or str(error)
         raise BadInputError.single(
-            str(path), (), f"cannot be read: {reason}", "check the path"
+            str(path), (), f"the file cannot be read: {reason}", "check the path"
         ) from error
     except UnicodeDecodeError as error:
         raise BadInputError.single(
-            str(path), (), f"is not UTF-8 text: {error}; save the file as UTF-8"
+            str(path), (), f"the file is not UTF-8 text: {error}; save the file as UTF-8"
         ) from error
     if len(text) > MAX_TEXT_LENGTH:
-        what = f"has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed"
+        what = f"the file has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed"
         raise BadInputError.single(str(path), (), what)
     try:
         tree = _parse_tree(text)
@@ -309,13 +309,14 @@ def read_document(path: Path) -> Document:
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise BadInputError.single(where, (), f"not YAML: {error.problem}") from error
+        what = f"the file is not valid YAML: {error.problem}"
+        raise BadInputError.single(where, (), what) from error
     except YAMLError as error:
-        raise BadInputError.single(str(path), (), f"not YAML: {error}") from error
+        raise BadInputError.single(str(path), (), f"the file is not valid YAML: {error}") from error
     if not isinstance(tree, CommentedMap):
         kind = _name_type(values)
         raise BadInputError.single(
-            str(path), (), f"is {kind}", "write a mapping of keys and values"
+            str(path), (), f"the file is {kind}", "write a mapping of keys and values"
         )
     return Document(path, values, text, dict(_lines(tree, ())))
 
@@ -333,7 +334,7 @@ def plain(tree: Any) -> Any:
         left -= 1
         if left < 0:
             raise YAMLError(
-                f"more than {MAX_VALUES} values, including those that aliases (*) repeat"
+                f"the file has more than {MAX_VALUES} values, including repetitions by aliases (*)"
             )
         if isinstance(value, Mapping):
             return {key(name): convert(item) for name, item in value.items()}
@@ -422,12 +423,12 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
         renamed = _renamed_keys(model, document, key).get(str(name))
         remedy = f'it was renamed to "{renamed}"' if renamed else did_you_mean(name, known)
         if name in REMOVED_KEYS:
-            remedy = "remove it: only one method is left"
+            remedy = "remove the key, because only one method is left"
         return document.problem(key, f'unknown key "{name}"', remedy)
     key = _existing_part(document, (*at, *_walk(model, location)[0]))
     if error["type"] in MAPPING_ERROR_TYPES:
         return document.problem(
-            key, f"is {_name_type(error['input'])}", "write a mapping of keys and values"
+            key, f"the value is {_name_type(error['input'])}", "write a mapping of keys and values"
         )
     renamed = VALUES.get(str(key[-1]) if key else "", {}).get(str(error["input"]))
     if renamed is not None:
@@ -471,7 +472,7 @@ def _shorten(value: Any) -> str:
 
 
 def _walk(model: Any, location: Key) -> tuple[Key, Any]:
-    """Convert the location of a pydantic error into a key of the file, and return its type too.
+    """Convert the location of a pydantic error into a key of the file and the type of its value.
 
     Inside a union of models, the location also names the chosen member, which is not a key.
     """

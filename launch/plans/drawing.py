@@ -11,7 +11,7 @@ from flexsheet.messages.topics import TOPICS
 Position = tuple[float, float]
 
 WIDTH, HEIGHT = 132, 34
-"""Width and height of the box of a node, px."""
+"""The width and height of the box of a node, px."""
 
 STYLE = """
   text { font: 13px system-ui, sans-serif; fill: #1f2328; text-anchor: middle }
@@ -36,7 +36,7 @@ STYLE = """
 
 @dataclass(frozen=True)
 class Arrow:
-    """Arrow for the topics from one node to another, or for a connection to a device.
+    """An arrow for the topics from one node to another, or for a connection to a device.
 
     path: points of the SVG polyline. label_at: position of the label, px. wire: label of a device
     connection; empty for topics.
@@ -53,7 +53,7 @@ class Arrow:
 
 @dataclass(frozen=True)
 class GraphDrawing:
-    """Geometry of the drawing of a graph, px.
+    """The geometry of the drawing of a graph, px.
 
     hosts: left, top, width and height of each host's frame. boxes, devices: centre of the box of
     each node and device.
@@ -107,14 +107,14 @@ def svg(drawing: GraphDrawing) -> str:
 
 
 MARGIN, COLUMN, ROW, HOST_GAP = 30, 230, 75, 45
-"""Outer margin, column and row pitch, and gap between hosts in an automatic layout, px."""
+"""The outer margin, the column pitch, the row pitch, and the gap between hosts in a drawing, px."""
 
 
 def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
     """Return the topics that connect each pair of nodes (writer, reader).
 
-    Topics with any number of writers, such as estop and status, are omitted. So are the inputs of
-    nodes that read all published topics, such as a recorder.
+    Topics with any number of writers, such as estop and status, are omitted. Inputs of nodes that
+    read all published topics, such as a recorder, are also omitted.
     """
     links: dict[tuple[str, str], list[str]] = {}
     for node in plan.nodes.values():
@@ -128,7 +128,10 @@ def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
 
 
 def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """Assign each node a column right of all nodes whose topics it reads; ignore loops."""
+    """Assign each node a column to the right of all nodes whose topics it reads; ignore loops.
+
+    links: pairs (writer, reader).
+    """
     order: list[str] = []
     seen: set[str] = set()
 
@@ -176,7 +179,7 @@ def lay_out(plan: ResolvedGraph) -> GraphDrawing:
 
 
 def _connect(boxes: dict[str, Position], writer: str, reader: str, topics: Sequence[str]) -> Arrow:
-    """Return an arrow: straight to a reader on the right, below both boxes to other readers."""
+    """Return a straight arrow to a reader on the right, or an arrow below both boxes otherwise."""
     (x1, y1), (x2, y2) = boxes[writer], boxes[reader]
     if x2 > x1:
         start, end = (x1 + WIDTH / 2, y1), (x2 - WIDTH / 2, y2)

@@ -1,4 +1,4 @@
-"""Parts of the display that a run can omit; a module of its own, so that commands start fast."""
+"""Define the parts of the display that a run can omit, in a module that commands import fast."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Feature(StrEnum):
-    """Part of the display that can be omitted in a run: the projected image or rendered force."""
+    """A part of the display that can be omitted in a run: the projected image or rendered force."""
 
     IMAGE = "image"
     FORCE = "force"

@@ -1,6 +1,6 @@
-"""Check the hosts of a launch file: addresses and keys must be valid and unique.
+"""Check that the addresses and keys of hosts are valid and unique.
 
-Also defines the names of nodes and writers that exist once per host.
+The module also defines the names of nodes and writers that exist once per host.
 """
 
 from __future__ import annotations
@@ -73,10 +73,7 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
 
 
 def load_keys(path: Path) -> dict[str, str]:
-    """Read the public key of each host from a launch file, which may have changed since the start.
-
-    Raises BadInputError.
-    """
+    """Read the public key of each host from a launch file; raise BadInputError on failure."""
     document = read_launch_file(path)
     spec = validate(LaunchFile, document)
     check_hosts(spec.hosts, document)
@@ -85,7 +82,7 @@ def load_keys(path: Path) -> dict[str, str]:
 
 
 def launcher_on(host: str) -> str:
-    """Return the name under which the launcher of a host publishes messages."""
+    """Return the writer name of the launcher on a host."""
     return LAUNCHER if host == MAIN else f"{LAUNCHER}_{host}"
 
 

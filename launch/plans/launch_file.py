@@ -21,28 +21,29 @@ from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import find_role
 
 RECORDER_NICE = 5
-"""Default niceness of the recorder.
+"""The default niceness of the recorder.
 
-Its input messages wait in queues, so its delay affects no other node.
+A delay of the recorder affects no other node, because its input messages wait in queues.
 """
 
 CONSOLE_NICE = 10
-"""Niceness of the console that --console adds; it must not delay the nodes that it shows."""
+"""The niceness of the console that --console adds; the console must not delay other nodes."""
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
-"""Bag file that is recorded from the console: strftime pattern, relative to the working folder."""
+"""The path of bag files that the console records, as strftime pattern in the working folder."""
 
 MERGED_LEVELS = 4
-"""Depth to which a launch file is merged with the file it extends: nodes.NAME.parameters.KEY."""
+"""The depth of keys to which a launch file is merged with the file that it extends:
+nodes.NAME.parameters.KEY."""
 
 SCENE_KEY_SET = frozenset({"object", "sheet", "arms", "camera", "working_range"})
-"""Keys by which a scene file is recognized, because launch files do not have them."""
+"""The keys that identify a scene file, because launch files do not have these keys."""
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=32)]
 
 
 class HostSpec(StrictModel):
-    """Settings of one host, which is a computer of the graph."""
+    """The settings of one host, which is a computer of the graph."""
 
     address: str = Field(description="IP address on which the host's nodes listen")
     key: str | None = Field(
@@ -50,19 +51,20 @@ class HostSpec(StrictModel):
     )
     may_reset_estop: bool | None = Field(
         default=None,
-        description="whether nodes of the host may reset an emergency stop; null: only if it is "
-        "the main host",
+        description="whether nodes of the host may reset an emergency stop; null: only nodes of "
+        "the main host may",
     )
 
 
 class NodeSpec(StrictModel):
-    """Settings of one node in a launch file."""
+    """The settings of one node in a launch file."""
 
     type: str = Field(description='node type: a shipped one, or "module:Class"')
     host: str = MAIN
     process: Name | None = Field(
         default=None,
-        description="name of a process that several nodes share; null: the node has its own",
+        description="name of a process that several nodes share; null: the node has its own "
+        "process",
     )
     shares_arm_process: bool = Field(
         default=False,
@@ -83,8 +85,8 @@ class NodeSpec(StrictModel):
         default=15.0,
         ge=2.0,
         allow_inf_nan=False,
-        description="time without a heartbeat after which the node is killed as hung, s; "
-        "null: never",
+        description="maximum time without a heartbeat, s, after which the node is killed; null: "
+        "no limit",
     )
     nice: int = Field(
         default=0,
@@ -95,13 +97,14 @@ class NodeSpec(StrictModel):
 
 
 class ClocksSpec(StrictModel):
-    """Required accuracy of the clock comparison between hosts; see docs/clocks.md."""
+    """The required accuracy of the clock comparison between hosts; see docs/clocks.md."""
 
     max_offset_uncertainty_s: float = Field(
         default=0.005,
         gt=0,
         allow_inf_nan=False,
-        description="maximum uncertainty of a clock offset, s; above it the arms do not move",
+        description="maximum uncertainty of a clock offset, s; with a larger one, the arms do not "
+        "move",
     )
     max_drift_ratio: float = Field(
         default=5e-4,
@@ -113,7 +116,7 @@ class ClocksSpec(StrictModel):
 
 
 class LaunchFile(StrictModel):
-    """Content of a launch file: its keys with their types and defaults."""
+    """The content of a launch file: its keys with their types and defaults."""
 
     extends: str | None = Field(
         default=None,
@@ -138,14 +141,14 @@ class LaunchFile(StrictModel):
 def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
     """Read a launch file and merge it with the files that it extends.  Raises BadInputError.
 
-    extending: files that extend this one, directly or indirectly; they detect circular references.
+    extending: files that extend this file, directly or indirectly, to detect circular references.
     """
     document = read_document(path)
     if SCENE_KEY_SET & document.values.keys() and "nodes" not in document.values:
         raise BadInputError.single(
             str(path),
             (),
-            "is a scene, not a launch file",
+            "the file is a scene, not a launch file",
             f"use it with a launch file: flexsheet launch demo --scene {path}",
         )
     name = document.values.get("extends")
@@ -202,7 +205,7 @@ def apply_setting(document: Document, setting: str) -> None:
     if node in known:
         if not isinstance(document.values["nodes"][node], dict):
             raise document.error(
-                ("nodes", node), "is not a mapping", "write the node's keys below it"
+                ("nodes", node), "the value is not a mapping", "write the node's keys below it"
             )
         document.set(("nodes", node, "parameters", *inner), value, origin)
     elif node == "recorder" and "record" in document.values:

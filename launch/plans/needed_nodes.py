@@ -1,8 +1,8 @@
 """Omit the nodes of a graph that its scene and its other nodes do not need.
 
-Without a material in the scene, the soft body is not computed; without a projector, no image is
-rendered.  A node that only serves others (`Node.on_demand`) is omitted if no node reads its topics.
-A recorder counts as a reader of the topics in its parameters, but not of its default topics.
+Without a material in the scene, the soft body is not computed. Without a projector, no image is
+rendered.  A node with `Node.on_demand` is omitted if no other node reads its topics. A recorder
+counts as a reader of the topics in its parameters, but not of its default topics.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from flexsheet.nodes.recorder.parameters import RecorderParameters
 REASON_TEXTS = {
     OmissionReason.RIGID_OBJECT: "the scene's object is rigid: it has no material",
     OmissionReason.NO_IMAGE: "the scene has no image: it has no projector",
-    OmissionReason.NO_READER: "no node of the graph reads the topics that it publishes",
-    OmissionReason.NO_WRITER: "no node of the graph publishes the topics that it reads",
+    OmissionReason.NO_READER: "no node of the graph reads the topics that this node publishes",
+    OmissionReason.NO_WRITER: "no node of the graph publishes the topics that this node reads",
 }
 
 
@@ -43,11 +43,10 @@ def omit_unneeded(
 ) -> tuple[list[NodeEntry], list[OmittedNode]]:
     """Return the nodes that are started, and the omitted nodes with the reasons.
 
-    Ports that a node does not use with its parameters and this scene are disconnected.  If a node
-    of the graph publishes scenes, it may later publish one that needs more nodes, so the scene is
-    ignored.
+    Ports that a node does not use with its parameters and this scene are disconnected.  The scene
+    is ignored if a node of the graph publishes scenes, because a later scene may need more nodes.
 
-    needed: topics that command-line tools read. external: topics that they write.
+    needed: topics that command-line tools read. external: topics that command-line tools write.
     """
     fixed = scene
     if any(topic.name == "scene" for entry in entries for _, topic in entry.topics("output")):
@@ -97,7 +96,7 @@ EXTERNAL_TOPICS = frozenset(name for name, topic in TOPICS.items() if topic.many
     "scene",
     "twin/apparatus",
 }
-"""Topics that may be written by the launcher or by command-line tools."""
+"""The topics that may be written by the launcher or by command-line tools."""
 
 
 def _required_inputs(entry: NodeEntry) -> set[str]:

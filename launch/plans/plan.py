@@ -82,10 +82,10 @@ def load_graph(
 
     settings: texts "node.parameter=value" with a YAML value, or "scene=FILE", which override the
         file.
-    record: bag file to record to; it overrides the file.
-    console: add a console and a paused recorder, unless the file contains them.
+    record: bag file to which is recorded, which overrides the launch file.
+    console: whether to add a console and a paused recorder, unless the file contains them.
     apparatus: true parameters of the simulated hardware: a file or "seed:N"; None: as in the scene.
-    needed: topics that the caller reads, so that the nodes which write them are started.
+    needed: topics that the caller reads, whose writers are therefore started.
     without: parts of the display that are omitted.
     Raises BadInputError with all errors of the file.
     """
@@ -263,7 +263,7 @@ def _marked(parameters: NodeParameters, mark: ParameterMark) -> list[Any]:
 def _device_address(parameters: NodeParameters) -> str | None:
     """Return "host:port" of the device that a node controls.
 
-    None unless exactly one parameter is marked as the device's host, and one as its port.
+    Return None unless exactly one parameter is marked as the device's host, and one as its port.
     """
     hosts = _marked(parameters, ParameterMark.DEVICE_HOST)
     ports = _marked(parameters, ParameterMark.DEVICE_PORT)

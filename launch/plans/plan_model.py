@@ -1,7 +1,7 @@
 """Data model of a resolved launch file, which is called the plan of a graph.
 
-It contains the nodes with their hosts and all defaults, and the network endpoints of every topic.
-The model is separate from the resolver (`launch.plans.plan`), so that tools start fast.
+A plan contains the nodes with their hosts and all defaults, and the network endpoints of every
+topic. The model is separate from the resolver (`launch.plans.plan`), so that tools start fast.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole, OmissionReason, node_class
 
 MAIN = "main"
-"""Name of the host on which the launcher's topics, the recorder and command-line tools run."""
+"""The name of the host on which the launcher's topics, the recorder and command-line tools run."""
 
 LAUNCHER, TOOLS = "launch", "tools"
-"""Names of the topic writers that are not nodes: the launcher; command-line tools, experiments."""
+"""The names of the topic writers that are not nodes: the launcher, and all command-line tools."""
 
 RUN_DIRECTORY = "@run"
-"""Placeholder in endpoints and parameters; the start of a run replaces it by the run's folder."""
+"""The placeholder in endpoints and parameters that a run replaces by the path of its folder."""
 
 
 ROLES_OF_TYPES = {
@@ -38,32 +38,32 @@ ROLES_OF_TYPES = {
     "renderer": NodeRole.RENDERER,
     "twin_finger": NodeRole.FINGER_SIMULATOR,
 }
-"""Node role by node type, for plans in older bags, which contain no roles."""
+"""The node roles by node type, for plans in older bags, which contain no roles."""
 
 
 OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
-"""Parameters with a calibration file, for plans in older bags, which list no calibrations."""
+"""The parameters with a calibration file, for plans in older bags, which list no calibrations."""
 
 
 class ArmingMode(StrEnum):
-    """Value of the arm bridge parameter `arming`: who permits the arm to move."""
+    """A value of the arm bridge parameter `arming`: the arm moves after a command, or by itself."""
 
     MANUAL = "manual"
     AUTO = "auto"
 
 
 class StrictModel(LimitedModel):
-    """Base of immutable models that reject unknown keys."""
+    """The base class of immutable models that reject unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class RestartSpec(StrictModel):
-    """Restart policy that is applied when the process of a node exits.
+    """A restart policy that is applied when the process of a node exits.
 
-    The first restart in the last `window_s` is immediate. The delay before the second one is
-    `delay_s` and doubles with each further one, up to `max_delay_s`. If the process exits after
-    `max_restarts` restarts in this time, the node has failed and the run ends.
+    The first restart in `window_s` is immediate. The delay before the second restart is `delay_s`
+    and doubles with each further restart, up to `max_delay_s`. If the process exits after
+    `max_restarts` restarts in `window_s`, the node has failed and the run ends.
     """
 
     policy: Literal["never", "on_failure", "always"] = "on_failure"
@@ -74,7 +74,7 @@ class RestartSpec(StrictModel):
 
 
 class Writer(StrictModel):
-    """Writer of a topic, with an ipc endpoint for readers on its host and a tcp one for others."""
+    """A writer of a topic, with an ipc endpoint for readers on its host and a tcp endpoint."""
 
     name: str
     host: str
@@ -93,15 +93,15 @@ class Writer(StrictModel):
     def source_for(self, host: str) -> Source:
         """Return the endpoint to which a subscriber on `host` connects, and the writer's name.
 
-        If the writer is reached over TCP because it runs on a different host, the source also
-        names that host, so that the subscriber can authenticate it.
+        The source of a TCP connection also names the writer's host, so that the subscriber can
+        authenticate that host.
         """
         far = host != self.host and self.tcp is not None
         return Source(self.endpoint_for(host), self.name, self.host if far else None)
 
 
 class ResolvedPort(StrictModel):
-    """Port of a node with its topic; an output binds the endpoints, an input connects to them."""
+    """A port of a node, its topic, and the endpoints that it binds (output) or reads (input)."""
 
     port: str
     topic: str
@@ -109,7 +109,7 @@ class ResolvedPort(StrictModel):
 
 
 class ResolvedNode(StrictModel):
-    """Complete settings with which a node is started."""
+    """The complete settings with which a node is started."""
 
     name: str
     type: str
@@ -138,13 +138,13 @@ class ResolvedNode(StrictModel):
 
     @property
     def arm_side(self) -> str | None:
-        """Return "left" or "right", the arm whose state the node publishes; None for others."""
+        """Return the side of the arm whose state the node publishes, "left" or "right", or None."""
         sides = {"arm_left": "left", "arm_right": "right"}
         return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
 
     @property
     def arming(self) -> ArmingMode | None:
-        """Return who permits the arm to move; None if the node has no parameter `arming`."""
+        """Return the value of the parameter `arming`; None if the node has no such parameter."""
         value = self.parameters.get("arming")
         return ArmingMode(value) if value in tuple(ArmingMode) else None
 
@@ -167,7 +167,7 @@ class ResolvedNode(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class ResolvedProcess:
-    """Process with its nodes, which have equal niceness, restart policy and heartbeat timeout."""
+    """A process and its nodes, which have equal niceness, restart policy and heartbeat timeout."""
 
     name: str
     nodes: tuple[ResolvedNode, ...]
@@ -183,7 +183,7 @@ class ResolvedProcess:
 
 
 class OmittedNode(StrictModel):
-    """Node of the launch file that is not started, with the reason."""
+    """A node of the launch file that is not started, with the reason."""
 
     name: str
     type: str
@@ -192,7 +192,7 @@ class OmittedNode(StrictModel):
 
 
 class ResolvedGraph(StrictModel):
-    """Resolved launch file: nodes and hosts with all defaults, and the endpoints of all topics."""
+    """A resolved launch file: nodes and hosts with all defaults, and endpoints of all topics."""
 
     launch_file: str
     launch_text: str
@@ -214,12 +214,12 @@ class ResolvedGraph(StrictModel):
     hash: str
 
     def writer(self, topic: str, name: str) -> Writer | None:
-        """Return the writer called `name` of `topic`; None if it may not write the topic."""
+        """Return the writer `name` of a topic, or None if that name may not write the topic."""
         return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
 
-    def endpoints_to_read(self, topic: str, host: str = MAIN) -> tuple[str, ...]:
-        """Return the endpoints to which a subscriber of `topic` on `host` connects."""
-        return tuple(writer.endpoint_for(host) for writer in self.writers.get(topic, ()))
+    def endpoints_to_read(self, topic: str) -> tuple[str, ...]:
+        """Return the endpoints to which a subscriber of a topic on the main host connects."""
+        return tuple(writer.endpoint_for(MAIN) for writer in self.writers.get(topic, ()))
 
     def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
         """Return endpoints and writers to which a subscriber of `topic` on `host` connects."""
@@ -268,5 +268,5 @@ class ResolvedGraph(StrictModel):
 
 
 def tools_on(host: str) -> str:
-    """Return the name under which command-line tools on a host publish messages."""
+    """Return the writer name of command-line tools on a host."""
     return TOOLS if host == MAIN else f"{TOOLS}_{host}"

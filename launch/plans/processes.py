@@ -11,7 +11,7 @@ from flexsheet.nodes.node import find_role
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 COMMON_KEYS = ("host", "nice", "restart", "liveness_s")
-"""Keys of a node that must be equal for all nodes in a process."""
+"""The keys of a node that must be equal for all nodes in a process."""
 
 
 def check_processes(entries: list[NodeEntry], document: Document) -> None:
@@ -50,7 +50,7 @@ def check_processes(entries: list[NodeEntry], document: Document) -> None:
 
 
 def _may_share(bridge: NodeEntry, entry: NodeEntry) -> bool:
-    """Return whether node `entry` may share the process of `bridge`, if that is an arm bridge."""
+    """Return whether a node may share a process with `bridge`, which may be any node."""
     if bridge.type is None or find_role(bridge.type) is not NodeRole.ARM_BRIDGE:
         return True
     if bridge.spec.shares_arm_process or bridge.parameters is None or entry.parameters is None:

@@ -1,4 +1,4 @@
-"""List renamed keys and values of launch files and scenes, so that errors name the new ones."""
+"""List renamed keys and values of launch files and scenes, so that errors name the new keys."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
     },
     "twin_eye": {"again_after_s": "min_interval_s", "most_waiting": "max_queue"},
 }
-"""New name by former name of node parameters, for each node type."""
+"""The new names of renamed node parameters, by node type and former name."""
 
 SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
-"""New key by former key of scene files."""
+"""The new names of renamed keys of scene files, by former name."""
 
 REMOVED_KEYS = frozenset({"kinematics", "triangulation"})
-"""Keys of scenes and node parameters that were removed, because only one value was left."""
+"""The keys of scenes and node parameters that were removed, because only one value was left."""
 
 LAUNCH_KEYS: Mapping[str, str] = {
     "from_tools": "external_topics",
     "also": "include",
     "waits": "start_paused",
 }
-"""New key by former key of launch files, including the keys below `record`."""
+"""The new names of renamed keys of launch files, by former name, including keys below `record`."""
 
 VALUES: Mapping[str, Mapping[str, str]] = {
     "arming": {"by_command": "manual", "by_itself": "auto"},
@@ -70,4 +70,4 @@ VALUES: Mapping[str, Mapping[str, str]] = {
     "driver": {"mxt_pose": "mxt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }
-"""New value by former value of a key, for names of methods, patterns and modes."""
+"""The new names of renamed methods, patterns and modes, by key and former name."""

@@ -31,20 +31,20 @@ from flexsheet.nodes.node import (
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")
-"""Names that nodes must not have, because files in the run's directory have them."""
+"""The names that nodes must not have, because files in the run's directory have these names."""
 
 _PARAMETER_SECTIONS: tuple[Key, ...] = (("record",), ("clocks",))
-"""Keys of a launch file that contain the parameters of a node directly.
+"""The keys of a launch file that contain the parameters of a node directly.
 
 Other nodes have their parameters below the key `parameters`.
 """
 
 
 class NodeEntry:
-    """Node of a launch file that is being resolved.
+    """A node of a launch file that is being resolved.
 
-    type, parameters: class and parameters of the node; None until they are known. ports: connected
-    ports with their topics. unconnected: unconnected ports with the topics they would have.
+    type, parameters: class and parameters of the node; None until resolved. ports: connected ports
+    with their topics. unconnected: unconnected ports with the topics of their type.
     """
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
@@ -63,7 +63,10 @@ class NodeEntry:
         return found
 
     def disconnect_optional(self, written: Container[str]) -> None:
-        """Disconnect optional inputs that have no writer, unless the launch file names a topic."""
+        """Disconnect optional inputs without a writer, except inputs named in the launch file.
+
+        written: names of the topics that have a writer.
+        """
         if self.type is None:
             return
         self.disconnect(
@@ -90,7 +93,10 @@ class NodeEntry:
 
 
 def collect_entries(spec: LaunchFile, document: Document) -> list[NodeEntry]:
-    """Return the nodes of a launch file, with the recorder and clock nodes that are added to it."""
+    """Return the nodes of a launch file, including added recorder and clock nodes.
+
+    Problems are reported to `document`.
+    """
     entries = []
     for name, node_spec in spec.nodes.items():
         entries.append(NodeEntry(name, node_spec, ("nodes", name)))
@@ -310,7 +316,10 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
 
 
 def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
-    """Return `dumped`, the JSON form of `value`, with paths relative to `base` made absolute."""
+    """Return the JSON form `dumped` of a value, with absolute instead of relative paths.
+
+    base: folder to which relative paths refer.
+    """
     if isinstance(value, Path):
         return _absolute(value, base)
     if isinstance(value, BaseModel):

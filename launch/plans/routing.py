@@ -14,13 +14,13 @@ from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.topics import TOPICS
 
 WRITABLE_ON_ALL_HOSTS = ("estop",)
-"""Topics that tools on every host may write, so that the arms can be stopped from each host."""
+"""The topics that tools on every host may write, such as the e-stop of the arms."""
 
 LAUNCHER_TOPICS = ("host", "estop")
-"""Topics that the launcher on every host publishes."""
+"""The topics that the launcher on every host publishes."""
 
 FIRST_PORT, PORT_COUNT = 20_000, 10_000
-"""Range of the TCP ports of topics, below Linux's ports of outgoing connections (from 32768)."""
+"""The first TCP port of topics and the number of ports, below Linux's outgoing ports (32768)."""
 
 
 def list_writers(
@@ -96,9 +96,9 @@ def resolve_further_inputs(
 def check_inputs(
     entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
-    """Check that the topic of every input has a writer; disconnect optional inputs without one.
+    """Check that every input has a writer of its topic; disconnect optional inputs without writer.
 
-    If a node has an unknown type, the check is omitted, because that node could be the writer.
+    The check is omitted if a node has an unknown type, because that node could be the writer.
     """
     if any(entry.type is None for entry in entries):
         return
@@ -124,7 +124,7 @@ def make_endpoints(
 ) -> dict[str, tuple[Writer, ...]]:
     """Return the writers of each topic with their endpoints: ipc on one host, tcp between hosts.
 
-    Each topic gets a tcp endpoint if there are several hosts. It sends data only to subscribers.
+    A topic gets a tcp endpoint only if there are several hosts.
     """
     far = sorted(
         (host, writer, topic)
@@ -157,8 +157,8 @@ def _assign_ports(links: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str,
     """Return a TCP port for each (host, writer, topic), computed from the hash of these names.
 
     If two hashes collide, the later name gets the next free port. A new topic therefore changes
-    only ports that collide with its own. Ports are unique over all hosts, because several hosts of
-    a graph may be the same computer.
+    only colliding ports. Ports are unique over all hosts, because several hosts of a graph may be
+    the same computer.
     """
     taken: dict[int, tuple[str, str, str]] = {}
     for link in links:

@@ -1,4 +1,4 @@
-"""Set up the process of a node, so that it ends with its launcher and has its niceness."""
+"""Set up the process of a node: the process ends with its launcher and gets the node's niceness."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from pathlib import Path
 
 PARENT_VARIABLE = "FLEXSHEET_PARENT"
 LIFELINE_VARIABLE = "FLEXSHEET_LIFELINE"
-"""Environment variable with the file descriptor of the lifeline.
+"""The environment variable with the file descriptor of the lifeline.
 
-The lifeline is a pipe to which nothing is written. Reading from it ends when the launcher exits.
+The lifeline is a pipe to which nothing is written. A read from the pipe ends when the launcher
+exits.
 """
 
 NICE_VARIABLE = "FLEXSHEET_NICE"
 
 AUTOGROUP = Path("/proc/self/autogroup")
-"""File with the niceness of a whole session, by which Linux shares the processor among sessions.
+"""The file with the niceness of a session, by which Linux shares the processor among sessions.
 
 Each node is a separate session, so the niceness of its process alone has little effect."""
 
 AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
-"""Number of attempts to write AUTOGROUP, and the time between them.
+"""The number of attempts to write AUTOGROUP, and the time between two attempts, s.
 
 Without privileges, the kernel accepts only one write per 0.1 s from all processes together.
 """
@@ -38,14 +39,15 @@ def exit_with_parent() -> None:
     """End this process when its launcher exits: SIGTERM first, SIGKILL after `GRACE_S`.
 
     The kernel sends SIGTERM when the launcher exits, even if the event loop of the process hangs.
-    If the process ignores it, a thread that reads the lifeline kills the process and its children.
+    If the process ignores SIGTERM, a thread that reads the lifeline kills the process and its
+    children.
     """
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None:
         return
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != int(parent):
-        sys.exit("the launcher has exited")
+        sys.exit("this node ends, because its launcher has exited; start the graph again")
     lifeline = int(os.environ[LIFELINE_VARIABLE])
     threading.Thread(
         target=_end_with_lifeline, args=(lifeline,), name="lifeline", daemon=True

@@ -1,4 +1,4 @@
-"""Determine the git commit of the running code, and whether its files have changed since."""
+"""Determine the git commit of the running code, and whether files have changed since the commit."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from pathlib import Path
 
 COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 SOURCE_PATHS = ("messages", "nodes", "launch", "flexsheet", "pyproject.toml")
-"""Paths in the repository that contain all the code of a run."""
+"""The paths in the repository that contain all the code of a run."""
 
 SOURCE_SUFFIXES = {".py", ".glsl", ".css", ".js"}
-"""Suffixes of untracked files that count as a change of the code.
+"""The suffixes of untracked files that count as a change of the code.
 
-Others, such as new launch files, scenes and meshes, affect a run only if a launch file names them.
+Other files, such as new scenes and meshes, affect a run only if a launch file names them.
 """
 
 UNTRACKED = "??"
 
 
 def read_git_state(directory: Path) -> str:
-    """Return a JSON text with the commit of the code, and whether files have changed since.
+    """Return a JSON text with the keys `commit` of the code and `changed` for modified files.
 
-    directory: root of the repository. Outside of a git repository, commit is the value of
-    COMMIT_VARIABLE or null, and changed is null.
+    directory: root of the repository. Outside of a git repository, `commit` is the value of
+    COMMIT_VARIABLE or null, and `changed` is null.
     """
     listed = _git(
         directory, "status", "--porcelain", "-z", "--untracked-files=all", "--", *SOURCE_PATHS

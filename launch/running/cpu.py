@@ -2,8 +2,8 @@
 
 For each thread, Linux counts the time in which it was ready to run but did not get a core
 (`/proc/PID/schedstat`).  The main thread of a node runs its event loop, so this wait delays the
-whole node.  System-wide counters (load, /proc/pressure) also include programs of high niceness,
-which wait by design, so they do not show whether nodes are delayed.
+whole node.  System-wide counters (load, /proc/pressure) do not show whether nodes are delayed,
+because they include programs of high niceness, which wait by design.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pathlib import Path
 from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
-"""Fraction of the time that a node waits for a core, above which the computer is overloaded."""
+"""The maximum fraction of time that a node may wait for a core on a computer without overload."""
 
 WINDOW_S = 3.0
 BACKGROUND_NICE = 10
-"""Niceness from which a node waits by design, so that its waiting time is ignored."""
+"""The minimum niceness of nodes that wait by design and whose waiting time is ignored."""
 
 MAX_PROGRAMS = 3
 MIN_CORES = 0.1
@@ -32,14 +32,14 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Waits:
-    """Sample of the total waiting time (s) of each process id, taken at `time_s`."""
+    """A sample of the total waiting time (s) of each process id, taken at `time_s`."""
 
     time_s: float
     waited_s: dict[int, float]
 
 
 class CpuWatch:
-    """Measurement of waiting and processor times over the last WINDOW_S.
+    """A measurement of waiting and processor times over the last WINDOW_S.
 
     Call `update` once a second. proc: folder of the kernel's counters. now_s: function that returns
     the time of the monotonic clock, s.
@@ -60,9 +60,8 @@ class CpuWatch:
         """Return the node that waited the longest fraction of the last WINDOW_S; None if unknown.
 
         watched: process ids by node name, of the nodes whose waiting time is measured.
-        named: process ids of all nodes, so that programs are reported by node name; default:
-        `watched`.
-        measure_programs: also list the programs if the computer is not overloaded.
+        named: process ids by node name, of the nodes that are reported by name; None: `watched`.
+        measure_programs: whether to list the programs even if the computer is not overloaded.
         """
         now_s = self._now_s()
         counted = {pid: self._waited_s(pid) for pid in watched.values()}
@@ -96,7 +95,10 @@ class CpuWatch:
         return int(fields[1]) * 1e-9
 
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
-        """Return the programs that used most processor time since the last call, if recent."""
+        """Return the programs that used most processor time since the last call.
+
+        Return no programs if the last call is more than WINDOW_S ago.
+        """
         names = {pid: name for name, pid in named.items()}
         used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}
         before, self._cpu_before = self._cpu_before, (now_s, used)

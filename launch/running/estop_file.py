@@ -15,7 +15,7 @@ from pathlib import Path
 from flexsheet.messages.types import EStop
 
 STATE_VARIABLE = "FLEXSHEET_STATE"
-"""Environment variable that replaces the default folder of state that survives a reboot."""
+"""The environment variable that replaces the default folder of persistent state."""
 
 
 def directory() -> Path:
@@ -27,7 +27,7 @@ def directory() -> Path:
 
 
 class EStopFile:
-    """File that stores the e-stop of one host.
+    """A file that stores the e-stop of one host.
 
     arms: network addresses of the arms of the graph.
     """

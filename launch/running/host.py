@@ -46,10 +46,10 @@ from flexsheet.nodes.stop_socket import StopSocket
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
 REASON_LENGTH = 1000
-"""Maximum number of characters of a reason, so that it fits into all messages that repeat it."""
+"""The maximum number of characters of an e-stop's reason, which fits into all messages."""
 
 RESET_WITHIN_S = 5.0
-"""Time within which all arms must confirm the reset of an e-stop."""
+"""The time within which all arms must confirm the reset of an e-stop."""
 
 ARMS = ("arm_left", "arm_right")
 
@@ -60,12 +60,12 @@ Sources = Callable[[list[Source]], tuple[Source, ...]]
 
 
 class HostAgent:
-    """Part of the launcher that publishes the status of its host and latches e-stops.
+    """A part of the launcher that publishes the status of its host and latches e-stops.
 
-    It works between `start` and `close`. endpoints, sources: functions that replace the placeholder
-    of the run's directory. code: commit that `HostStatus` reports. run_directory: folder for the
-    socket that receives e-stops; None for no socket. pids: function that returns the process ids of
-    the running nodes by node name.
+    The agent works between `start` and `close`. endpoints, sources: functions that replace the
+    placeholder of the run's directory. code: commit that `HostStatus` reports. run_directory:
+    folder for the socket that receives e-stops; None for no socket. pids: function that returns the
+    process ids of the running nodes by node name.
     """
 
     def __init__(
@@ -128,8 +128,8 @@ class HostAgent:
         stored = None if self._file is None else self._file.read()
         if stored is not None:
             self._on_problem(
-                f"e-stop from before this start: {stored.reason}; the arms do not move until it "
-                "is reset: flexsheet arms reset"
+                f"an e-stop was engaged before this start: {stored.reason}; the arms do not move "
+                "until it is reset: flexsheet arms reset"
             )
             self._engage(stored, self._clock.now_ns())
         others = [
@@ -162,7 +162,7 @@ class HostAgent:
         return subscriber
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Replace the keys of all sockets by reloaded ones."""
+        """Replace the keys of all sockets by the reloaded keys."""
         for publisher in self.publishers.values():
             publisher.renew_keys(change)
         for subscriber in self._subscribers:
@@ -218,7 +218,10 @@ class HostAgent:
             self._update_file()
 
     async def _reset(self, writer: str, latched: EStop) -> None:
-        """Release the e-stop when all arms have confirmed the reset; arms in motion refuse it."""
+        """Release the e-stop when all arms have confirmed the reset.
+
+        Arms in motion refuse the reset. The result is reported to `on_problem`.
+        """
         stopped = {topic for topic in ARMS if self._plan.writers.get(topic)}
         all_clear = asyncio.Event()
 
@@ -353,7 +356,7 @@ def has_estop(state: ArmState) -> bool:
 
 
 def list_arms(plan: ResolvedGraph) -> list[str]:
-    """Return the network address of each arm; "host/node" for a bridge that has none."""
+    """Return the network address of each arm, or "host/node" of its bridge if it has no address."""
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
@@ -384,7 +387,7 @@ def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
 def find_recording_folder(nodes: list[ResolvedNode]) -> Path:
     """Return the folder of the recorder's bag file, whose free disk space is reported.
 
-    Without a recorder, or if the folder does not exist, this is the working folder.
+    Return the working folder if there is no recorder, or if the recorder's folder does not exist.
     """
     for node in nodes:
         if node.role is NodeRole.RECORDER:

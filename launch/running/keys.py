@@ -23,7 +23,7 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.security import KeyChange, KeyRing, SecurityError, is_key, write_ring
 
 KEYS_VARIABLE = "FLEXSHEET_KEYS"
-"""Environment variable that replaces the default folder of secret keys."""
+"""The environment variable that replaces the default folder of secret keys."""
 
 
 def directory() -> Path:
@@ -59,7 +59,7 @@ def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Key
 
 
 class KeyWatch:
-    """Detector of key changes during a run, in the launch file and in the secret key files.
+    """A detector of key changes during a run, in the launch file and in the secret key files.
 
     Changes are written to the key ring files, which the processes of the run read.
     """

@@ -20,11 +20,11 @@ from flexsheet.nodes.renderer import deflection_cache
 Progress = Callable[[str], None]
 
 REPORT_STEP_RATIO = 0.1
-"""Fraction of the total work after which progress is reported again."""
+"""The fraction of the total work between two reports of the progress."""
 
 
 class NoSoftBodyError(FlexsheetError, RuntimeError):
-    """The soft body (FEM model of the virtual object) of a scene cannot be computed."""
+    """The error that is raised if the soft body (FEM model) of a scene cannot be computed."""
 
     code = "no-soft-body"
     remedy = "Follow the remedy in the text; see docs/soft-body-reference.md and docs/soft-body.md."
@@ -54,7 +54,7 @@ def _uses_deflection_shapes(scene: Scene, requested: SheetShapeMethod | Literal[
 def precompute_deflection_shapes(
     scene: Scene, cache_dir: Path | str | None, progress: Progress
 ) -> Path:
-    """Return the file with the deflection shapes of a scene's sheet; compute it if necessary.
+    """Return the file with the deflection shapes of a scene's sheet; compute the file if missing.
 
     If the membrane model finds no equilibrium, the reason is reported and no file is written. The
     renderer then approximates the pushed sheet by four triangles.
@@ -66,13 +66,13 @@ def precompute_deflection_shapes(
         )
         deflection_cache.load_or_compute(scene, folder, on_progress)
     except NoEquilibriumError as error:
-        progress(f"no deflection shapes for this sheet: {error}")
+        progress(f"the deflection shapes of this sheet cannot be computed: {error}")
     _, stored = deflection_cache.list_stored(scene)[0]
     return deflection_cache.shapes_cache(stored).path(folder)
 
 
 def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
-    """Return a function (done, total) that reports progress in steps with the remaining time."""
+    """Return a function (done, total) that reports progress and remaining time in steps."""
     from flexsheet.nodes.cache import EtaEstimator
 
     eta, next_ratio = EtaEstimator(), 0.0
@@ -88,7 +88,7 @@ def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]
 
 
 def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
-    """Return the file with the force table of a scene's sheet; compute it if necessary.
+    """Return the file with the force table of a scene's sheet; compute the file if missing.
 
     Raises NoEquilibriumError if the membrane model finds no equilibrium.
     """
@@ -106,11 +106,11 @@ def precompute_soft_body(
     scheduler: str | None,
     progress: Progress,
 ) -> Path:
-    """Return the file with the nonlinear table of a soft body; compute it if necessary.
+    """Return the file with the nonlinear table of a soft body; compute the file if missing.
 
     skin_spacing_m: spacing of the nodes at the surface. scheduler: address of a dask.distributed
-    scheduler; None computes here. Raises NoSoftBodyError if the scheduler cannot be used, the body
-    cannot be meshed, or memory is insufficient.
+    scheduler; None computes on this computer. Raises NoSoftBodyError if the scheduler cannot be
+    used, the body cannot be meshed, or memory is insufficient.
     """
     from flexsheet.nodes.cache import EtaEstimator
     from flexsheet.nodes.fem_solver import body, precompute_table

@@ -1,4 +1,4 @@
-"""Determine how far the user may raise the priority of processes (negative niceness)."""
+"""Determine the highest priority (minimum niceness) that the user may give to processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexsheet.launch.plans.plan_model import ResolvedNode
 
 MIN_NICE = -20
 CAP_SYS_NICE = 23
-"""Bit index of the Linux capability that permits any niceness."""
+"""The bit index of the Linux capability that permits any niceness."""
 
 
 def min_nice_step() -> int:
@@ -30,7 +30,7 @@ def _has_cap_sys_nice() -> bool:
 
 
 def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Describe which nodes have a niceness that is not permitted; None if there are none."""
+    """Describe the nodes whose niceness is not permitted; return None if there are none."""
     minimum = min_nice_step()
     names = [node.name for node in nodes if node.nice < minimum]
     if not names:

@@ -1,9 +1,9 @@
 """Manage the runs of graphs on this computer: their directories and orphaned processes.
 
-A run is one execution of a graph by a launcher. Its name consists of the launcher's process id and
-start time, and a count, so it shows whether the launcher is alive. A process of a run whose
-launcher has exited is an orphan. This module imports few others, because the emergency command
-`flexsheet arms stop` uses it and must start fast.
+A run is one execution of a graph by a launcher. The name of a run consists of the launcher's
+process id and start time, and a count. The name therefore shows whether the launcher is alive. A
+process of a run whose launcher has exited is an orphan. This module imports few other modules,
+because the emergency command `flexsheet arms stop` uses it and must start fast.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from flexsheet.messages.bus import Source
 
 RUN_VARIABLE = "FLEXSHEET_RUN"
-"""Environment variable with the run's name, set in every process of the run."""
+"""The environment variable with the run's name, set in every process of the run."""
 
 ROOT_VARIABLE = "FLEXSHEET_RUNS"
-"""Environment variable that replaces the default folder of all runs."""
+"""The environment variable that replaces the default folder of all runs."""
 
 MAX_FINISHED_RUNS = 10
 ORPHAN_GRACE_S = 3.5
@@ -44,7 +44,7 @@ _count = itertools.count(1)
 
 
 class RunDirectoryError(FlexsheetError, RuntimeError):
-    """The folder that contains all runs cannot be used."""
+    """The error that is raised if the folder of all runs cannot be used."""
 
     code = "run-directory"
     remedy = "Set `FLEXSHEET_RUNS` to a folder that belongs to you."
@@ -52,7 +52,7 @@ class RunDirectoryError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One execution of a graph, with a directory for sockets, configurations, plan and logs."""
+    """An execution of a graph, with a directory for sockets, configurations, plan and logs."""
 
     id: str
     directory: Path
@@ -107,22 +107,22 @@ def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
 
 
 def root() -> Path:
-    """Return the folder of this user's runs; it is short, as socket paths are limited."""
+    """Return the folder of this user's runs; its path is short, as socket paths are limited."""
     return Path(os.environ.get(ROOT_VARIABLE) or f"/tmp/flexsheet-{os.getuid()}")
 
 
 def create_run() -> Run:
     """Create the directory of a new run, which other users cannot read.
 
-    Raises RunDirectoryError.
+    Raises RunDirectoryError if the folder of all runs cannot be used.
     """
     directory = root()
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     status = directory.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
         raise RunDirectoryError(
-            f"{directory}: is not a folder, or belongs to another user; "
-            f"set {ROOT_VARIABLE} to a folder of this user"
+            f"{directory} is not a folder, or belongs to another user; set {ROOT_VARIABLE} to a "
+            "folder of this user"
         )
     directory.chmod(0o700)
     run_id = f"{os.getpid()}.{_start_ticks(os.getpid())}.{next(_count)}"
@@ -138,7 +138,7 @@ def create_run() -> Run:
 
 
 def list_runs() -> list[Run]:
-    """Return all runs whose directory exists, newest first."""
+    """Return all runs whose directory exists, in descending order of their start time."""
     if not root().is_dir():
         return []
     runs = [
@@ -150,7 +150,7 @@ def list_runs() -> list[Run]:
 
 
 def list_live_runs() -> list[Run]:
-    """Return the runs whose launcher is alive, newest first."""
+    """Return the runs whose launcher is alive, in descending order of their start time."""
     return [run for run in list_runs() if run.is_alive()]
 
 

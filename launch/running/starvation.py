@@ -1,4 +1,4 @@
-"""Distinguish a process that hangs from one that gets no processor core."""
+"""Distinguish a process that hangs from a process that gets no processor core."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ RUNNABLE = "R"
 
 @dataclass(frozen=True, slots=True)
 class ProcessorTime:
-    """Kernel counters of a process's main thread since its start.
+    """The kernel counters of a process's main thread since its start.
 
-    run_s: time on a processor core. wait_s: time in which it was ready to run but had no core, up
-    to the last time it ran. state: letter in /proc/PID/stat (R, S, D, T, ...).
+    run_s: time on a processor core. wait_s: time in which the thread was ready to run but had no
+    core, until the thread last ran. state: letter in /proc/PID/stat (R, S, D, T, ...).
     """
 
     run_s: float
@@ -23,7 +23,7 @@ class ProcessorTime:
 
     @classmethod
     def read(cls, process: int) -> Self | None:
-        """Read the counters of a process; None if there are none, or if it has ended."""
+        """Read the counters of a process id; return None if there are none."""
         try:
             run, wait, slices = Path(f"/proc/{process}/schedstat").read_text().split()
             stat = Path(f"/proc/{process}/stat").read_text()
@@ -38,7 +38,7 @@ class ProcessorTime:
 def compute_starved_s(
     before: ProcessorTime | None, now: ProcessorTime | None, elapsed_s: float
 ) -> float:
-    """Return how long a process waited for a processor core between two readings, s.
+    """Return the time that a process waited for a processor core between two readings, s.
 
     The result is at most `elapsed_s`. The kernel adds a wait to its counter only when the wait
     ends. For a process that is ready to run now, all time in which it did not run counts as a wait.

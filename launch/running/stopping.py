@@ -11,7 +11,7 @@ e-stops (`nodes.stop_socket`). The steps are:
 4. If nothing has answered, the nodes that send sheet targets are killed.  Without targets, the
    bridges on all hosts stop.
 
-The module imports few others, so that the stop is sent without delay.
+This module imports few other modules, so that the stop is sent without delay.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ TARGET_TOPIC = "sheet_target"
 
 
 class StopPath(StrEnum):
-    """Means by which an e-stop was sent: a socket, a topic, or a signal that kills a process."""
+    """The means of sending an e-stop: a socket, a topic, or a signal that kills a process."""
 
     LAUNCHER = "launcher"
     NODE = "node"
@@ -46,12 +46,12 @@ class StopPath(StrEnum):
 
 
 class StopOutcome(StrEnum):
-    """Outcome of an attempt to stop.
+    """The outcome of an attempt to stop.
 
     confirmed: the receiver has engaged the stop. silent: the stop was sent but not confirmed.
     absent: no process listens. published: the stop was sent on the topic, without confirmation.
-    refused: not sent, because another tool uses the endpoint of the topic. killed: the process was
-    killed.
+    refused: the stop was not sent, because another tool uses the endpoint of the topic. killed: the
+    process was killed.
     """
 
     CONFIRMED = "confirmed"
@@ -64,7 +64,7 @@ class StopOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StopAttempt:
-    """One attempt to stop: means, receiver, outcome, and time since the first request (ms)."""
+    """An attempt to stop: means, receiver, outcome, and time since the first request (ms)."""
 
     path: StopPath
     receiver: str
@@ -88,8 +88,8 @@ class _Receiver:
 def send_early(arguments: Sequence[str]) -> None:
     """Send the e-stop of `flexsheet arms stop ARGUMENTS` before the slow import of the command.
 
-    If the arguments are invalid, nothing is sent, and the command later reports the error. The
-    attempts are stored in `sent_early` for the command.
+    Nothing is sent if the arguments are invalid; the command then reports the error. The attempts
+    are stored in `sent_early` for the command.
     """
     options = {"--run": "", "--reason": DEFAULT_REASON}
     rest = [argument for argument in arguments if argument != "--json"]
@@ -104,7 +104,7 @@ def send_early(arguments: Sequence[str]) -> None:
 
 
 sent_early: list[list[StopAttempt]] = []
-"""Result of `send_early` for the command: empty, or one list of attempts."""
+"""The attempts of `send_early`, which the command reports later: empty, or one list."""
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
@@ -213,7 +213,10 @@ def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
 
 
 def _send_signal(process: int, number: int) -> bool:
-    """Send a signal to a process id, if it is known (above 0); return whether it was sent."""
+    """Send a signal to a process, and return whether the signal was sent.
+
+    process: process id; 0 or less if the id is unknown.
+    """
     if process <= 0:
         return False
     try:

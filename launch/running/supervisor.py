@@ -73,16 +73,16 @@ STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
 LIVENESS_PERIOD_S = 0.5
 STACK_DUMP_S = 0.5
-"""Time that a hanging node gets to write its call stacks to its log before it is killed."""
+"""The time between the request to a hanging node to log its call stacks and its end by SIGKILL."""
 
 LOG_READ_BYTES = 65_536
 
 Report = Callable[[str, str], None]
-"""Function (node, line) that is called for each log line. The launcher's node name is "launch"."""
+"""The function that is called with (node, line) for each log line; the launcher is "launch"."""
 
 
 class NodeFailedError(FlexsheetError, RuntimeError):
-    """A node exited, hung or was not ready in time more often than its restart policy allows."""
+    """The error that is raised if a node fails more often than its restart policy allows."""
 
     code = "node-failed"
     remedy = (
@@ -92,7 +92,7 @@ class NodeFailedError(FlexsheetError, RuntimeError):
 
 
 class Child:
-    """Operating system process that runs one or more nodes, from its start to its exit."""
+    """An operating system process that runs one or more nodes, from its start to its exit."""
 
     def __init__(
         self,
@@ -178,10 +178,10 @@ class Child:
     async def wait_until_silent(self, seconds: float, on_starved: Callable[[float], None]) -> None:
         """Wait until the process has sent no heartbeat for `seconds`.
 
-        The time is the number of the launcher's polls times their period. Clock time is not used,
-        because a suspended launcher would receive no heartbeats either. Time in which the process
-        waited for a processor core is subtracted. If the timeout has not been reached only because
-        of this time, `on_starved` is called once with it, in s.
+        The silence is the number of the launcher's polls times their period. Clock time is not
+        used, because a suspended launcher would receive no heartbeats either. Time in which the
+        process waited for a processor core does not count. If only this subtraction prevents the
+        timeout, `on_starved` is called once with the subtracted time, s.
         """
         beats, silence_s, waited_s, reported = self._beats, 0.0, 0.0, False
         before = ProcessorTime.read(self.pid)
@@ -207,7 +207,7 @@ class Child:
         self._loop.call_later(STACK_DUMP_S, self.signal, signal.SIGKILL)
 
     def _read_output(self) -> bool:
-        """Copy available output to the log and report its lines; return whether there was any."""
+        """Copy available output to the log and report its lines; return False if there was none."""
         try:
             piece = os.read(self._output, LOG_READ_BYTES)
         except BlockingIOError:
@@ -221,7 +221,7 @@ class Child:
         return True
 
     def _handle_line(self, line: bytes) -> None:
-        """Report a line and write it to the log of the node that it names, else of the process."""
+        """Report an output line and write it to the log of its node, or of the process."""
         node = self._find_node(line)
         self._logs[node].write(line + b"\n")
         if self._reports:
@@ -245,7 +245,7 @@ class Child:
         if self.exited.done():
             return
         if self._process.returncode is None:
-            # Until it is reaped, the id of its process group is not given to other processes.
+            # Until the process is reaped, no other process gets the id of its process group.
             os.killpg(self.pid, signal.SIGKILL)
             self._process.wait()
         for fd in (self._pidfd, self._output, self._ready_fd):
@@ -261,10 +261,10 @@ class Child:
 
 
 class RunningGraph:
-    """Supervisor of the processes that run the nodes of a graph.
+    """A supervisor of the processes that run the nodes of a graph.
 
-    host: start only the nodes assigned to this host; None starts all nodes on this computer.
-    without: names of nodes that are not started. report: called with (node, line) for every log
+    host: host whose nodes are started; None starts all nodes on this computer. without: names of
+    nodes that are not started. report: function that is called with (node, line) for every log
     line. The folder `run.logs` also contains all lines.
     """
 
@@ -300,7 +300,7 @@ class RunningGraph:
     def run(self) -> Run:
         """Return the run (directory, logs, id).  Raises RuntimeError before the start."""
         if self._run is None:
-            raise RuntimeError("the graph has not been started")
+            raise RuntimeError("the graph has no run before its start; enter its context first")
         return self._run
 
     @property
@@ -329,7 +329,10 @@ class RunningGraph:
         await self.stop()
 
     async def wait_ready(self, timeout_s: float | None = None) -> None:
-        """Wait until every node is set up.  Raises NodeFailedError and TimeoutError."""
+        """Wait until every node is set up.
+
+        Raises NodeFailedError if a node fails, and TimeoutError after `timeout_s`.
+        """
         waiting = [asyncio.ensure_future(event.wait()) for event in self._ready.values()]
         everyone = asyncio.ensure_future(asyncio.gather(*waiting))
         end = asyncio.ensure_future(self.wait())
@@ -349,7 +352,7 @@ class RunningGraph:
             await asyncio.gather(end, everyone, *waiting, return_exceptions=True)
         late = [name for name, event in self._ready.items() if not event.is_set()]
         raise TimeoutError(
-            f"nodes not ready within {timeout_s} s: {', '.join(late)}; see their logs"
+            f"these nodes are not ready after {timeout_s} s: {', '.join(late)}; see their logs"
         )
 
     async def wait_ready_again(self, node: str, restarts: int) -> None:
@@ -362,11 +365,11 @@ class RunningGraph:
         while self.restarts[node] < restarts or not self._ready[node].is_set():
             if supervisor.done():
                 supervisor.result()
-                raise NodeFailedError(f"{node} has ended")
+                raise NodeFailedError(f"node {node} has ended and is not restarted; see its log")
             await asyncio.sleep(0.02)
 
     async def wait(self) -> None:
-        """Wait until every node has exited.  Raises NodeFailedError."""
+        """Wait until every node has exited.  Raises NodeFailedError if a node fails."""
         pending: set[asyncio.Task[None]] = set(self._supervisors.values())
         while pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
@@ -375,7 +378,7 @@ class RunningGraph:
                     supervisor.result()
 
     def kill(self, node: str, number: int = signal.SIGKILL) -> None:
-        """Send the signal `number` to the process of a node, to simulate a fault."""
+        """Send a signal to the process of a node, to simulate a fault."""
         os.kill(self.pids[node], number)
 
     def kill_all(self) -> None:
@@ -465,10 +468,9 @@ class RunningGraph:
         return source_ns
 
     def _publish_latched(self, topic: str, message: Message | None) -> int | None:
-        """Publish a message that subscribers also receive if they connect later.
+        """Publish a message, which later subscribers also receive; return its source timestamp, ns.
 
-        Returns its source timestamp; None if there is no message, or if the topic has a different
-        writer.
+        Return None if there is no message, or if the launcher is not a writer of the topic.
         """
         writer = self.plan.writer(topic, LAUNCHER)
         if message is None or writer is None:
@@ -544,11 +546,11 @@ class RunningGraph:
             except (BadInputError, SecurityError, OSError) as error:
                 if str(error) != reported:
                     reported = str(error)
-                    self._report(LAUNCHER, f"keys not changed: {reported}")
+                    self._report(LAUNCHER, f"the keys are not reloaded: {reported}")
                 continue
             for host, change in changes.items():
                 reported = ""
-                self._report(LAUNCHER, f"keys of {host} reloaded")
+                self._report(LAUNCHER, f"the keys of host {host} are reloaded")
                 if host == MAIN:
                     for publisher in self._publishers.values():
                         publisher.renew_keys(change)
@@ -585,7 +587,7 @@ class RunningGraph:
                 self.restarts[node.name] += 1
 
     async def _run_once(self, process: ResolvedProcess) -> str | None:
-        """Run a process until it ends, and return the failure; None if it ended without error."""
+        """Run a process until it ends; return its failure as text, or None if there is no error."""
         child = self._spawn(process)
         await asyncio.wait(
             (child.ready, child.exited),
@@ -618,7 +620,7 @@ class RunningGraph:
         self.exit_codes.update(dict.fromkeys((node.name for node in process.nodes), code))
 
     async def _detect_hang(self, child: Child, process: ResolvedProcess) -> bool:
-        """Watch a process until it hangs or exits; end a hanging process and return True for it."""
+        """Watch a process until it hangs or exits; end a hanging process and return True."""
         liveness_s = process.settings.liveness_s
         if liveness_s is None:
             return False
@@ -663,7 +665,7 @@ class RunningGraph:
         return child
 
     def _write_run_files(self) -> None:
-        """Write the files that the recorder stores, and those by which tools find the graph."""
+        """Write the files that the recorder stores and the files by which tools find the graph."""
         directory = self.run.directory
         write_file(directory / "launch.yaml", self.plan.launch_text)
         write_file(directory / "scene.yaml", self.plan.scene_text)
@@ -771,7 +773,7 @@ def _clocks_port(plan: ResolvedGraph, host: str, run: Run) -> PortConfig | None:
 
 
 def describe_exit(code: int) -> str | None:
-    """Describe how a process with this exit code failed; return None for 0."""
+    """Describe the failure of a process by its exit code; return None for 0."""
     if code == 0:
         return None
     if code < 0:
@@ -800,7 +802,7 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
                 [
                     read_launch_file(Path(plan.launch_file)).problem(
                         ("hosts", name, "address"),
-                        f"{address} is not a loopback address, and the hosts have no keys",
+                        f"{address} is not a loopback address, but the hosts have no keys",
                         f"create a key on each host (flexsheet keys new {name}) and install all "
                         f"of them: flexsheet keys install {plan.launch_file} {name} KEY",
                     )

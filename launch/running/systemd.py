@@ -30,7 +30,7 @@ def list_bags(plan: ResolvedGraph, host: str) -> Iterator[Path]:
 
 @dataclass(frozen=True, slots=True)
 class SystemFile:
-    """File to install: path, text and permission bits."""
+    """A file to install: path, text and permission bits."""
 
     path: Path
     text: str
@@ -43,15 +43,12 @@ def make_files(
     """Yield the systemd unit, the kernel's TCP settings, and the environment file of a host.
 
     root: root folder of the file system; "/" except in tests.
-    flexsheet: path of the command; default: the command installed next to this Python.
+    flexsheet: path of the command; None: the command that is installed next to this Python.
     """
     command = flexsheet or Path(sys.executable).parent / "flexsheet"
     unit = TEMPLATE.read_text()
-    for key, value in (
-        ("@SOFTWARE@", str(SOFTWARE)),
-        ("@USER@", user),
-        ("@FLEXSHEET@", str(command)),
-    ):
+    replaced = {"@SOFTWARE@": str(SOFTWARE), "@USER@": user, "@FLEXSHEET@": str(command)}
+    for key, value in replaced.items():
         unit = unit.replace(key, value)
     yield SystemFile(root / "etc/systemd/system/flexsheet@.service", unit)
     yield SystemFile(root / "etc/sysctl.d/90-flexsheet.conf", NETWORK.read_text())

@@ -1,7 +1,7 @@
 """Read and write topics of a running graph from command-line tools and experiments.
 
-On the main host, tools may write the topics that no node writes. On other hosts they may write only
-e-stops. They authenticate with the keys of their host.
+On the main host, tools may write the topics that no node writes. On other hosts, tools may write
+only e-stops. Tools authenticate with the keys of their host.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
-"""Time after which all readers have connected to a new writer; they retry every 0.5 s."""
+"""The time in which all readers connect to a new writer; a reader retries every 0.5 s."""
 
 
 @dataclass(slots=True)
 class ToolCounts:
-    """Numbers of messages that the subscriber of a tool has lost or rejected."""
+    """The numbers of messages that the subscriber of a tool has lost or rejected."""
 
     dropped: int = 0
     gaps: int = 0
@@ -62,7 +62,10 @@ def make_subscriber(
     on_problem: Problem,
     raw: bool = False,
 ) -> Subscriber:
-    """Return a subscriber, not yet started, to all writers of a topic in a running graph."""
+    """Return a subscriber to all writers of a topic in a running graph, without starting it.
+
+    raw: whether `on_message` receives undecoded messages.
+    """
     definition = find_topic(topic)
     return Subscriber(
         definition,
@@ -82,7 +85,7 @@ async def read_topic(
 ) -> AsyncIterator[tuple[Message, Header]]:
     """Yield the messages of a topic of a running graph with their headers when they arrive.
 
-    count: number of messages; None for no limit.  If the caller is slow, messages wait in a queue.
+    count: number of messages; None for no limit.  Messages for a slow caller wait in a queue.
     Raises KeyError for a topic that does not exist.
     """
     # Imported here, so that commands that do not call this function start faster.
@@ -105,10 +108,10 @@ async def read_topic(
 
 
 class GraphWriter:
-    """Writer of topics for tools outside the running graph.  Requires a running event loop.
+    """A writer of topics for tools outside the running graph, which needs a running event loop.
 
-    Raises BadInputError for a topic that tools may not write, and BusError if another tool is
-    writing it.
+    The constructor raises BadInputError for a topic that tools may not write, and BusError for a
+    topic that another tool is writing.
     """
 
     def __init__(self, plan: ResolvedGraph, run: Run, topics: Iterable[str]) -> None:
@@ -132,7 +135,7 @@ class GraphWriter:
     def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> None:
         """Send a message with the next sequence number.
 
-        source_ns: source timestamp of the data; default: the present time.
+        source_ns: source timestamp of the data, ns; None for the present time.
         """
         self._sequences[topic] = self._sequences.get(topic, 0) + 1
         now_ns = self._clock.now_ns()

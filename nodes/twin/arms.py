@@ -3,7 +3,7 @@
 This module was written from `docs/modbus.md` and the dimensions of the arms only. It shares no code
 with the bridge (the node that sends commands to an arm), because it serves to test the bridge. The
 forward kinematics is a product of exponentials (Brockett 1984; Lynch and Park, Modern Robotics, ch.
-4). The inverse kinematics is a Gauss-Newton method on it.
+4). The inverse kinematics applies a Gauss-Newton method to this product.
 """
 
 from __future__ import annotations
@@ -41,16 +41,17 @@ Fault = Literal[
     "frozen",
     "lagging",
 ]
-"""Faults that a test can switch on in a simulated arm. MXT is the protocol of `mxt_controller.py`.
+"""The faults that a test can switch on in a simulated arm. MXT is the protocol of
+`mxt_controller.py`.
 
-silent: does not answer.
-slow: answers with the delay LATE_S.
-exception: answers with a Modbus exception (MXT: with a packet of another data type).
-bad_crc: answers with a wrong checksum (MXT: with a truncated packet).
-old_version: answers with the version of an older register map.
-repeated: repeats the counter of the previous answer.
-frozen: answers, but its joints do not move.
-lagging: executes commands with the delay LATE_S.
+silent: the arm does not answer.
+slow: the arm answers with the delay LATE_S.
+exception: the arm answers with a Modbus exception (MXT: with a packet of another data type).
+bad_crc: the arm answers with a wrong checksum (MXT: with a truncated packet).
+old_version: the arm answers with the version of an older register map.
+repeated: the arm repeats the counter of the previous answer.
+frozen: the arm answers, but its joints do not move.
+lagging: the arm executes commands with the delay LATE_S.
 """
 
 LATE_S = 0.05
@@ -61,14 +62,14 @@ logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 CONTROLLER_CYCLE_S = 0.0071
 
 JITTER_STREAM = 1
-"""Second element of the random seed for the jitter of cycles, which makes it independent of the
-noise of measured joints."""
+"""The second element of the random seed for the jitter of controller cycles, which makes the jitter
+independent of the noise of measured joints."""
 
 
 def check_loopback(address: str) -> str:
-    """Return the address; raises ValueError unless only this computer can reach it.
+    """Return a network address unchanged; raise ValueError unless it is a loopback address.
 
-    The simulated arms have no authentication: they obey any client.
+    The simulated arms have no authentication and obey any client.
     """
     if not ipaddress.ip_address(address).is_loopback:
         raise ValueError(
@@ -93,7 +94,7 @@ def _skew(axis: Floats) -> Floats:
 
 
 class ArmMechanics:
-    """Geometry and limits of a simulated arm, from its model in the scene.
+    """The geometry and limits of a simulated arm, from its model in the scene.
 
     range_rad: lower and upper ends of the joints' ranges (6, 2).
     speed_rad_per_s, acceleration_rad_per_s2: maximum speeds and accelerations of the joints (6,).
@@ -125,27 +126,27 @@ class ArmMechanics:
         return bool(((joints_rad >= low) & (joints_rad <= high)).all())
 
     def forward(self, joints_rad: Floats) -> Floats:
-        """Compute the forward kinematics: base_from_flange (4, 4) for joint angles (6,).
+        """Compute the forward kinematics: base_from_flange (4, 4) for joint angles (6,), rad.
 
-        It is exp(S1 q1) ... exp(S6 q6) M, with the screw axes S, joint angles q, and the flange
-        pose M at joint angles of zero.
+        The pose is exp(S1 q1) ... exp(S6 q6) M, with the screw axes S, joint angles q, and the
+        flange pose M at joint angles of zero.
         """
         turns = self._rotations(joints_rad)
         one, two, three = turns[::2] @ turns[1::2]
         return np.asarray(one @ two @ three @ self._home)
 
     def _rotations(self, joints_rad: Floats) -> Floats:
-        """Return the transforms exp(S q) (6, 4, 4) of all joints; see `forward`."""
+        """Return the matrices exp(S q) (6, 4, 4) for screw axes S and joint angles q (6,), rad."""
         angles = joints_rad[:, None, None]
         return np.asarray(
             np.eye(4) + np.sin(angles) * self._cross + (1.0 - np.cos(angles)) * self._square
         )
 
     def solve_inverse_kinematics(self, base_from_flange: Floats, guess_rad: Floats) -> Floats:
-        """Solve the joint angles (6,), within their ranges, for a flange pose (4, 4).
+        """Solve the joint angles (6,), rad, within their ranges, for a flange pose (4, 4).
 
-        The method is damped Gauss-Newton from `guess_rad`. Raises ValueError unless it converges to
-        a micrometre and a microradian.
+        The damped Gauss-Newton method starts at `guess_rad` (6,). Raises ValueError unless the
+        pose error falls to a micrometre and a microradian.
         """
         joints = guess_rad.copy()
         low, high = self.range_rad.T
@@ -170,7 +171,7 @@ class ArmMechanics:
 
 
 def _pose_error(wanted: Floats, present: Floats) -> Floats:
-    """Return translation (m) and small rotation (rad), as (6,), from present to wanted pose."""
+    """Return the translation (m) and small rotation (rad) from `present` to `wanted`, (6,)."""
     turn = wanted[:3, :3] @ present[:3, :3].T
     spin = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -179,7 +180,7 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 
 RV_1A_MECHANICS = ArmMechanics(RV_1A)
-"""Mechanics of the RV-1A, the default arm of a scene."""
+"""The mechanics of the RV-1A, the default arm of a scene."""
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
@@ -189,9 +190,10 @@ def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
 def decelerate(
     velocity_rad_per_s: Floats, duration_s: float, acceleration_rad_per_s2: Floats
 ) -> Floats:
-    """Return the joint velocities (..., 6) after braking for a duration.
+    """Return the joint velocities (..., 6), rad/s, after braking for a duration.
 
     All joints are slowed by the same factor, so that the arm stays on its path.
+    acceleration_rad_per_s2: maximum decelerations (6,).
     """
     stopping_s = (np.abs(velocity_rad_per_s) / acceleration_rad_per_s2).max(axis=-1, keepdims=True)
     left = np.maximum(stopping_s - duration_s, 0.0) / np.maximum(stopping_s, 1e-12)
@@ -200,9 +202,9 @@ def decelerate(
 
 @dataclass(slots=True)
 class Servo:
-    """Six joint servos of second order with critical damping.
+    """The six joint servos of an arm, of second order with critical damping.
 
-    joints_rad: joint angles (6,) by the encoders, which are at the motors.
+    joints_rad: joint angles (6,) that the encoders at the motors measure.
     lag_s: lag of a joint behind a set-point of constant velocity.
     driven_rad: joint angles (6,) at the output of the gears. After a reversal they stay constant
         until the motor has moved by `backlash_rad`.
@@ -245,15 +247,16 @@ class Servo:
 
 
 class Controller:
-    """Simulated controller of one arm, which checks command blocks and answers with its status.
+    """A simulated controller of one arm, which checks command blocks and answers with its status.
 
-    It rejects an invalid command (magic number, version, CRC, mode, sequence number) by a Modbus
-    exception. In four cases it enters the fault state, in which it brakes and stops: joints out of
-    range, joints not finite, a jump of the set-point, and no command for `watchdog_s` while moving.
-    An `idle` command clears a fault and may restart the sequence numbers.
+    The controller rejects an invalid command (magic number, version, CRC, mode, sequence number)
+    by a Modbus exception. In four cases it enters the fault state, in which it brakes and stops:
+    joints out of range, joints not finite, a jump of the set-point, and no command for `watchdog_s`
+    while moving. An `idle` command clears a fault and may restart the sequence numbers.
 
     noise_rad: standard deviation of the measured joints.
-    cycle_s: duration of a cycle; a set-point takes effect when the next one begins. 0: at once.
+    cycle_s: duration of a controller cycle. A set-point takes effect when the next cycle begins; 0:
+        at once.
     cycle_jitter_s: standard deviation of the time at which a cycle begins.
     latency_s: time from the arrival of a set-point until it waits for the next cycle.
     """
@@ -312,7 +315,7 @@ class Controller:
             self.servo.advance(self._acting_rad, duration_s, braking=self.state != STATE_MOVING)
 
     def receive_command(self, registers: list[int]) -> bool:
-        """Check and execute a command block; return False if it must be rejected."""
+        """Check and execute the registers of a command; return False if they must be rejected."""
         block = struct.pack(f">{len(registers)}H", *registers)
         if len(block) != _COMMAND.size:
             return self._refuse()
@@ -373,7 +376,7 @@ class Controller:
         return False
 
     def status_registers(self) -> list[int]:
-        """Return the status block of the register map, with the measured joints."""
+        """Return the status block of the register map as 16-bit registers."""
         measured = self.servo.joints_rad + self._noise_rad * self._random.standard_normal(6)
         block = _STATUS.pack(
             0x4653,
@@ -393,7 +396,7 @@ class Controller:
 
 
 class ArmServer:
-    """Modbus TCP server through which clients command a simulated controller."""
+    """A modbus TCP server through which clients command a simulated controller."""
 
     def __init__(
         self, controller: Controller, *, host: str, port: int, before: Callable[[], None]
@@ -408,7 +411,7 @@ class ArmServer:
         self._server: ModbusTcpServer | None = None
 
     async def start(self) -> None:
-        """Start to listen; raises OSError or RuntimeError if the port is in use."""
+        """Start to listen; raise OSError or RuntimeError if the port is in use."""
         device = SimDevice(
             1,
             simdata=[
@@ -423,7 +426,7 @@ class ArmServer:
 
     @property
     def port(self) -> int:
-        """Return the port on which the server listens, also if it was given as 0 (any)."""
+        """Return the port on which the server listens, even if port 0 (any) was requested."""
         listener: Any = None if self._server is None else self._server.transport
         if listener is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")

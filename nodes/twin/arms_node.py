@@ -1,7 +1,7 @@
 """Simulate two arms that are controlled over the network, and publish their true poses.
 
-The apparatus holds the true parameters of the simulated hardware; the scene holds those that the
-other nodes assume.
+The apparatus holds the true parameters of the simulated hardware. The scene holds the parameters
+that the other nodes assume.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ Loopback = Annotated[str, AfterValidator(check_loopback)]
 
 
 class TwinArmsParameters(SimulatorParameters):
-    """Parameters of the simulated arms; values that the apparatus states take precedence."""
+    """The parameters of the simulated arms; values in the apparatus take precedence."""
 
     host: Loopback = "127.0.0.1"
     left_port: ListenPort = Field(
-        default=5020, description="network port of the left arm; 0: any free port"
+        default=5020, description="network port of the left simulated arm; 0: any free port"
     )
     right_port: ListenPort = 5021
     rate_hz: Positive = 140.8
@@ -58,15 +58,17 @@ class TwinArmsParameters(SimulatorParameters):
     protocol: Literal["modbus", "mxt"] = "modbus"
     cycle_s: NonNegative = Field(
         default=0.0,
-        description="Modbus: controller cycle at which set-points take effect, s; 0: at once",
+        description="Modbus: period of the controller cycles, at whose start set-points take "
+        "effect, s; 0: set-points take effect at once",
     )
     restart_after_s: Positive = Field(
         default=2.0,
-        description="MXT: time after which the robot program restarts after an error, s",
+        description="MXT: time from an error until the robot program restarts, s",
     )
     joints_file: str | None = Field(
         default=None,
-        description="file that keeps the joint angles, so that a restart does not move the arms",
+        description="file that stores the joint angles, so that a restart does not move the arms; "
+        "null: the angles are not stored",
     )
     fault: Fault = Field(default="none", description="simulated fault of the arm `fault_side`")
     fault_side: Literal["left", "right"] = "left"
@@ -76,10 +78,10 @@ class TwinArmsParameters(SimulatorParameters):
 
 
 def open_joints_file(path: str | None) -> dict[str, Floats]:
-    """Open the file that keeps the joint angles of both arms, rad, when the process ends.
+    """Open the file that stores the joint angles of both arms, rad, beyond the end of the process.
 
-    The returned arrays (6,) are mapped onto the file. They are NaN if the file is new or `path` is
-    None. Raises OSError if the file cannot be opened.
+    The returned arrays (6,) by side are mapped onto the file. The angles are NaN if the file is new
+    or `path` is None. Raises OSError if the file cannot be opened.
     """
     if path is None:
         rows = np.full((2, 6), np.nan)
@@ -94,7 +96,11 @@ def open_joints_file(path: str | None) -> dict[str, Floats]:
 def joint_torques_nm(
     mechanics: ArmMechanics, joints_rad: Floats, flange_from_edge: Floats, force_n: Floats
 ) -> Floats:
-    """Return the joint torques (6,) that a force (3,) on the edge, in the base frame, causes."""
+    """Return the joint torques (6,), N m, that a force on the sheet's edge causes.
+
+    joints_rad: joint angles (6,). flange_from_edge: pose (4, 4). force_n: force (3,) in the base
+    frame.
+    """
     step_rad = 1e-4
     torques = np.zeros(6)
     for joint, turn in enumerate(step_rad * np.eye(6)):
@@ -199,17 +205,18 @@ class TwinArmsNode(Node):
         return self._arms.left if side == "left" else self._arms.right
 
     def _true_joints(self, side: str, motor_rad: Floats) -> Floats:
-        """Return the true joint angles (6,), given the angles (6,) after the gears' backlash.
+        """Return the true joint angles (6,), rad: encoder angles plus the true zero offsets.
 
-        They differ by the true zero offsets of the encoders.
+        motor_rad: joint angles (6,) after the backlash of the gears.
         """
         offsets_rad = self._truth(side).joint_offsets_rad
         return motor_rad + np.array(offsets_rad) if any(offsets_rad) else motor_rad
 
     def _start_joints(self, side: str, spec: ArmSpec, scene: Scene) -> Floats:
-        """Return the joint angles (6,) by the encoders at which an arm starts.
+        """Return the encoder angles (6,), rad, at which an arm starts.
 
-        They hold the sheet in the screen plane (z = 0), with the scene's minimum stretch.
+        At these angles the arm holds the sheet in the screen plane (z = 0), with the scene's
+        minimum stretch.
         """
         half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
         edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
@@ -230,7 +237,7 @@ class TwinArmsNode(Node):
             self._stored_joints[side][:] = controller.servo.joints_rad
 
     def _load_motors(self, joints: dict[str, Floats], left: Floats, right: Floats) -> None:
-        """Set the joint torques of the sheet's pull, which only the protocol MXT reports."""
+        """Set the joint torques by the sheet's tension, which only the protocol MXT reports."""
         across = right[:3, 3] - left[:3, 3]
         distance_m = float(np.linalg.norm(across))
         if self._pull is None or distance_m <= 0.0:

@@ -21,28 +21,29 @@ from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
 
 RAYS = 3
-"""Number of rays per pixel in each direction."""
+"""The number of rays per pixel in each direction."""
 
 PAPER_LEVEL = 175.0
 INK_LEVEL = 22.0
 ROOM_LEVEL = 45.0
 BORDER_SQUARES = 0.6
-"""Width of the white border around the squares, in squares."""
+"""The width of the white border around the squares, in squares."""
 
 TILTS_RAD = (0.0, 0.35, 0.6, 0.45, 0.25)
 HEIGHT_FRACTIONS = (0.95, 0.5, 0.75, 0.35, 0.6)
-"""Tilts of successive poses, and fractions of the image height that the untilted board fills."""
+"""The fractions of the image height that the untilted board fills in successive poses. `TILTS_RAD`
+holds the tilts of the same poses."""
 
 MARGIN_PX = 6.0
 MIN_CHARUCO_FRACTION = 0.6
-"""Minimum visible fraction of the corners of a ChArUco board; the image may cut off the others."""
+"""The minimum fraction of the corners of a ChArUco board that must be visible in both images."""
 
 CHARUCO_NEARER = 1.2
-"""Factor by which a ChArUco board appears larger than a chessboard, since its markers are small."""
+"""The factor by which a ChArUco board appears larger than a chessboard in the images."""
 
 
 class BoardError(FlexsheetError, ValueError):
-    """Raised for a board that cannot be rendered; the text states the cause."""
+    """The error that is raised for a board that cannot be rendered."""
 
     code = "board"
     exit_code = 2
@@ -51,10 +52,10 @@ class BoardError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Uneven illumination of an image, and the background behind the board.
+    """The uneven illumination of an image, and the background behind the board.
 
-    gain: factor at the image centre. slope_x, slope_y: relative change from there to the right and
-    the lower edge. background: its levels (height, width).
+    gain: factor at the image centre. slope_x, slope_y: relative change from the centre to the right
+    and lower edges. background: grey levels (height, width).
     """
 
     gain: float
@@ -64,7 +65,7 @@ class Light:
 
 
 class TwinBoard:
-    """Simulated stereo camera that views a calibration board.
+    """A simulated stereo camera that views a calibration board.
 
     camera: true lenses and poses. seed: determines noise, illumination and poses.
     """
@@ -96,7 +97,8 @@ class TwinBoard:
     def corners(self, left_from_board: Floats) -> tuple[Floats, Floats]:
         """Return the true pixels (rows * columns, 2) of the inner corners in both images.
 
-        They are ordered row by row.
+        The corners are ordered row by row. Raises BoardError unless all corners lie in front of
+        both cameras.
         """
         board = self.board
         grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2) * board.square_m
@@ -116,7 +118,9 @@ class TwinBoard:
         ):
             in_eye = apply(eye_from_left @ left_from_board, points)
             if in_eye[:, 2].min() <= 0:
-                raise BoardError("the board reaches behind a camera; hold it further away")
+                raise BoardError(
+                    "a part of the board is behind a camera; hold the board farther away"
+                )
             seen.append(pixels_of(lens, in_eye[:, :2] / in_eye[:, 2:]))
         return seen
 
@@ -130,7 +134,7 @@ class TwinBoard:
         return quantize(levels + self.sensor.noise(levels) * noise)
 
     def levels(self, left_from_board: Floats) -> tuple[Singles, Singles]:
-        """Render both images (height, width) without noise and rounding."""
+        """Render both images (height, width) at the pose (4, 4), without noise and rounding."""
         self._views(left_from_board, self._outline())
         light = self._light()
         left, right = (
@@ -149,7 +153,7 @@ class TwinBoard:
         return Light(gain, slope_x, slope_y, np.clip(background, 5.0, 90.0).astype(np.float32))
 
     def _outline(self) -> Floats:
-        """Return points (n, 3) along the edge of the board with its border, in its frame."""
+        """Return points (n, 3), m, along the outer edge of the border, in the board's frame."""
         board = self.board
         low = -(1.0 + BORDER_SQUARES) * board.square_m
         high = np.array([board.columns, board.rows]) * board.square_m + BORDER_SQUARES * (
@@ -225,9 +229,9 @@ class TwinBoard:
     def poses(self, count: int) -> list[Floats]:
         """Return poses `left_from_board` (4, 4) at which a careful person would hold the board.
 
-        They cover the centre, corners and edges of the image, near and far, with tilts in all
-        directions. Each is as far from the image centre as both images still show the whole board
-        (most of a ChArUco board).
+        The poses cover the centre, corners and edges of the image at several distances, with tilts
+        in all directions. Each pose has the maximum distance from the image centre at which both
+        images show the whole board (most of a ChArUco board).
         """
         board = self.board
         board_centre = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
@@ -253,7 +257,8 @@ class TwinBoard:
     ) -> Floats:
         """Place a rotated board as far from the image centre in `direction` as it is visible.
 
-        If it is not visible at the centre, move it farther away. Returns left_from_board (4, 4).
+        A board that is too large at `depth_m` is moved farther away. Returns left_from_board
+        (4, 4).
         """
         between_m = -0.5 * float(self.camera.right_from_left[0, 3])
         half = 0.5 * np.array([self.camera.width_px, self.camera.height_px])
@@ -289,9 +294,9 @@ class TwinBoard:
 
 
 def _measure_rise(place: Singles) -> Singles:
-    """Return the change of values (rows, columns) from one ray to the next.
+    """Return the change (rows, columns) of values (rows, columns) from one ray to the next.
 
-    The change varies little within a pixel, so it is computed at one ray per pixel.
+    The change is computed at one ray per pixel, because it varies little within a pixel.
     """
     rows, columns = place.shape
     step = RAYS if min(rows, columns) >= 2 * RAYS else 1
@@ -303,12 +308,14 @@ def _measure_rise(place: Singles) -> Singles:
 def _markers(board: Board) -> NDArray[np.bool_]:
     """Return which cells of the ChArUco markers are black, (rows + 1, columns + 1, n, n).
 
-    A marker has n cells per side, its black border included. Markers are numbered by row over the
-    white squares; the first square of the board is black, as in OpenCV.
+    A marker has n cells per side, including its black border. Markers are numbered by row over the
+    white squares. The first square of the board is black, as in OpenCV.
     Raises BoardError if the board has no valid markers, or more than its dictionary holds.
     """
     if board.marker_m is None or board.dictionary is None:
-        raise BoardError("board: a ChArUco board needs marker_m and dictionary; give both")
+        raise BoardError(
+            "board: a ChArUco board needs the keys marker_m and dictionary; give both keys"
+        )
     if not 0 < board.marker_m < board.square_m:
         raise BoardError(
             f"board.marker_m: {board.marker_m:g} m does not fit into square_m = "
@@ -317,8 +324,8 @@ def _markers(board: Board) -> NDArray[np.bool_]:
     number = getattr(cv2.aruco, board.dictionary, None)
     if not isinstance(number, int) or not board.dictionary.startswith("DICT_"):
         raise BoardError(
-            f"board.dictionary: OpenCV has none named {board.dictionary}; give one of cv2.aruco, "
-            "for instance DICT_4X4_50"
+            f"board.dictionary: OpenCV has no dictionary {board.dictionary}; give one of cv2.aruco,"
+            " for instance DICT_4X4_50"
         )
     dictionary = cv2.aruco.getPredefinedDictionary(number)
     cells = dictionary.markerSize + 2
@@ -340,7 +347,7 @@ def _markers(board: Board) -> NDArray[np.bool_]:
 
 
 def _marker_ink(squares: Singles, markers: NDArray[np.bool_], share: float) -> Singles:
-    """Return 1 where a marker is printed black and 0 elsewhere.
+    """Return an array (...) with 1 where a marker is printed black and 0 elsewhere.
 
     squares: board positions (..., 2) in units of squares. share: side length of a marker as a
     fraction of its square.

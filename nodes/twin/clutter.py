@@ -2,8 +2,8 @@
 
 Positions are in m; `pixels.py` renders the objects. The path of an object is in the world frame,
 or relative to the fingertip if the object is `carried`. `views` names the cameras that see the
-object. Levels are grey levels (0 to 255) at normal exposure, at which the marker on the fingertip
-has a level of about 215.
+object. Levels are grey levels (0 to 255) at normal exposure. The marker on the fingertip has a
+level of about 215.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Views = Literal["both", "left", "right"]
 MARKER_RADIUS_M = 0.003
 FINGER_LENGTH_M = 0.06
 FINGER_DIRECTION: Point = (0.0, -0.5, 0.866)
-"""World direction from the fingertip to the knuckle; the finger must not hide the marker."""
+"""The world direction from the fingertip to the knuckle. The finger does not hide the marker."""
 
 
 class Trajectory(Protocol):
-    """Interface of a position as a function of simulation time."""
+    """The interface of a position as a function of simulation time."""
 
     def at(self, time_s: float) -> Floats:
         """Return the position (3,) in the world frame, or relative to the fingertip, m."""
@@ -34,7 +34,7 @@ class Trajectory(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class FixedPoint:
-    """Trajectory of an object that does not move."""
+    """A trajectory of an object that does not move."""
 
     point: Point
 
@@ -44,7 +44,7 @@ class FixedPoint:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """Trajectory that leaves `start` at time 0 and has a constant velocity."""
+    """A trajectory that leaves `start` at time 0 and has a constant velocity."""
 
     start: Point
     velocity_m_per_s: Point
@@ -55,7 +55,7 @@ class Moving:
 
 @dataclass(frozen=True, slots=True)
 class Oscillation:
-    """Sinusoidal oscillation about the centre `middle` with the amplitude `reach`."""
+    """A sinusoidal trajectory about the centre `middle` with the amplitude `reach` (3,), m."""
 
     middle: Point
     reach: Point
@@ -69,7 +69,7 @@ class Oscillation:
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """Part of the hand: a tapered capsule between two points, drawn behind the finger."""
+    """A part of the hand: a tapered capsule between two points, drawn behind the finger."""
 
     start: Trajectory
     end: Trajectory
@@ -81,7 +81,7 @@ class Capsule:
 
 @dataclass(frozen=True, slots=True)
 class SecondMarker:
-    """Bead that looks like the marker on the fingertip."""
+    """A bead that looks like the marker on the fingertip."""
 
     path: Trajectory
     radius_m: float = MARKER_RADIUS_M
@@ -92,9 +92,10 @@ class SecondMarker:
 
 @dataclass(frozen=True, slots=True)
 class Highlight:
-    """Reflection of a lamp: a small spot whose light is added to the background.
+    """A reflection of a lamp: a small spot whose light is added to the background.
 
-    It saturates above 255. On a curved surface it often appears in only one of the two images.
+    The image saturates above the grey level 255. A reflection on a curved surface often appears in
+    only one of the two images.
     """
 
     path: Trajectory
@@ -106,7 +107,7 @@ class Highlight:
 
 @dataclass(frozen=True, slots=True)
 class Occluder:
-    """Capsule of constant level that hides everything behind it, such as a cable."""
+    """A capsule of constant level that hides everything behind it, such as a cable."""
 
     start: Trajectory
     end: Trajectory
@@ -118,7 +119,7 @@ class Occluder:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """Illuminated rubber sheet behind the finger, at rest in the plane z = 0, with a texture.
+    """An illuminated rubber sheet behind the finger, at rest in the plane z = 0, with a texture.
 
     contrast: standard deviation of the texture's levels. grain_m: size of its features.
     """
@@ -132,7 +133,7 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """Set of cluttering objects, in the order in which they are drawn.
+    """A set of cluttering objects, in the order in which they are drawn.
 
     The finger with its marker is drawn after `limbs`.
     """
@@ -144,27 +145,23 @@ class Clutter:
     occluders: tuple[Occluder, ...] = ()
 
 
-def second_marker(offset_m: Point, *, level: float = 215.0, views: Views = "both") -> Clutter:
-    """Make a second marker at a fixed offset from the fingertip."""
-    return Clutter(
-        markers=(SecondMarker(FixedPoint(offset_m), level=level, carried=True, views=views),)
-    )
+def second_marker(offset_m: Point) -> Clutter:
+    """Make a second marker at a fixed offset (3,) from the fingertip, m."""
+    return Clutter(markers=(SecondMarker(FixedPoint(offset_m), carried=True),))
 
 
-def touching_highlight(
-    overlap: float, *, radius_m: float = 0.0015, level: float = 300.0, views: Views = "both"
-) -> Clutter:
+def touching_highlight(overlap: float, *, radius_m: float = 0.0015) -> Clutter:
     """Make a highlight beside the marker (+x) that covers a fraction of the marker's diameter."""
     aside_m = MARKER_RADIUS_M + radius_m - overlap * 2.0 * MARKER_RADIUS_M
-    spot = Highlight(FixedPoint((aside_m, 0.0, 0.0)), radius_m, level, carried=True, views=views)
+    spot = Highlight(FixedPoint((aside_m, 0.0, 0.0)), radius_m, 300.0, carried=True)
     return Clutter(highlights=(spot,))
 
 
-def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clutter:
-    """Make an occluder whose straight edge hides the fraction `share` of the marker's area.
+def covered(share: float, *, views: Views = "both") -> Clutter:
+    """Make an occluder whose straight edge hides the fraction `share` (0 to 1) of the marker.
 
-    It comes from +x. At `share` = 1 it hides the marker with its blur. With `views`, it hides the
-    marker from one camera only.
+    The occluder comes from +x. At `share` = 1 it also hides the blur of the marker.
+    views: cameras from which the marker is hidden.
     """
     radius_m = 0.05
     if share >= 1.0:
@@ -178,16 +175,16 @@ def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clut
         )
     middle_m = edge * MARKER_RADIUS_M + radius_m
     ends = [FixedPoint((middle_m, y, 0.0)) for y in (-0.02, 0.02)]
-    return Clutter(
-        occluders=(Occluder(ends[0], ends[1], radius_m, level, carried=True, views=views),)
-    )
+    return Clutter(occluders=(Occluder(ends[0], ends[1], radius_m, carried=True, views=views),))
 
 
 def together(*parts: Clutter) -> Clutter:
-    """Combine sets of clutter; raises ValueError if several contain a sheet."""
+    """Combine sets of clutter; raise ValueError if several sets contain a sheet."""
     sheets = [part.sheet for part in parts if part.sheet is not None]
     if len(sheets) > 1:
-        raise ValueError(f"{len(sheets)} sheets found; give one, since it fills the plane z = 0")
+        raise ValueError(
+            f"the clutter has {len(sheets)} sheets; give one, because a sheet fills the plane z = 0"
+        )
     return Clutter(
         sheet=sheets[0] if sheets else None,
         limbs=tuple(limb for part in parts for limb in part.limbs),
@@ -218,12 +215,12 @@ HAND = Clutter(
         ),
     )
 )  # fmt: skip
-"""Palm, folded fingers and thumb of a right hand whose index finger points."""
+"""The palm, folded fingers and thumb of a right hand whose index finger points."""
 
 NAIL = Clutter(
     highlights=(Highlight(FixedPoint((0.001, -0.006, 0.014)), 0.0006, 120.0, carried=True),)
 )
-"""Reflection on the fingernail, dimmer and smaller than the marker."""
+"""The reflection on the fingernail, dimmer and smaller than the marker."""
 
 CLAMPS = Clutter(
     highlights=(
@@ -231,7 +228,7 @@ CLAMPS = Clutter(
         Highlight(FixedPoint((0.135, -0.04, 0.01)), 0.0008, 150.0),
     )
 )
-"""Reflections on the clamps of the sheet's edges."""
+"""The reflections on the clamps of the sheet's edges."""
 
 PASSING = Clutter(
     markers=(SecondMarker(Oscillation((0.0, 0.05, 0.02), (0.14, 0.02, 0.0), 7.3)),),
@@ -253,11 +250,11 @@ PASSING = Clutter(
         ),
     ),
 )  # fmt: skip
-"""Moving bead as bright as the marker, moving reflections, and cables that swing in front."""
+"""The moving bead as bright as the marker, moving reflections, and cables that swing in front."""
 
 CLUTTER = {
     "none": Clutter(),
     "lab": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS),
     "crowded": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS, PASSING),
 }
-"""Sets of clutter by their names in launch files."""
+"""The sets of clutter by their names in launch files, such as "lab"."""

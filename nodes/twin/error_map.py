@@ -16,27 +16,28 @@ import numpy as np
 from flexsheet.nodes.arrays import Bools, Floats, Image
 
 PERIOD_M, RANGE_M = 0.02, 0.24
-"""Period of the phase and range of the coarse position, as in the shader `object.frag.glsl`."""
+"""The period of the phase and range of the coarse position, as in the shader `object.frag.glsl`."""
 
 PURE = 0.06
-"""Maximum deviation of red and green from the circle of codes, relative to its radius. A pixel that
-deviates more is a mixture of different colours and is ignored."""
+"""The maximum deviation of red and green from the circle of codes, relative to the radius of the
+circle. A pixel that deviates more is a mixture of different colours and is ignored."""
 
 AGREES_M = 0.002
-"""Maximum difference between the positions that blue and the phase encode; a pixel with a larger
-one is ignored. One step of blue is 1.2 mm."""
+"""The maximum difference between the positions that blue and the phase encode. A pixel with a
+larger difference is ignored. One step of blue is 1.2 mm."""
 
 RIM_PX = 3
-"""Width of the outline that is ignored, since mixing with black would change the decoded position.
+"""The width of the outline that is ignored, since mixing with black would change the decoded
+position.
 """
 
 COARSE_LIGHT = 0.1
-"""Fraction of full blue below which a pixel counts as black; the object has at least twice that."""
+"""The fraction of full blue below which a pixel counts as black and not as the object."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorMap:
-    """Image error at each visible point of the object.
+    """The image error at each visible point of the object.
 
     errors_m: (rows, columns, 2) seen minus expected position, x right, y up; NaN where no point can
     be decoded.
@@ -52,7 +53,10 @@ class ErrorMap:
 
 
 def error_map(coordinate_ramp_x: Image, coordinate_ramp_y: Image, metres_per_px: float) -> ErrorMap:
-    """Measure the image errors from the images (rows, columns, 3) of both patterns at the eye."""
+    """Measure the image errors from both patterns as the eye sees them.
+
+    coordinate_ramp_x, coordinate_ramp_y: images (rows, columns, 3).
+    """
     seen = _lit(coordinate_ramp_x) & _lit(coordinate_ramp_y)
     kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     seen = cv2.erode(seen.astype(np.uint8), kernel, borderValue=0) > 0
@@ -72,7 +76,7 @@ def _lit(picture: Image) -> Bools:
 
 
 def _places(picture: Image) -> tuple[Floats, Bools]:
-    """Decode the position (rows, columns), m, of each pixel, and whether its code is valid."""
+    """Return the encoded position, m, and the validity of each pixel, both (rows, columns)."""
     red, green, blue = np.moveaxis(picture.astype(np.float64) / 127.5 - 1.0, -1, 0)
     phase = np.arctan2(green, red) / (2.0 * np.pi)
     coarse = ((0.5 * (blue + 1.0) - 0.2) / 0.8 - 0.5) * RANGE_M

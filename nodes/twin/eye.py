@@ -35,27 +35,27 @@ from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
 Indices = NDArray[np.intp]
 
 METRES_PER_PX = 0.00035
-"""Default size of a pixel on the screen plane: half of the paper's 0.7 mm."""
+"""The default size of a pixel on the screen plane: half of the paper's 0.7 mm."""
 
 HALF_WINDOW_M = 0.12
 MARGIN_PX = 3
 SEEN_SAMPLES = 2
+
 FLAT_SAMPLES, SOFT_SAMPLES = 8, 4
-"""Samples per pixel and direction for flat and soft shading of the expected image. Sizes are
-measured in flat-shaded images, whose outline needs finer sampling."""
+"""The number of samples per pixel and direction in an expected image with flat and soft shading.
+Flat-shaded images need more samples, because sizes are measured at their outlines."""
 
 SHADOW_TOLERANCE = 0.002
-"""Relative distance behind the first surface on a projector ray beyond which a point is in shadow.
-"""
+"""The minimum relative distance of a shadowed point behind the first surface on a projector ray."""
 
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 AMBIENT, WRAP, SHEEN, SHEEN_EXPONENT = 0.25, 0.35, 0.10, 20.0
 GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0, 1.05]), 0.025
-"""Parameters of the shading of a soft object; see docs/renderer.md."""
+"""Three parameters of the shading of a soft object; docs/renderer.md describes all parameters."""
 
 
 class NotMeasurableError(FlexsheetError, ValueError):
-    """Raised if an image does not show the object to be measured; the text states the cause."""
+    """The error that is raised if an image does not show the object that is to be measured."""
 
     code = "not-measurable"
     remedy = "Choose a pose in which the whole object is visible within the image."
@@ -63,7 +63,7 @@ class NotMeasurableError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """Regular fan of rays from `origin`, one per pixel of an image.
+    """A regular fan of rays from `origin`, one per pixel of an image.
 
     The direction of a ray is first + column * right + row * down; all vectors are (3,).
     """
@@ -83,7 +83,7 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """First intersection of each ray of a fan with a mesh.
+    """The first intersection of each ray of a fan with a mesh.
 
     triangle: (height, width) index of the triangle that is hit; -1 where nothing is hit.
     inverse_range: (height, width) reciprocal of the ray parameter at the hit; 0 if there is no hit.
@@ -97,9 +97,9 @@ class Hits:
 
 
 def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
-    """Find the nearest triangle that each ray of a fan hits.
+    """Find the nearest triangle that each ray hits.
 
-    triangles: (triangles, 3) indices of vertices (vertices, 3).
+    triangles: (triangles, 3) indices of vertices (vertices, 3), m.
 
     A direction is written as d = sum of w_i (vertex_i - origin) over the corners of a triangle. The
     ray hits the triangle if all w_i >= 0, at the ray parameter 1 / sum(w). The weights w_i are
@@ -140,7 +140,7 @@ def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
 
 
 class TrueProjector:
-    """Simulated projector, which maps between its pixels and the points of the sheet they light."""
+    """A simulated projector, which maps its pixels to the points of the sheet and back."""
 
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
         """Prepare the rays of a projector that lights a mesh.
@@ -176,7 +176,7 @@ class TrueProjector:
         return first_hits(self._rays, self._vertices, self._triangles)
 
     def _straight(self, pixels: Floats) -> Floats:
-        """Return the positions (..., 2) that pixels (..., 2) have without lens distortion."""
+        """Remove the lens distortion from pixels (..., 2)."""
         lens = self._lens
         if not any(lens.distortion):
             return pixels
@@ -184,7 +184,7 @@ class TrueProjector:
         return np.asarray(slopes_of(lens, pixels) * focal + centre)
 
     def pixels_of(self, points: Floats) -> tuple[Floats, Bools]:
-        """Return the projector pixels (..., 2) that light points (..., 3), and which are lit.
+        """Return the projector pixels (..., 2) of world points (..., 3), and whether each is lit.
 
         A point is not lit if it lies outside the projected image or if another part of the sheet
         casts a shadow on it.
@@ -205,9 +205,9 @@ class TrueProjector:
         return pixels, lit
 
     def intersect_surface(self, pixels: Floats) -> tuple[Floats, Bools]:
-        """Return the points (n, 3) of the sheet that pixels (n, 2) light, and which are valid.
+        """Return the points (n, 3) of the sheet that pixels (n, 2) light, and their validity (n,).
 
-        A point is not valid if the pixel is outside the image or its ray misses the sheet.
+        A point is not valid if the pixel is outside the image or if its ray misses the sheet.
         """
         inside: Bools = np.all((pixels >= -0.5) & (pixels <= self._size - 0.5), axis=1)
         places = self._straight(np.where(inside[:, None], pixels, 0.0)) + self._margin
@@ -224,14 +224,14 @@ class TrueProjector:
 
 
 Box = tuple[int, int, int, int]
-"""Part of an image: first column, first row, last column + 1, last row + 1."""
+"""The part of an image: first column, first row, last column + 1, last row + 1."""
 
 
 def eye_rays(eye: Floats, *, metres_per_px: float, size: int, box: Box, samples: int) -> Rays:
-    """Make the rays from the eye through part of the measuring camera's square image.
+    """Make the rays from the eye (3,) through part of the measuring camera's square image.
 
     The whole image has `size` x `size` pixels. Each pixel of `box` has `samples` x `samples` rays;
-    the first is at the top left.
+    the first ray is at the top left.
     """
     left, top, right, bottom = box
     pitch = metres_per_px / samples
@@ -289,7 +289,7 @@ def seen(
 def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | None:
     """Return the part of the measuring camera's image that shows world points (n, 3).
 
-    It has a margin of MARGIN_PX. Return None if the image shows none of the points.
+    The part includes a margin of MARGIN_PX. Return None if the image shows none of the points.
     """
     if len(points) == 0:
         return None
@@ -303,7 +303,7 @@ def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | 
 
 
 def _put(whole: Image, box: Box, samples_of: NDArray[np.float32], samples: int) -> None:
-    """Average the samples of each pixel and store the pixels in part `box` of image `whole`."""
+    """Average the samples of each pixel and store the result in the part `box` of an image."""
     left, top, right, bottom = box
     blocks = samples_of.reshape(bottom - top, samples, right - left, samples, -1)
     whole[top:bottom, left:right] = np.rint(blocks.mean(axis=(1, 3)))
@@ -321,7 +321,9 @@ def render_expected(
     Raises ValueError unless the whole object lies in front of the eye.
     """
     if (true_object.vertices[:, 2] > eye[2] - 1e-3).any():
-        raise ValueError("the virtual object reaches the eye or beyond; move the object or the eye")
+        raise ValueError(
+            "a part of the virtual object is not in front of the eye; move the object or the eye"
+        )
     vertices, triangles = true_object.vertices, true_object.triangles
     size = round(2.0 * HALF_WINDOW_M / metres_per_px)
     whole = np.zeros((size, size, 3), np.uint8)
@@ -359,8 +361,8 @@ def render_expected(
 def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) -> Floats:
     """Return the colours (n, 3), 0 to 1, of points on a soft object without a texture.
 
-    colour: (3,) of the object. normals, to_eye: (n, 3) normals, and vectors from the points to the
-    eye. sunk_m: (n,) depths by which the points are pushed in.
+    colour: (3,) of the object. normals: (n, 3). to_eye: (n, 3) vectors from the points to the eye.
+    sunk_m: (n,) depths by which the points are pushed in.
     """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     half = to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True) + LIGHT
@@ -373,14 +375,14 @@ def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) ->
 
 
 class _Silhouette:
-    """Outline of the largest bright region of an image, measured along rows and columns."""
+    """The outline of the largest bright region of an image, measured along rows and columns."""
 
     def __init__(self, picture: Image) -> None:
         gray = picture.astype(np.float64).mean(axis=2)
         bright = gray[gray > 25.0]
         if len(bright) < 400:
             raise NotMeasurableError(
-                f"only {len(bright)} pixels of the image are lit; at least 400 are required"
+                f"only {len(bright)} pixels of the eye's image are lit; at least 400 are required"
             )
         self.white = float(np.quantile(bright, 0.9))
         mask = (gray > 0.5 * self.white).astype(np.uint8)
@@ -389,10 +391,11 @@ class _Silhouette:
         left, top, width, height, area = statistics[largest]
         if area < 400:
             raise NotMeasurableError(
-                f"the largest bright region has only {area} pixels; at least 400 are required"
+                f"the largest bright region of the eye's image has only {area} pixels; at least "
+                "400 are required"
             )
         if left == 0 or top == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]:
-            raise NotMeasurableError("the object reaches the border of the image")
+            raise NotMeasurableError("the object reaches the border of the eye's image")
         # Remove other regions. The margin keeps the partly bright pixels at the edge.
         keep = cv2.dilate((labels == largest).astype(np.uint8), np.ones((9, 9), np.uint8))
         self._gray = np.where(keep > 0, gray, 0.0) / self.white
@@ -400,11 +403,11 @@ class _Silhouette:
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Return the rows at which the object begins and ends on a (fractional) column."""
+        """Return the top and bottom row (px) of the object on a fractional column."""
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:
-        """Return the columns at which the object begins and ends on a (fractional) row."""
+        """Return the left and right column (px) of the object on a fractional row."""
         return self._ends_between(self._gray, row)
 
     def _ends_between(self, lines: Floats, at: float) -> tuple[float, float]:
@@ -420,12 +423,15 @@ class _Silhouette:
 def _ends(profile: Floats) -> tuple[float, float]:
     """Return the subpixel positions at which a bright run of a grey-level profile begins and ends.
 
-    An edge is placed where a sharp step would give the same total light. Unlike the position of
-    half brightness, this is exact for any symmetric blur.
+    The position of an edge is that of a sharp step with the same total light, which is exact for
+    any symmetric blur. Raises NotMeasurableError if the run is too short.
     """
     bright = np.nonzero(profile > 0.5)[0]
     if len(bright) < 12:
-        raise NotMeasurableError("the object is too narrow, or missing, on a measured line")
+        raise NotMeasurableError(
+            f"the object covers only {len(bright)} pixels of a measured line of the eye's image; "
+            "at least 12 are required"
+        )
     return _edge(profile, bright[0]), len(profile) - 1 - _edge(
         profile[::-1], len(profile) - 1 - bright[-1]
     )
@@ -439,11 +445,11 @@ def _edge(profile: Floats, first: int) -> float:
 
 
 INSET = 0.05
-"""Fraction of the height of the tilted cylinder. Its widths are measured this far inside the upper
-and lower edge, away from the rounded corners."""
+"""The distance of the measured widths of the tilted cylinder from its upper and lower edge, as a
+fraction of its height. The distance avoids the rounded corners."""
 
 MIDDLE_COLUMNS = 17
-"""Number of columns about the centre over which a measured height is averaged."""
+"""The number of columns about the centre over which a measured height is averaged."""
 
 
 def _height(shape: _Silhouette) -> tuple[float, float]:
@@ -485,7 +491,7 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class EyeSituation:
-    """True state of the simulated hardware and of the object while a frame is shown.
+    """The true state of the simulated hardware and of the object while a frame is shown.
 
     world_from_flange_left, world_from_flange_right: (4, 4) poses of the arms' last links.
     finger_tip: (3,) in the world frame, or None if there is no finger.
@@ -520,7 +526,7 @@ class EyeSituation:
         metres_per_px: float,
         apparatus: Apparatus | None = None,
     ) -> Self:
-        """Combine the latest messages.
+        """Collect the true state from the latest messages.
 
         scene: the scene with the true devices. The deformation is ignored unless `body` and `skin`
         belong to the same mesh.
@@ -577,7 +583,7 @@ def true_sheet(
 
 
 class EyeCamera:
-    """Measuring camera at the user's eye, which caches results that later images can use."""
+    """A measuring camera at the user's eye, which caches the expected image."""
 
     def __init__(self) -> None:
         self._scene: Scene | None = None
@@ -587,7 +593,7 @@ class EyeCamera:
     def take(
         self, projected: Image, situation: EyeSituation, *, eye: Floats
     ) -> tuple[Image, Image]:
-        """Render the image of a projected frame that the eye sees, and the one that it should see.
+        """Render the image of a projected frame that the eye sees, and the expected image.
 
         Both images are (rows, columns, 3). Raises NotConvergedError if the sheet's shape is not
         found, and ValueError if the object reaches the eye or its deformation is invalid.
@@ -611,20 +617,16 @@ class EyeCamera:
             self._scene, self._body = situation.scene, TrueBody(situation.scene)
             self._expected = None
         skin, triangles = situation.skin_vertices, situation.skin_triangles
-        displacement = situation.displacement
-        moved = displacement is not None and bool(displacement.any())
+        moved = situation.displacement
         settings = np.array([*eye, situation.flat, situation.metres_per_px])
         key: tuple[bytes, ...] = (settings.tobytes(),)
-        if skin is not None and displacement is not None and moved:
-            key += (skin.tobytes(), displacement.tobytes())
+        deformation = None
+        if skin is not None and triangles is not None and moved is not None and moved.any():
+            key += (skin.tobytes(), moved.tobytes())
+            deformation = skin.astype(np.float64), triangles, moved.astype(np.float64)
         if self._expected is None or self._expected[0] != key:
-            true_object = (
-                self._body.displaced(
-                    skin.astype(np.float64), triangles, displacement.astype(np.float64)
-                )
-                if moved and skin is not None and triangles is not None and displacement is not None
-                else self._body.at_rest()
-            )
+            body = self._body
+            true_object = body.displaced(*deformation) if deformation else body.at_rest()
             picture = render_expected(
                 true_object, eye=eye, flat=situation.flat, metres_per_px=situation.metres_per_px
             )

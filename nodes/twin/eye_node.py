@@ -31,15 +31,15 @@ from flexsheet.nodes import OmissionReason
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation
-from flexsheet.nodes.twin.head import HeadSway
 from flexsheet.nodes.twin.render_queue import RenderQueue
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus, find_display_delay_s
+from flexsheet.nodes.twin.viewer import HeadSway
 
 Job = tuple[EyeSituation, Floats, Frame, Header]
 
 
 class TwinEyeParameters(SimulatorParameters):
-    """Parameters of the simulated eye."""
+    """The parameters of the simulated eye."""
 
     metres_per_px: Positive = Field(
         default=METRES_PER_PX, description="size of a pixel on the screen plane, m"
@@ -49,18 +49,20 @@ class TwinEyeParameters(SimulatorParameters):
     )
     projector: Projector | None = Field(
         default=None,
-        description="true projector, in the format of the scene; null: that of the scene",
+        description="true projector, in the format of the scene file; null: the scene's projector",
     )
     eye_stale_s: Positive = Field(
         default=0.1,
-        description="age of the tracked `eye`, s, above which the eyes of the scene are used",
+        description="maximum age of the tracked eye position, s; with an older one, the eyes of "
+        "the scene are used",
     )
     min_interval_s: Positive = Field(
-        default=5.0, description="minimum time before the same label is rendered again, s"
+        default=5.0, description="minimum time between two rendered frames of the same label, s"
     )
     viewpoint: Viewpoint = Field(
         default="centre",
-        description="position of the measuring camera for mono frames: one eye or between both",
+        description="position of the measuring camera for mono frames: left or right eye, or the "
+        "centre between both eyes",
     )
     seed: int = Field(default=2026, description="random seed of the simulated head motion")
 
@@ -72,9 +74,9 @@ class TwinEyeNode(Node):
     the viewpoint in the parameters, and a frame for one eye from that eye.
 
     An image takes about a second. Further frames of a label that is waiting or was just rendered
-    are therefore skipped; they do not count as lost. The sheet has its true shape at the time at
+    are therefore skipped and do not count as lost. The sheet has its true shape at the time at
     which the projector shows the frame, a few milliseconds after the frame arrives. The finger
-    position is that of the latest exposure, the deformation is the solver's latest.
+    position is that of the latest exposure, and the deformation is the latest from the solver.
     """
 
     on_demand: ClassVar[bool] = True
@@ -122,12 +124,15 @@ class TwinEyeNode(Node):
         if self.scene.message is None or self.twin__arms.message is None:
             self.note = "waits for the scene and the simulated arms"
         elif frame.stereo != "mono" and frame.eye == "both":
-            self.note = f'cannot render frame "{frame.label}" with two views ({frame.stereo})'
+            self.note = f'frame "{frame.label}" with two views ({frame.stereo}) cannot be rendered'
         elif self._queue.is_full:
             if self._queue.reject(key):
                 self.report_error(
                     "on_frame",
-                    OverflowError(f'frame "{frame.label}" not rendered: increase max_queue'),
+                    OverflowError(
+                        f'frame "{frame.label}" is not rendered, because max_queue = '
+                        f"{self.parameters.max_queue} frames are waiting; increase max_queue"
+                    ),
                 )
         elif self._before_light is None:
             self._before_light = (frame, header)
@@ -151,7 +156,7 @@ class TwinEyeNode(Node):
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
 
     def _true_scene(self, scene: Scene) -> Scene:
-        """Return the scene with the true devices; cached, so that it is one object per scene."""
+        """Return the scene with the true devices: the same object for the same scene."""
         if self._scenes is None or self._scenes[0] is not scene:
             true = apply_apparatus(scene, self.parameters.apparatus)
             if self.parameters.projector is not None:
@@ -175,10 +180,10 @@ class TwinEyeNode(Node):
         return self.parameters.viewpoint if frame.eye == "both" else frame.eye
 
     def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
-        """Return the true position (3,) of the measuring camera.
+        """Return the true world position (3,) of the measuring camera at `at_s`, m.
 
-        The offset of the apparatus is added to the tracked eyes, or to the eyes of the scene if
-        none are tracked.
+        The position is that of the tracked eyes, or else of the scene's eyes, plus the offset in
+        the apparatus.
         """
         given = self.parameters
         tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None

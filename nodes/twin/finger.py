@@ -22,10 +22,10 @@ from flexsheet.nodes.arrays import Floats
 Real = TypeVar("Real", float, Floats)
 
 ROUNDING_S = 0.04
-"""Half the duration over which corners of a polyline are rounded; a hand does not turn abruptly."""
+"""Half of the duration over which corners of a polyline are rounded, s."""
 
 EASE_SPEED_M_PER_S = 0.4
-"""Peak speed of the reach from the present position to the first point of a path."""
+"""The peak speed of the reach from the present position to the first point of a path."""
 
 MIN_EASE_S = 0.3
 WANDER_BAND_HZ = (0.15, 1.2)
@@ -33,7 +33,7 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 
 
 class FingerPathError(FlexsheetError, ValueError):
-    """Raised for a path that the simulated finger cannot follow; the text gives the remedy."""
+    """The error that is raised for a path that the simulated finger cannot follow."""
 
     code = "finger-path"
     remedy = "Slow the path down, or correct the point or line that the text names."
@@ -41,7 +41,7 @@ class FingerPathError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class SineSum:
-    """Band-limited noise: a sum of sines per axis with standard deviation 1, defined for any time.
+    """A band-limited noise: a sum of sines per axis with standard deviation 1.
 
     frequencies_hz, phases_rad: (3 axes, sines).
     """
@@ -51,7 +51,7 @@ class SineSum:
 
     @staticmethod
     def drawn(band_hz: tuple[float, float], generator: np.random.Generator) -> SineSum:
-        """Choose seven sines per axis at random, one from each seventh of the frequency band."""
+        """Choose seven random sines per axis: one from each seventh of the frequency band."""
         edges = np.linspace(*band_hz, 8)
         return SineSum(
             frequencies_hz=generator.uniform(edges[:-1], edges[1:], (3, 7)),
@@ -67,9 +67,9 @@ class SineSum:
 
 
 class Path(Protocol):
-    """Interface of the steady motion along a path, without wander and tremor.
+    """The interface of the motion along a path, without wander and tremor.
 
-    Here times are in seconds from the first point. The finger rests before and after the path.
+    Times are in seconds from the first point. The finger rests before and after the path.
     """
 
     @property
@@ -82,7 +82,7 @@ class Path(Protocol):
     def begins_s(self) -> float:
         """Return the time (s, at most 0) at which the finger leaves the first point.
 
-        The reach to the path must have ended by then.
+        The reach to the first point must end at this time or earlier.
         """
         ...
 
@@ -97,12 +97,13 @@ class Path(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RoundedLines:
-    """Motion along straight lines, whose corners are rounded by a moving average of +-ROUNDING_S.
+    """The motion along straight lines, whose corners are rounded by a moving average of
+    +-ROUNDING_S.
 
-    The average is computed exactly from the integral of the position. It never leaves the convex
-    hull of the points, never exceeds the speed on the lines, and has a continuous velocity.
-    It suits paths of a few points. A smooth motion that is sampled densely would be displaced by
-    ROUNDING_S^2 / 6 times its acceleration.
+    The average is computed exactly from the integral of the position. The rounded motion never
+    leaves the convex hull of the points, never exceeds the speed on the lines, and has a continuous
+    velocity. Densely sampled smooth motions are unsuitable: rounding would displace them by
+    ROUNDING_S^2 / 6 times their acceleration.
 
     integral: (n, 3) integral of the position from time 0 to each point, m s.
     """
@@ -128,12 +129,12 @@ class RoundedLines:
         return -ROUNDING_S
 
     def speeds(self) -> Floats:
-        """Return the speeds (n - 1,) on the straight lines, m/s, which rounding does not exceed."""
+        """Return the speeds (n - 1,) on the straight lines, m/s, which bound the rounded motion."""
         ways = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.asarray(ways / np.diff(self.times_s))
 
     def _corner(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return the position on the polyline without rounding, and its integral since time 0."""
+        """Return the position (3,), m, on the polyline and its integral (3,), m s, since time 0."""
         if time_s <= 0.0:
             return self.points[0], self.points[0] * time_s
         if time_s >= self.times_s[-1]:
@@ -157,7 +158,7 @@ class RoundedLines:
 
 @dataclass(frozen=True, slots=True)
 class SmoothPath:
-    """Cubic spline through samples of a motion, at rest at both ends.
+    """A cubic spline through samples of a motion, at rest at both ends.
 
     Between samples at intervals h the error is about h^4 / 100 times the fourth derivative of the
     motion. For a reach of 10 mm in 50 ms, sampled every 4 ms, it is below a micrometre.
@@ -190,8 +191,9 @@ class SmoothPath:
     def speeds(self) -> Floats:
         """Return upper bounds (n - 1,) on the speed between successive samples, m/s.
 
-        Between two samples the velocity is a quadratic Bezier curve. It stays within the triangle
-        of its control points: both end velocities, and 3 times the mean velocity minus these two.
+        Between two samples the velocity is a quadratic Bezier curve, which stays within the
+        triangle of its control points: both end velocities, and 3 times the mean velocity minus
+        both end velocities.
         """
         ends = self.rates
         mean = np.diff(self.points, axis=0) / np.diff(self.times_s)[:, None]
@@ -218,8 +220,8 @@ class SmoothPath:
 def find_clamped_rates(times_s: Floats, points: Floats) -> Floats:
     """Return the rates (n, 3) at the points (n, 3) of the cubic spline that rests at both ends.
 
-    The second derivative is continuous; the tridiagonal equations are solved by elimination. SciPy
-    would take a third of a second to import, which delays the restart of the node.
+    The second derivative is continuous. The tridiagonal equations are solved by elimination,
+    because the import of SciPy would delay the restart of the node by a third of a second.
     """
     steps = np.diff(times_s)
     mean = np.diff(points, axis=0) / steps[:, None]
@@ -241,8 +243,8 @@ def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
     """
     if len(times_s) != len(points) or len(times_s) == 0:
         raise FingerPathError(
-            f"path has {len(times_s)} times and {len(points)} points; give one time per point, and "
-            "at least one point"
+            f"the path has {len(times_s)} times and {len(points)} points; give one time per point, "
+            "and at least one point"
         )
     steps_s = np.diff(times_s)
     if (steps_s <= 0).any():
@@ -259,10 +261,10 @@ def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class FingerState:
-    """True state of the fingertip at one time.
+    """The true state of the fingertip at one time.
 
     position, velocity: (3,) in m and m/s.
-    path_time_s: time since the first point of the path; negative during the reach to it.
+    path_time_s: time since the first point of the path; negative before the finger reaches it.
     path_done: whether the end of the path is reached.
     force: (3,) force of the sheet on the finger, N.
     """
@@ -276,14 +278,15 @@ class FingerState:
 
 @dataclass(frozen=True, slots=True)
 class FingerMotion:
-    """Motion of the fingertip: a reach to the first point of a path, the path, and unsteadiness.
+    """The motion of the fingertip: a reach to the first point of a path, the path, and
+    unsteadiness.
 
     start, start_velocity: position and velocity when the path was given, without unsteadiness.
     ease_s: duration of the reach to the first point.
-    amplitudes_before_m, amplitudes_m: (wander, tremor) before the reach and on the path; they are
-        blended during the reach.
-    age_s: time argument of the unsteadiness when the path was given. It increases from one motion
-        to the next, so that the unsteadiness has no jumps.
+    amplitudes_before_m, amplitudes_m: (wander, tremor) before the reach and on the path. Amplitudes
+        during the reach are interpolated.
+    age_s: time argument of the unsteadiness when the path was given. Later motions continue this
+        time, so that the unsteadiness has no jumps.
     """
 
     path: Path
@@ -304,7 +307,7 @@ class FingerMotion:
         wander_band_hz: tuple[float, float] = WANDER_BAND_HZ,
         tremor_band_hz: tuple[float, float] = TREMOR_BAND_HZ,
     ) -> FingerMotion:
-        """Make a finger that rests at `position`; `seed` determines its later unsteadiness."""
+        """Make a finger that rests at `position` (3,), m; `seed` determines later unsteadiness."""
         generator = np.random.default_rng(seed)
         return FingerMotion(
             path=RoundedLines.through(np.zeros(1), position[None]),
@@ -320,7 +323,7 @@ class FingerMotion:
 
     @staticmethod
     def of(finger: FingerTruth | None, position: Floats, *, seed: int) -> FingerMotion:
-        """Make a finger that rests at `position`, with the tremor of an apparatus if given."""
+        """Make a finger that rests at `position` (3,), m, with the true tremor if it is known."""
         if finger is None:
             return FingerMotion.resting(position, seed=seed)
         middle_hz, half_hz = finger.tremor_frequency_hz, 0.5 * finger.tremor_width_hz
@@ -342,7 +345,9 @@ class FingerMotion:
         max_speed_m_per_s: float,
         joined_by: PathJoin = "rounded_lines",
     ) -> FingerMotion:
-        """Return the motion that follows if a new path is given at time `at_s` of this motion.
+        """Return the motion that follows a new path from the time `at_s` of this motion on.
+
+        times_s, points: path of n times and points (n, 3), m.
 
         wander_m: standard deviation of the wander per axis.
         tremor_m: amplitude of the tremor, that is sqrt(2) times its standard deviation per axis.
@@ -355,8 +360,9 @@ class FingerMotion:
         if (speeds > max_speed_m_per_s).any():
             at = int(np.argmax(speeds))
             raise FingerPathError(
-                f"path: speed {speeds[at]:.3g} m/s after times_s[{at}] = {times_s[at]:.6g} exceeds "
-                f"finger.max_speed_m_per_s = {max_speed_m_per_s:.3g} m/s; increase the times"
+                f"path: the speed {speeds[at]:.3g} m/s after times_s[{at}] = {times_s[at]:.6g} "
+                f"exceeds finger.max_speed_m_per_s = {max_speed_m_per_s:.3g} m/s; increase the "
+                "times"
             )
         start, start_velocity, amplitudes = self._steady(at_s)
         distance_m = float(np.linalg.norm(points[0] - start))
@@ -376,7 +382,7 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Return position and velocity without unsteadiness, and the amplitudes of both parts."""
+        """Return the position and velocity (3,) without unsteadiness, and its two amplitudes, m."""
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))
             return position, velocity, self.amplitudes_m
@@ -412,7 +418,10 @@ class FingerMotion:
 
 
 def find_tremor_m(finger: FingerTruth | None, path_tremor_m: float) -> float:
-    """Return the tremor amplitude on a path: that of the apparatus if both state a tremor."""
+    """Return the tremor amplitude on a path, m.
+
+    The tremor of the apparatus, if any, replaces the amplitude of a path with tremor.
+    """
     if finger is None or finger.tremor_rms_m is None or not path_tremor_m:
         return path_tremor_m
     return math.sqrt(2.0) * finger.tremor_rms_m
@@ -421,7 +430,7 @@ def find_tremor_m(finger: FingerTruth | None, path_tremor_m: float) -> float:
 def minimum_jerk_profile(s: Real) -> tuple[Real, Real]:
     """Return the minimum-jerk profile and its derivative at s (Flash and Hogan 1985).
 
-    The profile rises from 0 to 1 while s, the fraction of the duration, rises from 0 to 1.
+    s: fraction of the duration, 0 to 1; numbers or arrays. The profile rises from 0 to 1.
     """
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2
 

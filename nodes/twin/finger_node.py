@@ -1,7 +1,7 @@
 """Simulate the user's finger and the stereo camera that observes it.
 
-The apparatus holds the true parameters of the simulated hardware; the scene holds those that the
-other nodes assume.
+The apparatus holds the true parameters of the simulated hardware. The scene holds the parameters
+that the other nodes assume.
 """
 
 from __future__ import annotations
@@ -36,17 +36,16 @@ from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 JITTER_STREAM = 1
-"""Second element of the random seed for the jitter of exposure times, which makes it independent of
-the image noise."""
+"""The second element of the random seed for the jitter of exposure times, which makes the jitter
+independent of the image noise."""
 
 
 class TwinFingerParameters(SimulatorParameters):
-    """Parameters of the simulated finger and stereo camera."""
+    """The parameters of the simulated finger and stereo camera."""
 
     seed: int = Field(
         default=2006,
-        description="random seed of the finger's unsteadiness and the image noise; no chart of the "
-        "documentation uses the default",
+        description="random seed of the finger's unsteadiness and the image noise",
     )
     rest_world_m: tuple[float, float, float] = Field(
         default=(0.0, 0.0, 0.08),
@@ -57,18 +56,18 @@ class TwinFingerParameters(SimulatorParameters):
     )
     clutter: Literal["none", "lab", "crowded"] = Field(
         default="lab",
-        description="other objects in the images. lab: sheet, hand, reflections; crowded: also a "
-        "second marker, moving reflections, cables",
+        description="objects in the images besides the finger. lab: sheet, hand, reflections; "
+        "crowded: also a second marker, moving reflections, cables",
     )
     hand: Literal["prescribed", "coupled"] = Field(
         default="prescribed",
         description="prescribed: the finger follows its path regardless of forces. coupled: the "
-        "force of the simulated sheet deflects the finger; the apparatus has the hand's impedance",
+        "force of the simulated sheet deflects the finger, by the hand impedance in the apparatus",
     )
     cache_dir: Path | None = Field(
         default=None,
-        description="folder of the cached table of the sheet's force on a coupled finger; null: "
-        "the user's cache",
+        description="folder that caches the table of the sheet's force on a coupled finger; null: "
+        "the user's cache folder",
     )
 
 
@@ -99,7 +98,7 @@ class TwinFingerNode(Node):
 
     @cached_property
     def has_scene(self) -> asyncio.Event:
-        """Event that is set when the first scene has arrived."""
+        """Return the event that is set when the first scene arrives."""
         return asyncio.Event()
 
     @classmethod
@@ -182,7 +181,7 @@ class TwinFingerNode(Node):
         return (at_ns - self.started_ns) * 1e-9
 
     def _voluntary(self, at_s: float) -> tuple[Floats, Floats]:
-        """Return position and velocity, each (3,), of the finger if it touched nothing."""
+        """Return position (3,), m, and velocity (3,), m/s, of a finger that touches nothing."""
         state = self.motion.at(at_s - self._seconds(self.motion_from_ns))
         return state.position, state.velocity
 
@@ -213,7 +212,7 @@ class TwinFingerNode(Node):
     def _follow(self, path: FingerPath) -> None:
         """Start to follow a path now.
 
-        A path that the finger cannot follow raises FingerPathError and changes nothing.
+        Raises FingerPathError, without any change, if the finger cannot follow the path.
         """
         now_ns = self.clock.now_ns()
         if self.coupled is not None and self.edges:
@@ -247,7 +246,7 @@ class TwinFingerNode(Node):
         """Render the image pair with timestamp `middle_ns`; publish the true finger at that time.
 
         The actual exposure time differs from `middle_ns` by the timestamp error of the apparatus.
-        This method must not be called before a scene has been received.
+        Call this method only after a scene has been received.
         """
         assert self.camera is not None
         exposed_ns = middle_ns + self._stamp_error_ns()
@@ -279,7 +278,7 @@ class TwinFingerNode(Node):
         )
 
     def _track(self, exposed_ns: int) -> Callable[[float], Floats]:
-        """Return the position (3,) during an exposure as a function of the offset in time, s."""
+        """Return a function from the time since mid-exposure, s, to the fingertip position (3,)."""
         if self.coupled is None:
             return lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position
         seen = self.truth(exposed_ns)
@@ -309,7 +308,7 @@ class TwinFingerNode(Node):
 
     @property
     def _max_late_ns(self) -> int:
-        """Return by how much the start of an exposure may be late without missing the frame.
+        """Return the maximum delay of an exposure's start without missing the frame, ns.
 
         An exposure may overlap the read-out of the previous frame.
         """

@@ -22,28 +22,28 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.nodes.arrays import Floats
 
 REFERENCE_S = 1.0
-"""Age of a force at which the relaxation function is one."""
+"""The age of a force at which the relaxation function is one."""
 
 TIME_CONSTANTS_S = 10.0 ** np.arange(-1.0, 4.0)
-"""Time constants of the relaxation function; forces relax from about 50 ms to some hours."""
+"""The time constants of the relaxation function; forces relax from about 50 ms to some hours."""
 
 REVERSAL_RATIO = 0.1
-"""Relative change of the elastic force within which the factor of the hysteresis approaches its new
-value to 1/e."""
+"""The relative change of the elastic force after a reversal in which the hysteresis factor's
+distance from its new value falls to 1/e."""
 
 MIN_FORCE_N = 1e-3
-"""Elastic force below which a change does not reverse the hysteresis."""
+"""The minimum elastic force whose changes can reverse the hysteresis, N."""
 
 CREEP_LOSS_RATIO = math.pi**2 / (4.0 * math.log(10.0))
-"""Fraction of the energy that a load cycle loses by creep, divided by the creep per decade."""
+"""The fraction of the energy that a load cycle loses by creep, divided by the creep per decade."""
 
 MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
-"""Time in which the force of a push rises to the evaluated force. Ratio of the largest force, at
-which the finger reverses, to the evaluated force."""
+"""The time in which the force of a push rises to the evaluated force, s, and the ratio of the
+maximum force, at which the finger reverses, to the evaluated force."""
 
 
 class ForceHistory:
-    """State of the hysteresis and creep of one force of the sheet.
+    """The state of the hysteresis and creep of one force of the sheet.
 
     hysteresis_ratio: fraction of the loading energy that a cycle from zero force loses, including
         the loss by creep.
@@ -75,8 +75,8 @@ class ForceHistory:
     def update(self, time_s: float, elastic_n: float) -> float:
         """Add the elastic force at `time_s`, and return the force with hysteresis and creep, N.
 
-        The elastic force is assumed to change linearly between calls; the first value has the age
-        `REFERENCE_S`. Raises ValueError if the time decreases.
+        The elastic force is assumed to change linearly between calls. The first force is assumed to
+        have acted for `REFERENCE_S`. Raises ValueError if the time decreases.
         """
         if self._elastic_n is None:
             self._relaxing = elastic_n * np.exp(-REFERENCE_S / TIME_CONSTANTS_S)

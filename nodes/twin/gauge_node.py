@@ -1,7 +1,7 @@
 """Simulate a force gauge between the finger and the simulated sheet.
 
-The apparatus holds the true parameters of the simulated hardware; the scene holds those that the
-other nodes assume.
+The apparatus holds the true parameters of the simulated hardware. The scene holds the parameters
+that the other nodes assume.
 """
 
 from __future__ import annotations
@@ -23,31 +23,32 @@ from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.membrane import solve
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_surface import make_edge_plane
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 CELLS = 12
-"""Number of cells per side of the mesh; the force differs by 1 % from that with 32 cells."""
+"""The number of cells per side of the mesh. With 32 cells, the force differs by 1 %."""
 
 STATED_STANDARD_DEVIATION_N = 0.02
-"""Uncertainty that the gauge's data sheet states, which the node publishes with each force."""
+"""The standard uncertainty in the gauge's data sheet, which the node publishes with each force."""
 
 GAUGE_STREAM = 3
-"""Second element of the random seed, which makes the noise independent of other simulators."""
+"""The second element of the random seed, which makes the gauge's noise independent."""
 
 
 class TwinGaugeParameters(SimulatorParameters):
-    """Parameters of the simulated gauge."""
+    """The parameters of the simulated gauge."""
 
-    seed: int = Field(default=2006, description="random seed of the noise")
+    seed: int = Field(default=2006, description="random seed of the gauge's noise")
     rate_hz: Positive = Field(
         default=4.0,
-        description="rate of the readings, Hz; each takes about 0.1 s of processor time during a "
-        "push",
+        description="rate of the readings, Hz; during a push, a reading takes about 0.1 s of "
+        "processor time",
     )
 
 
 class TrueSheetForce:
-    """Force of the simulated sheet on the finger along the sheet's normal, from the true poses."""
+    """The force of the simulated sheet on the finger, along the sheet's normal."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
         true_scene = apply_apparatus(scene, apparatus)
@@ -61,13 +62,14 @@ class TrueSheetForce:
         ]
 
     def compute_n(self, time_s: float, tip: Floats, left: Floats, right: Floats) -> float:
-        """Return the force for true tip and flange poses; times of calls must not decrease."""
+        """Return the normal force, N, for a fingertip and poses of the flanges (last arm links).
+
+        tip: position (3,), m. left, right: poses (4, 4). time_s must not decrease between calls.
+        """
         edges = left @ self._clamps[0], right @ self._clamps[1]
-        across = edges[1][:3, 3] - edges[0][:3, 3]
-        normal = np.cross(across, edges[0][:3, 1] + edges[1][:3, 1])
-        normal /= np.linalg.norm(normal)
-        elastic_n = 0.0
-        if (tip - 0.5 * (edges[0][:3, 3] + edges[1][:3, 3])) @ normal < 0.0:
+        plane = make_edge_plane(*edges)
+        normal, elastic_n = plane[:3, 2], 0.0
+        if (tip - plane[:3, 3]) @ normal < 0.0:
             pressed = solve(
                 self._rubber,
                 *edges,
@@ -82,7 +84,7 @@ class TrueSheetForce:
 
 @dataclass(slots=True)
 class GaugeErrors:
-    """Gain, offset and noise of the simulated gauge."""
+    """The gain, offset and noise of the simulated gauge."""
 
     truth: GaugeTruth
     random: np.random.Generator

@@ -43,8 +43,7 @@ from flexsheet.nodes.twin.finger import minimum_jerk_profile
 from flexsheet.nodes.twin.paths import map_to_surface, place_path, touchable
 
 Sampled = tuple[Floats, Floats]
-"""Times (n,) in s, from zero, and surface positions (n, 3) or distances (n,) in m at these times.
-"""
+"""Times (n,), s, from zero, and surface positions (n, 3) or distances (n,), m, at these times."""
 
 SAMPLE_S = 0.004
 WANDER_M = 0.0005
@@ -55,10 +54,10 @@ HOVER_M = 0.04
 APPROACH_S = 0.8
 REST_S = 0.3
 TOUCH_M = 0.001
-"""Depth below the surface of a light touch."""
+"""The depth below the surface of a light touch."""
 
 PRESS_M = 0.002
-"""Depth below the surface of a tap."""
+"""The depth below the surface of a tap."""
 
 EXPLORE_M_PER_S = 0.086
 REACH_PEAK_M_PER_S = 0.35
@@ -74,9 +73,9 @@ class Gesture(Protocol):
 def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> Sampled:
     """Sample a sequence of minimum-jerk reaches.
 
-    start: first position (3,).
-    moves: pairs of a duration (s) and the next position (3,). A move to the present position is a
-    rest.
+    start: first position (3,), m.
+    moves: pairs of a duration (s) and the next position (3,), m. A move to the present position is
+    a rest.
     """
     corners = np.array([start, *(place for _, place in moves)])
     ends = np.cumsum([0.0, *(duration for duration, _ in moves)])
@@ -88,10 +87,10 @@ def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> 
 
 
 def integrate_speed_profile(phases: Sequence[tuple[float, float]]) -> Sampled:
-    """Sample the distance (n,), m, that a finger covers if its speed changes in phases.
+    """Sample the distance (n,), m, that a finger covers while its speed changes in phases.
 
-    phases: pairs of a duration (s) and the speed at its end (m/s); the finger starts at rest. The
-    speed changes by the minimum-jerk profile, so that the acceleration is continuous.
+    phases: pairs of a duration (s) and the speed at the end of the phase (m/s); the finger starts
+    at rest. The speed follows the minimum-jerk profile, which makes the acceleration continuous.
     """
     durations = np.array([duration for duration, _ in phases])
     speeds = np.array([0.0, *(speed for _, speed in phases)])
@@ -183,9 +182,9 @@ def _taps(
 ) -> FingerPath:
     """Tap `count` times at about the same position; intervals vary by 5 %, positions by 2 mm.
 
-    A tap is a reach from `lift_m` above the surface to PRESS_M below it, a rest there, and a reach
-    back. The finger does not brake before contact. It is below the surface for `contact_s` of each
-    interval `every_s`.
+    A tap is a reach from `lift_m` above the surface to PRESS_M below the surface, a rest there, and
+    a reach back. The finger does not brake before contact, and is below the surface for `contact_s`
+    of each interval `every_s`.
     """
     generator = np.random.default_rng(seed)
     grid = np.linspace(0.0, 1.0, 1001)
@@ -204,12 +203,12 @@ def _taps(
 
 
 def tap(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Tap three times a second, each with 120 ms of contact."""
+    """Tap three times a second, with 120 ms of contact per tap."""
     return _taps(scene, "tap", count=15, every_s=0.333, contact_s=0.12, lift_m=0.012, seed=seed)
 
 
 def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Tap as fast as people can, 5.4 times a second, each with 85 ms of contact."""
+    """Tap as fast as people can: 5.4 times a second, with 85 ms of contact per tap."""
     return _taps(
         scene, "tap-fast", count=25, every_s=0.185, contact_s=0.085, lift_m=0.006, seed=seed
     )
@@ -272,7 +271,7 @@ def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _rounds(turns: int, turn_s: float) -> Sampled:
-    """Sample the angle (n,), rad, of `turns` turns on a closed figure, with rest at both ends."""
+    """Sample the angle (n,), rad, of a number of turns on a closed figure, from rest to rest."""
     pace = 2.0 * np.pi / turn_s
     ramp_s = 0.25 * turn_s
     return integrate_speed_profile([(ramp_s, pace), (turns * turn_s - ramp_s, pace), (ramp_s, 0.0)])
@@ -306,7 +305,7 @@ def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _pressing(arcs: Floats, depth_m: float) -> Floats:
-    """Return surface positions (n, 3) at arc lengths (n,) from the front, `depth_m` deep."""
+    """Return surface positions (n, 3), m, at arc lengths (n,) and the depth `depth_m`."""
     return np.stack([np.zeros(len(arcs)), arcs, np.full(len(arcs), -depth_m)], axis=1)
 
 
@@ -323,4 +322,4 @@ GESTURES: dict[str, Gesture] = {
     "circle": circle,
     "eight": eight,
 }
-"""All gestures; the key is the label of the path."""
+"""All gestures by the label of their path."""

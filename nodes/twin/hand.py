@@ -25,25 +25,25 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.sheet_reaction import SheetReaction
-from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
+from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface, make_edge_plane
 
 VoluntaryPath = Callable[[float], tuple[Floats, Floats]]
-"""Voluntary position (3,) m and velocity (3,) m/s at a time, s."""
+"""A function from a time, s, to the voluntary position (3,), m, and velocity (3,), m/s."""
 
 Edges = Callable[[float], tuple[Floats, Floats]]
-"""Poses (4, 4) of the left and the right edge of the sheet at a time, s."""
+"""A function from a time, s, to the poses (4, 4) of the sheet's left and right edge."""
 
 STEP_S = 0.0005
-"""Maximum time step of the normal motion: a tenth of a radian of the fastest oscillation."""
+"""The maximum time step of the normal motion: a tenth of a radian of the fastest oscillation."""
 
 INTERVAL_S = 0.004
-"""Maximum interval over which the voluntary path and the sheet are interpolated."""
+"""The maximum interval over which the voluntary path and the sheet are interpolated."""
 
 NEAR_M = 0.005
-"""Distance from the sheet beyond which no force is computed."""
+"""The maximum distance of the finger from the sheet, m, at which a force is computed."""
 
 MAX_EXTRAPOLATION_S = 0.02
-"""Time after the newest pose of the edges for which they are assumed to keep their velocity."""
+"""The maximum time over which poses of the edges are extrapolated at constant velocity, s."""
 
 MAX_PREDICTION_S = 0.1
 
@@ -52,7 +52,7 @@ UP = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class HandImpedance:
-    """Mechanical impedance of a hand at the fingertip, equal in all directions.
+    """The mechanical impedance of a hand at the fingertip, equal in all directions.
 
     The default is a finger whose wrist moves too. Its natural frequency in the air is 5 Hz (Lakie
     et al. 2015: 6 to 12 Hz with less mass).
@@ -64,7 +64,10 @@ class HandImpedance:
 
     @classmethod
     def of(cls, apparatus: Apparatus | None) -> Self:
-        """Return the impedance in the apparatus (true hardware parameters), or else the default."""
+        """Return the impedance in an apparatus (true hardware parameters).
+
+        Return the default if the apparatus states no impedance.
+        """
         finger = None if apparatus is None else apparatus.finger
         if finger is None or finger.hand_mass_kg is None:
             return cls()
@@ -73,7 +76,10 @@ class HandImpedance:
         return cls(finger.hand_mass_kg, finger.hand_stiffness_n_per_m, finger.hand_damping_ratio)
 
     def transition(self, step_s: float) -> tuple[float, float, float, float]:
-        """Return the 2x2 matrix, row by row, that advances deviation and rate without force."""
+        """Return the transition matrix (2, 2) of the free motion over `step_s`, row by row.
+
+        The matrix maps the deviation (m) and its rate (m/s) to their values one step later.
+        """
         pace = math.sqrt(self.stiffness_n_per_m / self.mass_kg)
         decay = self.damping_ratio * pace
         split = pace * cmath.sqrt(self.damping_ratio**2 - 1.0)
@@ -87,10 +93,10 @@ class HandImpedance:
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """Local state of the sheet below the finger at one time.
+    """The local state of the sheet below the finger at one time.
 
     origin: point (3,) of the unloaded sheet's tangent plane. normal: (3,) towards the user.
-    curve_n: normal forces at the depths in the force table `SheetReaction`.
+    curve_n: normal forces (d,) at the depths in the force table `SheetReaction`.
     """
 
     origin: Floats
@@ -99,7 +105,7 @@ class Touch:
 
 
 class TrueSheet:
-    """Force of the simulated sheet on the finger, for given poses of its edges."""
+    """The force of the simulated sheet on the finger, for given poses of its edges."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None, reaction: SheetReaction) -> None:
         self.step_m = float(reaction.depths_m[1])
@@ -107,23 +113,19 @@ class TrueSheet:
         self._reaction, self._surface = reaction, SheetSurface.of(scene, apparatus)
 
     def find_touch(self, edges: tuple[Floats, Floats], tip: Floats) -> Touch:
-        """Return point, normal and force curve of the sheet nearest to the fingertip (3,).
+        """Return point, normal and force curve of the sheet nearest to the fingertip.
 
-        edges: poses (4, 4) of the left and right edges. tip: position in the world, m.
+        edges: poses (4, 4) of the left and right edges. tip: world position (3,), m.
         """
         left, right = edges
-        across = right[:3, 3] - left[:3, 3]
-        distance_m = float(np.linalg.norm(across))
-        x_axis = across / distance_m
-        normal = np.cross(x_axis, left[:3, 1] + right[:3, 1])
-        normal /= np.linalg.norm(normal)
-        middle = 0.5 * (left[:3, 3] + right[:3, 3])
+        distance_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
+        x_axis, y_axis, normal, middle = make_edge_plane(left, right)[:3].T
         if float((tip - middle) @ normal) > NEAR_M:
             return Touch(middle, normal, np.zeros(2))
         plane = SheetPlanes(middle[None], normal[None], x_axis[None], np.array([distance_m]))
         surface = self._surface.find_tangent_planes(plane, tip[None], UP)
         x_m = float((tip - middle) @ x_axis)
-        y_m = float((tip - middle) @ np.cross(normal, x_axis))
+        y_m = float((tip - middle) @ y_axis)
         sag_m = 0.0
         if surface is not plane:
             sag_m = float((surface.points[0] - middle) @ normal)
@@ -132,7 +134,7 @@ class TrueSheet:
 
 
 class EdgeTrack:
-    """Poses of the sheet's edges, linearly inter- and extrapolated in time from two samples."""
+    """The poses of the sheet's edges as a linear function of time, from the last two samples."""
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, Floats]] = []
@@ -149,7 +151,7 @@ class EdgeTrack:
         return len(self._samples) == 2
 
     def __call__(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return both poses (4, 4), extrapolated by MAX_EXTRAPOLATION_S at most."""
+        """Return the poses (4, 4) of both edges, extrapolated by at most MAX_EXTRAPOLATION_S."""
         (before_s, before), (after_s, after) = self._samples
         at_s = min(max(time_s, before_s), after_s + MAX_EXTRAPOLATION_S)
         left, right = after + (at_s - after_s) / (after_s - before_s) * (after - before)
@@ -157,7 +159,7 @@ class EdgeTrack:
 
 
 class CoupledFinger:
-    """Deviation of the finger from its voluntary path, integrated over time.
+    """The deviation of the finger from its voluntary path, integrated over time.
 
     path: voluntary motion, which may be replaced at any time. deviation_m, rate_m_per_s: (3,).
     force_n: (3,) force of the sheet on the finger, mean over the last interval.
@@ -173,10 +175,10 @@ class CoupledFinger:
         self._ratio, self._remembers = 1.0, sheet.history is not None
 
     def predict(self, time_s: float, edges: Edges) -> CoupledFinger:
-        """Return a copy that is advanced to a time.
+        """Return a copy of the finger that is advanced to `time_s`.
 
-        This finger itself is advanced only if it is more than MAX_PREDICTION_S behind. This happens
-        if no poses of the edges arrive.
+        The finger itself is advanced only to MAX_PREDICTION_S before this time, which has an effect
+        only if no poses of the edges arrive.
         """
         self.advance(time_s - MAX_PREDICTION_S, edges)
         ahead = copy(self)
@@ -251,7 +253,10 @@ def _hermite(t: float, span_s: float, before: float, after: float, rates: list[f
 
 
 def _interpolate(curve: list[float], at: float) -> float:
-    """Interpolate a curve at a fractional index: 0 below 0; extrapolate linearly beyond the end."""
+    """Interpolate a curve linearly at a fractional index, and extrapolate beyond the curve's end.
+
+    Return 0 for an index below 0.
+    """
     if at <= 0.0:
         return 0.0
     index = min(int(at), len(curve) - 2)

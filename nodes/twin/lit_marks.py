@@ -21,20 +21,23 @@ from flexsheet.nodes.twin.membrane import DeformedSheet, NotConvergedError, solv
 from flexsheet.nodes.twin.projector import on_plane
 from flexsheet.nodes.twin.rig import slopes_of
 from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_surface import make_edge_plane
 from flexsheet.nodes.twin.truth import find_display_delay_s
 
 CELLS = 8
-"""Number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
+"""The number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
 
 SOLVE_PERIOD_NS = 500_000_000
+"""The minimum time between two solutions of the sheet's shape, ns."""
+
 MAX_FINGER_MOTION_M = 5e-4
-"""Period in which the sheet's shape is solved, and motion of a pushing finger since the last
-solution beyond which the marks are not drawn, because the shape is not known."""
+"""The maximum motion of a pushing finger since the last solution of the sheet's shape. After a
+larger motion the shape is unknown, and no marks are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Heights:
-    """Heights (n,) of the sheet at the marks, above the plane of its edges.
+    """The heights (n,) of the sheet at the projected marks, above the plane of its edges.
 
     finger_sheet_m: position (3,) of the fingertip in the frame of this plane. pushed: whether the
     finger deforms the sheet.
@@ -46,16 +49,17 @@ class _Heights:
 
 
 class LitMarks:
-    """Points of the simulated sheet that the projected marks light.
+    """The points of the simulated sheet that the projected marks light.
 
     The sheet moves with the true arms. Its deflection by the finger and by its weight is solved in
     the background.
     """
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
-        """Store the devices.
+        """Store the true devices.
 
-        scene: scene with the true devices. apparatus: their deviations from the nodes' scene.
+        scene: scene with the true devices. apparatus: deviations of the devices from the scene that
+        the nodes assume.
         """
         self._scene, self._apparatus = scene, apparatus
         projector = require_projector(scene)
@@ -82,12 +86,15 @@ class LitMarks:
             self._frames.append((frame.light_ns + late_ns, frame.marks_px))
 
     def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
-        """Return the lit points (n, 3) in the world at `at_ns`; empty if they are unknown."""
+        """Return the lit world points (n, 3), m, at `at_ns`; empty if the points are unknown.
+
+        finger: position (3,) of the fingertip.
+        """
         shown = [pixels for light_ns, pixels in self._frames if light_ns <= at_ns]
         if not shown:
             return np.zeros((0, 3))
         edges = self._edges(arms)
-        plane = _plane_of(*edges)
+        plane = make_edge_plane(*edges)
         local = apply(inverse(plane), finger)
         self._solve_if_due(edges, plane, finger, shown[-1], at_ns)
         heights = self._heights
@@ -152,13 +159,3 @@ class LitMarks:
         heights = np.where(lands, apply(inverse(plane), points)[:, 2], 0.0)
         local = apply(inverse(plane), finger)
         return _Heights(heights, local, bool(np.any(sheet.finger_force_n)))
-
-
-def _plane_of(left: Floats, right: Floats) -> Floats:
-    """Return the pose (4, 4) of the plane through two edges (4, 4); z points towards the user."""
-    across = right[:3, 3] - left[:3, 3]
-    across = across / np.linalg.norm(across)
-    normal = np.cross(across, left[:3, 1] + right[:3, 1])
-    normal /= np.linalg.norm(normal)
-    rotation = np.column_stack([across, np.cross(normal, across), normal])
-    return transform(rotation, 0.5 * (left[:3, 3] + right[:3, 3]))

@@ -11,8 +11,8 @@ minimum.
 The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points). They differ from the
 elements of the renderer, which this module serves to test. The mesh is finer around the finger.
 Gravity acts on the sheet. The fingertip is a rigid sphere that is pushed in along the sheet's
-normal, in steps. A stiff penalty force keeps the sheet outside it. Touched nodes stick to it unless
-the limit of Coulomb friction is exceeded.
+normal, in steps. A stiff penalty force keeps the sheet outside the sphere. Touched nodes stick to
+the sphere unless the limit of Coulomb friction is exceeded.
 """
 
 from __future__ import annotations
@@ -30,33 +30,37 @@ from flexsheet.nodes.arrays import Bools, Floats
 Indices = NDArray[np.intp]
 
 CELLS = 32
-"""Number of intervals between nodes along each side; an element spans two of them."""
+"""The number of intervals between nodes along each side; an element spans two of them."""
 MIN_CELL_FRACTION = 0.008
-"""Distance between nodes under the finger, as a fraction of the side: 1.9 mm of 240 mm."""
+"""The distance between nodes under the finger, as a fraction of the side: 1.9 mm of 240 mm."""
 
 SLACK_TENSION = 2e-4
-"""Isotropic tension added everywhere, in units of the shear modulus. Without it the equilibrium of
-slack and wrinkled regions would not be unique."""
+"""The isotropic tension that is added everywhere, in units of the shear modulus. Without this
+tension, the equilibrium of slack and wrinkled regions would not be unique."""
 
 CONTACT_PA_PER_M = 1e10
-"""Contact pressure per penetration depth; 10 N on 1 cm2 penetrate 0.01 mm."""
+"""The contact pressure per penetration depth, Pa/m; a force of 10 N on 1 cm2 penetrates 0.01 mm."""
 
 MAX_STEP_RADII = 0.7
-"""Maximum advance of the finger per step, in radii; in a longer step it could cross the sheet."""
+"""The maximum advance of the finger per step, in radii; a longer step could cross the sheet."""
 
 MAX_ITERATIONS = 80
-UNDAMPED_ROUNDS, MAX_FRICTION_ROUNDS = 6, 20
-"""Limits of the number of equilibria that are solved per finger step while nodes slip. Above the
-first limit, changes of the friction forces are halved, since they may alternate. The second limit
-is the maximum."""
+
+UNDAMPED_ROUNDS = 6
+"""The number of equilibria per finger step after which changes of the friction forces are halved,
+because they may alternate."""
+
+MAX_FRICTION_ROUNDS = 20
+"""The maximum number of equilibria that are solved per finger step while nodes slip."""
+
 FRICTION_TOLERANCE = 0.01
-"""Relative change of the friction forces between two equilibria below which they are accepted."""
+"""The maximum relative change of the friction forces between two accepted equilibria."""
 GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
-"""Gravitational acceleration in the world frame, whose y axis points up."""
+"""The gravitational acceleration in the world frame, whose y axis points up."""
 
 
 class NotConvergedError(FlexsheetError, RuntimeError):
-    """Raised when the membrane's equilibrium is not found; the text gives the residual force."""
+    """The error that is raised if the equilibrium of the membrane is not found."""
 
     code = "membrane"
     remedy = "Reduce the depth of the push: the simulated membrane has no solution for it."
@@ -64,7 +68,7 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class TrueRubber:
-    """Dimensions and material of the simulated sheet at rest.
+    """The dimensions and material of the simulated sheet at rest.
 
     width_m: free length between the clamps of the unstretched sheet; height_m: length along them.
     density_kg_per_m3: 0 for a sheet without weight.
@@ -82,7 +86,7 @@ class TrueRubber:
 
 @dataclass(frozen=True, slots=True)
 class DeformedSheet:
-    """Equilibrium of the sheet.
+    """The equilibrium of the sheet.
 
     rest_m: (rows, columns, 2) node positions at rest, measured from the bottom left corner.
     positions: (rows, columns, 3) node positions in the world frame.
@@ -99,7 +103,7 @@ class DeformedSheet:
     iterations: int
 
     def triangles(self) -> Indices:
-        """Return triangles (triangles, 3), as indices of the flattened nodes, facing the user."""
+        """Return triangles (n, 3) that face the user, as indices into the flattened nodes."""
         rows, columns = self.positions.shape[:2]
         corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
         right, above = corner + 1, corner + columns
@@ -112,9 +116,9 @@ class DeformedSheet:
 
 
 def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
-    """Return coordinates (cells + 1,) from 0 to `length_m`, which are densest at `focus_m`.
+    """Return coordinates (cells + 1,) from 0 to `length_m`, m, which are densest at `focus_m`.
 
-    Without a focus they are uniform.
+    The coordinates are uniform if the focus is None.
     """
     if focus_m is None:
         return np.linspace(0.0, length_m, cells + 1)
@@ -137,7 +141,7 @@ def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
 def _quadratic(t: Floats) -> tuple[Floats, Floats]:
     """Return the values and derivatives (points, 3) of the quadratic shape functions on [0, 1].
 
-    Their nodes are at 0, 1/2 and 1.
+    The nodes of the shape functions are at 0, 1/2 and 1.
     """
     values = [(1 - t) * (1 - 2 * t), 4 * t * (1 - t), t * (2 * t - 1)]
     slopes = [4 * t - 3, 4 - 8 * t, 4 * t - 1]
@@ -145,7 +149,7 @@ def _quadratic(t: Floats) -> tuple[Floats, Floats]:
 
 
 class _Mesh:
-    """Rectangular finite-element mesh, which assembles the elastic forces and stiffness.
+    """A rectangular finite-element mesh, which assembles the elastic forces and stiffness.
 
     x, y: coordinates of the nodes. Element boundaries have even indices; nodes with odd indices
     are midway between their neighbours.
@@ -204,10 +208,10 @@ class _Mesh:
         self._unique, self._size = unique, size
 
     def deformation(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the deformation at the Gauss points.
+        """Return the deformation gradient F and the right Cauchy-Green tensor C = F^T F.
 
-        It consists of the gradient F (elements, points, 3, 2) and [C11, C22, C12] (elements,
-        points, 3) of the right Cauchy-Green tensor C = F^T F.
+        positions: node positions (nodes, 3). The results at the Gauss points are F (elements,
+        points, 3, 2) and [C11, C22, C12] (elements, points, 3).
         """
         at_nodes = positions[self.elements].transpose(0, 2, 1)[:, None]
         f = at_nodes @ self.gradient
@@ -266,9 +270,9 @@ class _Mesh:
 
 
 def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the larger and smaller eigenvalue (...,) of C, and the larger one's unit eigenvector.
+    """Return both eigenvalues (...,) of C, larger first, and the larger's eigenvector (..., 2).
 
-    c: (..., 3) = [C11, C22, C12]. The eigenvector is (..., 2).
+    c: components (..., 3) = [C11, C22, C12]. The eigenvector has unit length.
     """
     mean, half = 0.5 * (c[..., 0] + c[..., 1]), 0.5 * (c[..., 0] - c[..., 1])
     radius = np.hypot(half, c[..., 2])
@@ -277,7 +281,7 @@ def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION) -> Floats:
-    """Return the energy per volume at rest (...,), relaxed for wrinkles, J/m3.
+    """Return the elastic energy (...,) per volume at rest, J/m3; wrinkles have no compression.
 
     c: (..., 3) components [C11, C22, C12] of the right Cauchy-Green tensor.
     """
@@ -294,10 +298,10 @@ def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK
 def relaxed_stress(
     c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION
 ) -> tuple[Floats, Floats]:
-    """Return the second Piola-Kirchhoff stress (..., 3) = [S11, S22, S12] and its tangent.
+    """Return the second Piola-Kirchhoff stress (..., 3) = [S11, S22, S12], Pa, and its tangent.
 
     The stress is the derivative of `relaxed_energy` with respect to the Green strain
-    [E11, E22, 2 E12]; the tangent (..., 3, 3) is the derivative of the stress.
+    [E11, E22, 2 E12]. The tangent (..., 3, 3) is the derivative of the stress.
     """
     large, small, along = _eigen(c)
     taut = small > np.maximum(large, 1.0) ** -0.5
@@ -334,7 +338,7 @@ def relaxed_stress(
 
 
 class _Finger:
-    """Fingertip as a rigid sphere: a penalty force keeps nodes outside, and touched nodes stick.
+    """A fingertip as a rigid sphere: a penalty force keeps nodes outside, and touched nodes stick.
 
     stuck: (nodes,) whether a node sticks to the finger at its position in `anchor` (nodes, 3).
     friction_coefficient: Coulomb coefficient; None if touched nodes never slip.
@@ -363,7 +367,7 @@ class _Finger:
         return np.where(self._stuck, 0.0, np.maximum(self._radius - distance, 0.0)), outward
 
     def touching(self, positions: Floats) -> Bools:
-        """Return which nodes (nodes,) stick to the finger or penetrate it."""
+        """Return whether each node (nodes,) sticks to the finger or penetrates it."""
         return self._stuck | (self._depth(positions)[0] > 0.0)
 
     def energy(self, positions: Floats) -> float:
@@ -374,9 +378,10 @@ class _Finger:
         return float(penalty - np.sum(self._friction_n * (positions - self._anchor)))
 
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the gradient (nodes, 3) of `energy`, and a stiffness (nodes, 3, 3).
+        """Return the gradient (nodes, 3) of `energy`, N, and a stiffness (nodes, 3, 3), N/m.
 
-        The stiffness omits the effect of the sphere's curvature, so that it is never negative.
+        The stiffness omits the effect of the sphere's curvature, so that the stiffness is never
+        negative.
         """
         depth, outward = self._depth(positions)
         pressed = np.where(depth > 0.0, self._stiffness, 0.0)
@@ -387,11 +392,11 @@ class _Finger:
         return gradient, derivative + fixed[:, None, None] * np.eye(3)
 
     def release(self, positions: Floats, share: float) -> bool:
-        """Release the nodes whose friction exceeds the Coulomb limit, so that they slip.
+        """Release the nodes whose friction force exceeds the Coulomb limit, so that they slip.
 
         Return whether forces changed, so that a new equilibrium must be solved. The friction force
-        of a slipping node keeps its direction; its size is the coefficient times the normal force.
-        share: fraction of the change of the friction forces that is applied.
+        of a slipping node keeps its direction and becomes the coefficient times the normal force.
+        share: fraction (0 to 1) of the change of the friction forces that is applied.
         """
         if self._coefficient is None:
             return False
@@ -422,13 +427,12 @@ def solve(
     finger_radius_m: float = 0.007,
     friction_coefficient: float | None = None,
     cells: int = CELLS,
-    slack_tension: float = SLACK_TENSION,
 ) -> DeformedSheet:
     """Solve the equilibrium of the sheet between its edges, pushed by a fingertip.
 
-    finger_tip: the point (3,) of the fingertip sphere that is farthest from the user. Without it,
-    or if it lies in front of or beside the sheet, there is no contact. The other arguments, and the
-    errors, are those of `solve_path`.
+    finger_tip: the point (3,) of the fingertip sphere that is farthest from the user, m. There is
+    no contact if the point is None, in front of the sheet, or beside the sheet. The other arguments
+    and the errors are those of `solve_path`.
     """
     return solve_path(
         rubber,
@@ -438,7 +442,6 @@ def solve(
         finger_radius_m=finger_radius_m,
         friction_coefficient=friction_coefficient,
         cells=cells,
-        slack_tension=slack_tension,
     )[-1]
 
 
@@ -455,7 +458,7 @@ def solve_path(
 ) -> list[DeformedSheet]:
     """Solve the equilibria of the sheet while a fingertip advances through the given positions.
 
-    Returns the sheet at each position; if there are no positions, the sheet that nothing touches.
+    Return the sheet at each position, or only the untouched sheet if there are no positions.
 
     world_from_left_edge, world_from_right_edge: (4, 4) poses of the clamped edges; the origin is
     the centre of the edge, y points along it.
@@ -463,7 +466,7 @@ def solve_path(
     friction_coefficient: Coulomb coefficient between finger and sheet; None: touched nodes stick.
     cells: number of intervals between nodes along each side; even.
     slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a barely
-    taut sheet. With it, the equilibrium of a slack sheet is not found.
+    taut sheet, but the equilibrium of a slack sheet is then not found.
 
     Raises NotConvergedError if no equilibrium is found, and ValueError if the edges coincide.
     """
@@ -472,7 +475,8 @@ def solve_path(
     distance = float(np.linalg.norm(x_axis))
     if distance < 1e-3:
         raise ValueError(
-            f"the sheet's edges are {distance * 1e3:.2f} mm apart; at least 1 mm is required"
+            f"the sheet's edges are {distance * 1e3:.2f} mm apart, but the simulated membrane "
+            "needs at least 1 mm; move the arms apart"
         )
     x_axis = x_axis / distance
     normal = np.cross(x_axis, left[:3, 1] + right[:3, 1])
@@ -533,8 +537,8 @@ def solve_path(
                 rounds += 1
                 if rounds > MAX_FRICTION_ROUNDS:
                     raise NotConvergedError(
-                        f"membrane: the friction forces still change after {rounds} equilibria "
-                        f"(friction coefficient {friction_coefficient})"
+                        f"the friction forces on the simulated membrane still change after {rounds}"
+                        f" equilibria (friction coefficient {friction_coefficient})"
                     )
                 positions, count = _relax(mesh, positions, finger)
                 iterations += count
@@ -561,7 +565,7 @@ def _describe(
 
 
 def _insert_midpoints(boundaries: Floats) -> Floats:
-    """Return the node coordinates (2 n - 1,): element boundaries (n,) and the points between."""
+    """Return element boundaries (n,) and the midpoints between them, in order: (2 n - 1,)."""
     nodes = np.empty(2 * len(boundaries) - 1)
     nodes[::2] = boundaries
     nodes[1::2] = 0.5 * (boundaries[1:] + boundaries[:-1])
@@ -569,9 +573,10 @@ def _insert_midpoints(boundaries: Floats) -> Floats:
 
 
 def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: TrueRubber) -> Floats:
-    """Return a cone (nodes,), 1 at the focus and 0 from about the distance of the clamps on.
+    """Return the fraction (nodes,) of a finger step by which each node moves initially.
 
-    It distributes a step of the finger over the sheet, as the start of the next equilibrium.
+    The fraction is 1 at the focus and decreases linearly to 0 near the clamps. The moved nodes are
+    the initial guess of the next equilibrium.
     """
     x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
     focus_x, focus_y = focus
@@ -584,9 +589,10 @@ def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: TrueRub
 
 
 def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, int]:
-    """Minimise the energy by Newton's method with a line search; return positions and step count.
+    """Minimise the energy by Newton's method with a line search.
 
-    Raises NotConvergedError if the residual does not vanish.
+    Return the node positions (nodes, 3), m, and the number of steps. Raises NotConvergedError if
+    the residual force exceeds the tolerance.
     """
     positions = start.copy()
     scale = mesh.shear_modulus * float(mesh.weight.sum()) / float(np.ptp(mesh.rest[..., 0]))
@@ -629,6 +635,6 @@ def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, 
     if residual < 1e-5 * scale:
         return positions, iteration
     raise NotConvergedError(
-        f"membrane: residual force {residual:.2e} N after {iteration} Newton steps exceeds the "
-        f"tolerance {1e-7 * scale:.2e} N"
+        f"the residual force {residual:.2e} N of the simulated membrane after {iteration} Newton "
+        f"steps exceeds the tolerance {1e-7 * scale:.2e} N"
     )

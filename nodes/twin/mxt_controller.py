@@ -2,9 +2,9 @@
 
 This module was written from `docs/mxt.md` only. It shares no code with the bridge (the node that
 sends commands to an arm), because it serves to test the bridge. The robot program
-`Mxt 1,1,<filter>` is assumed to run. The set of packets that a real controller rejects is only
-partly known. The simulated controller rejects more packets, and sends no answer after its program
-has ended.
+`Mxt 1,1,<filter>` is assumed to run. The packets that a real controller rejects are only partly
+known. The simulated controller rejects more packets, and sends no answer after its program has
+ended.
 """
 
 from __future__ import annotations
@@ -39,48 +39,53 @@ _JOINTS, _PULSES, _CURRENT = (2, 5, 8), 3, 11
 _MORE_AT = (64, 108, 152)
 
 TORQUE_PER_PERCENT_NM = np.array([0.3, 0.3, 0.2, 0.05, 0.05, 0.03])
-"""Torque of each simulated joint per percent of its motor's rated current."""
+"""The torque of each simulated joint per percent of its motor's rated current."""
 
 UNLOADED_PERCENT = np.array([0.0, 22.0, 30.0, 0.0, 8.0, 0.0])
-"""Currents that hold the simulated arm without a load; their change with the pose is neglected."""
+"""The currents (6,), in percent of the rated currents, that hold the simulated arm without a load.
+The change of the currents with the pose is neglected."""
 
 FRICTION_PERCENT = 6.0
-"""Maximum current that the simulated gears take up by static friction, in either direction."""
+"""The maximum change of a motor's current by static friction of its gear, in either direction."""
 
 FILTER_S = 0.01
-"""Time constant of the low-pass filter that the manufacturer recommends for `Mxt`."""
+"""The time constant of the low-pass filter that the manufacturer recommends for `Mxt`."""
 
 FRICTION_STREAM = 11
-"""Second element of the random seed of the static friction."""
+"""The second element of the random seed of the static friction."""
 
 FIRST_STEP_RAD = 0.01
-"""Maximum difference of each joint between the first set-point and the measured joints."""
+"""The maximum difference of each joint between the first set-point and the measured joints."""
 
 STEP_CYCLES = 2.0
-"""Maximum step between set-points, as the number of cycles that it would take at full speed."""
+"""The maximum step between set-points, in cycles that the step takes at full speed."""
 
 
 class MxtError(FlexsheetError):
-    """Raised when an invalid command ends the robot program; the text gives the reason."""
+    """The error that is raised when an invalid command ends the robot program."""
 
     code = "mxt-program"
     remedy = "No action is needed: the simulated controller's program restarts."
 
 
 class MxtController:
-    """Simulated controller of one arm, which receives and answers one packet per cycle.
+    """A simulated controller of one arm, which receives and answers one packet per cycle.
 
     An error ends the robot program: the arm brakes, and no packet is answered until `restart`.
-    Errors are: a move before a packet that only requests the state; an unknown command or data
-    type; joint angles outside the allowed range; a first set-point away from the measured joint
-    angles; a jump of the set-point; and no packet for `timeout_s`.
+    These are the errors:
+    - a move before a packet that only requests the state
+    - an unknown command or data type
+    - joint angles outside the allowed range
+    - a first set-point away from the measured joint angles
+    - a jump of the set-point
+    - no packet for `timeout_s`
 
     servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joints.
     filter_s: time constant of the low-pass filter on set-points.
     load_nm: torques (6,) of the sheet's pull on the joints, set by the simulator.
     restart_after_s: time after which the program restarts by itself.
     cycle_s, cycle_jitter_s: mean and standard deviation of the cycle's duration.
-    latency_s: time from the arrival of a set-point until it takes effect.
+    latency_s: time from the arrival of a set-point until the set-point takes effect.
     """
 
     def __init__(
@@ -131,16 +136,17 @@ class MxtController:
         self.restart()
 
     def restart(self) -> None:
-        """Clear the error and restart the program, as an operator would."""
+        """Clear the error and restart the robot program."""
         self.error = ""
         self._master: Address | None = None
         self._moved = False
         self._count = self._timeouts = self._missing = 0
 
     def receive_command(self, packet: bytes, sender: Address) -> None:
-        """Store a packet; the next cycle processes the latest one.
+        """Store a packet, which the next cycle processes unless a newer packet replaces it.
 
-        A packet of wrong length is ignored, and so is another sender while one has control.
+        Packets of wrong length are ignored. While a sender has control, packets from other senders
+        are also ignored.
         """
         if len(packet) != _BYTES or (self._master not in (None, sender)):
             self.refused += 1
@@ -153,11 +159,11 @@ class MxtController:
         return self._waiting is not None
 
     def until_cycle_s(self) -> float:
-        """Return the time until the next cycle begins."""
+        """Return the time until the next cycle begins, s."""
         return self._next_cycle_s - self._into_cycle_s
 
     def advance(self, duration_s: float) -> None:
-        """Simulate `duration_s`; append the answers of the cycles to `answers`."""
+        """Simulate `duration_s` of motion; append the answers of the controller to `answers`."""
         while duration_s >= self.until_cycle_s():
             duration_s -= self.until_cycle_s()
             self._move_on(self.until_cycle_s())
@@ -186,12 +192,12 @@ class MxtController:
             self._timeouts = (self._timeouts + 1) & 0xFFFF
             self._missing += 1
             if self._missing > self._timeout_cycles:
-                self._fail("no packet in time")
+                self._fail(f"no packet arrived in {self._timeout_cycles} cycles")
         wanted = self._acting()
         self._filtered_rad = self._filtered_rad + self._filter_share * (wanted - self._filtered_rad)
 
     def _acting(self) -> Floats:
-        """Return the set-point that takes effect now: the latest, or an older one with latency."""
+        """Return the set-point (6,), rad, that takes effect now, after the latency."""
         late_s = self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
         if not late_s:
             self._late.clear()
@@ -215,7 +221,7 @@ class MxtController:
             self.restart()
             return
         else:
-            self._fail(f"unknown command {command}")
+            self._fail(f"the packet has the unknown command {command}")
             return
         self.commands += 1
         if self.fault != "repeated":
@@ -226,7 +232,7 @@ class MxtController:
     def _stay(self, sender: Address) -> None:
         """Process a packet that only requests the state.
 
-        The arm stops. The next set-point is compared with the measured joints, like the first one.
+        The arm stops. The next set-point must agree with the measured joints, as at the start.
         """
         self._master = sender
         if self._moved:
@@ -234,24 +240,27 @@ class MxtController:
             self._moved = False
 
     def _move(self, send_type: int, data: Floats) -> None:
-        """Check and store a set-point; raise MxtError if it is invalid, which ends the program."""
+        """Check and store a set-point; raise MxtError if the set-point is invalid."""
         if self._master is None:
-            raise MxtError("move command ahead of the first packet that only requests the state")
+            raise MxtError("a move command came before a packet that only requests the state")
         before = self.wanted_rad if self._moved else self.servo.joints_rad
         joints = self._set_point(send_type, data)
         step = np.abs(joints - before)
         if not self._moved and step.max() > FIRST_STEP_RAD:
-            raise MxtError("first set-point away from the measured joint angles")
+            raise MxtError(
+                f"the first set-point differs by more than {FIRST_STEP_RAD:g} rad from the "
+                "measured joint angles"
+            )
         if (step > self._max_step_rad).any():
-            raise MxtError("set-point too far from the previous one")
+            raise MxtError("the step from the previous set-point is too large")
         self._moved, self.wanted_rad = True, joints
 
     def _set_point(self, send_type: int, data: Floats) -> Floats:
-        """Decode the joints (6,) of a packet; raise MxtError if it contains no valid set-point."""
+        """Decode the set-point (6,), rad, of a packet; raise MxtError if it is not valid."""
         if send_type != _JOINTS[0]:
-            raise MxtError(f"set-point of unknown type {send_type}")
+            raise MxtError(f"the set-point has the unknown data type {send_type}")
         if not np.isfinite(data).all():
-            raise MxtError("set-point not finite")
+            raise MxtError("the set-point contains a number that is not finite")
         if not self.servo.mechanics.is_in_range(data[:6]):
             raise MxtError("the set-point contains joint angles outside the allowed range")
         return data[:6]
@@ -275,9 +284,9 @@ class MxtController:
         return whole[:-4] if self.fault == "bad_crc" else whole
 
     def _monitor(self, wanted_type: int) -> tuple[float, ...]:
-        """Return the requested state as data type, eight numbers and two flags.
+        """Return the requested state of the arm as data type, eight numbers and two flags.
 
-        The type is 0 if the requested quantity is not available.
+        The data type is 0 if the requested quantity is not available.
         """
         if wanted_type in _JOINTS:
             joints = self._seen(_JOINTS.index(wanted_type))
@@ -294,16 +303,16 @@ class MxtController:
         return [round(float(one)) for one in balance + self._stuck_percent]
 
     def _seen(self, what: int) -> Floats:
-        """Return the joints (6,) of one kind.
+        """Return joint angles (6,), rad.
 
-        what: 0 for the set-point, 1 for the filtered set-point, 2 for the measurement.
+        what: 0 for the set-point, 1 for the filtered set-point, 2 for the measured angles.
         """
         noise = self._noise_rad * self._random.standard_normal(6)
         return (self.wanted_rad, self._filtered_rad, self.servo.joints_rad + noise)[what]
 
 
 class MxtServer:
-    """UDP server through which clients command a simulated controller."""
+    """A UDP server through which clients command a simulated controller."""
 
     def __init__(
         self, controller: MxtController, *, host: str, port: int, before: Callable[[], None]
@@ -319,7 +328,7 @@ class MxtServer:
         self._due: asyncio.TimerHandle | None = None
 
     async def start(self) -> None:
-        """Start to listen; raises OSError if the port is in use."""
+        """Start to listen; raise OSError if the port is in use."""
         loop = asyncio.get_running_loop()
         self._transport, _ = await loop.create_datagram_endpoint(
             lambda: _Packets(self._received), local_addr=self._address
@@ -327,7 +336,7 @@ class MxtServer:
 
     @property
     def port(self) -> int:
-        """Return the port on which the server listens, also if it was given as 0 (any)."""
+        """Return the port on which the server listens, even if port 0 (any) was requested."""
         if self._transport is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")
         return int(self._transport.get_extra_info("sockname")[1])

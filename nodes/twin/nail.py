@@ -14,13 +14,13 @@ from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.twin.clutter import FINGER_DIRECTION, FINGER_LENGTH_M
 
 THICKNESS_RATIO = 0.6
-"""Thickness of a finger from pad to nail, 10 mm when the pad yields, divided by its breadth of 16
-to 18 mm (sources: `tolerance_table.py`)."""
+"""The ratio of a finger's thickness from pad to nail (10 mm under pressure) to its breadth (16 to
+18 mm). `tolerance_table.py` names the sources."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nail:
-    """Placement of the marker, and direction of the finger, as vectors in the world frame.
+    """The placement of the marker and the direction of the finger, as vectors in the world frame.
 
     marker_offset_m: (3,) from the fingertip (contact point of the finger pad) to the centre of the
         marker.
@@ -28,8 +28,8 @@ class Nail:
     direction: (3,) from the fingertip to the knuckle.
 
     A finger with a flat marker on its nail has an elliptic cross-section, on whose flat side the
-    marker lies. Otherwise it is round, and its axis begins at the fingertip: with a ball, or with a
-    marker at the pad, whose offset is only the error of a calibration.
+    marker lies. A finger with a ball, or with a marker at the pad, is round, and its axis begins at
+    the fingertip.
     """
 
     marker_offset_m: Floats = field(default_factory=lambda: np.zeros(3))

@@ -1,10 +1,10 @@
 """Map finger paths onto the scene's object, within the range of the arms; read recorded paths.
 
 A surface position is (along, arc, height) in metres. `along` is the distance over the surface in
-the direction of the object's x axis. `arc` is the distance over the surface from there, at right
-angles. `height` is the distance from the surface, negative inside the object. (0, 0, 0) is the
-front of the object, the point that faces the user. Motions are defined in surface positions, so
-that they apply to the object of any scene.
+the direction of the object's x axis. `arc` is the further distance over the surface at right angles
+to this direction. `height` is the distance from the surface, negative inside the object. (0, 0, 0)
+is the front of the object, the point that faces the user. Motions that are defined in surface
+positions apply to the object of any scene.
 """
 
 from __future__ import annotations
@@ -23,28 +23,25 @@ from flexsheet.nodes.models.rigid import apply, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape
 from flexsheet.nodes.twin.finger import FingerPathError, SmoothPath
 
-FAR_M = 2.0
-MAX_DISTANCE_M = 0.5
-STRIDE_M = 0.001
-GRID_M = 0.003
-"""Distance of an imaginary viewer, maximum length of geodesics (straightest lines on the surface),
-their step, and the spacing of the interpolation grid."""
+FAR_M = 2.0  # distance of an imaginary viewer
+MAX_DISTANCE_M = 0.5  # maximum length of geodesics, the straightest lines on the surface
+STRIDE_M = 0.001  # step along a geodesic
+GRID_M = 0.003  # spacing of the interpolation grid
 
-WITHIN_ENDS = 0.8
-OF_WIDTH = 0.7
-OF_HEIGHT = 0.9
-"""Fractions that the finger can stroke: of the length of an object with ends, of the width of the
-sheet, and of its usable half-height."""
+# Fractions that a finger can stroke.
+WITHIN_ENDS = 0.8  # of the length of an object with ends
+OF_WIDTH = 0.7  # of the width of the sheet
+OF_HEIGHT = 0.9  # of the usable half-height of the sheet
 
 MAX_CACHED_SURFACE_MAPS = 4
 _SURFACE_MAPS: dict[bytes, SurfaceMap] = {}
 
 SPEED_FRACTION = 0.8
-"""Maximum speed of a path, as a fraction of the scene's finger speed. The rest is a reserve, since
-wander and tremor are added to the path."""
+"""The maximum speed of a path, as a fraction of the scene's maximum finger speed. The difference is
+a reserve for wander and tremor, which are added to the path."""
 
 PRESS_FRACTION = 1.0 / 6.0
-"""Maximum depth to which a recorded path pushes, as a fraction of the scene's push depth."""
+"""The maximum depth to which a recorded path pushes, as a fraction of the scene's push depth."""
 
 
 def map_to_surface(scene: Scene, places: Floats) -> Floats:
@@ -55,14 +52,14 @@ def map_to_surface(scene: Scene, places: Floats) -> Floats:
 def touchable(scene: Scene) -> tuple[float, float]:
     """Return the lengths (m), along and around the object, over which a finger can stroke.
 
-    They extend equally to both sides of the front. They are limited by 0.8 of the length of an
-    object with ends, the maximum tilt of the working range, and the usable part of the sheet.
+    The lengths extend equally to both sides of the front. Three limits apply: 0.8 of the length of
+    an object with ends, the maximum tilt of the working range, and the usable part of the sheet.
     """
     return _surface_map_of(scene).touchable_m
 
 
 class SurfaceMap:
-    """Map from surface positions on a scene's object to world points.
+    """A map from surface positions on a scene's object to world points.
 
     The distances `along` and `arc` are measured on geodesics, which are computed on a grid. Points
     between are interpolated by bicubic splines and projected onto the surface, so that a mapped
@@ -70,7 +67,7 @@ class SurfaceMap:
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Compute the grid; raises FingerPathError if no side of the object faces the user."""
+        """Compute the grid; raise FingerPathError if no side of the object faces the user."""
         self._world_from_object = pose_matrix(scene.object.world_from_object)
         self._shape = make_shape(dict(scene.object.geometry))
         towards_user = self._world_from_object[:3, :3].T[:, 2]
@@ -79,7 +76,7 @@ class SurfaceMap:
         if front.normal @ towards_user < most:
             raise FingerPathError(
                 f'scene "{scene.name}": no side of the object faces the user within '
-                "working_range.tilt_rad; turn the object by object.world_from_object"
+                "working_range.tilt_rad; rotate the object by object.world_from_object"
             )
         along = np.array([1.0, 0.0, 0.0])
         across = np.cross(front.normal, along)
@@ -112,10 +109,10 @@ class SurfaceMap:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return how far a finger can stroke in one direction, and whether an end limits it.
+        """Return the maximum stroke in one direction, m, and whether an end limits the stroke.
 
-        The other limit is the tilt of the normal from the user, whose cosine is `most`. Lengths
-        are measured from the front along the geodesic that begins in direction `heading`, m.
+        The other limit is the tilt of the normal from the user, whose cosine is `most`. The length
+        is measured from the front along the geodesic that begins in direction `heading` (3,).
         """
         here, way_m = front, 0.0
         while way_m < MAX_DISTANCE_M:
@@ -133,7 +130,7 @@ class SurfaceMap:
         return way_m, False
 
     def _fit_splines(self, front: Nearest, heading: Floats) -> None:
-        """Fit splines of the surface over (along, arc), to 1.25 times the range to be stroked."""
+        """Fit splines of the surface over (along, arc), for 1.25 times the range of strokes."""
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
             for half in (0.625 * size for size in self.touchable_m)
@@ -149,10 +146,10 @@ class SurfaceMap:
 
 
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
-    """Return the surface point that faces the user.
+    """Return the surface point that faces the user: the point nearest to a distant user.
 
-    That is the point nearest to a distant user. If that point lies on an end of the object, the
-    point that the user sees in the direction of the object's origin is taken instead.
+    If the nearest point lies on an end of the object, return instead the point that the user sees
+    in the direction of the object's origin.
     """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:
@@ -173,8 +170,7 @@ def _lean_rad(found: Nearest, towards_user: Floats) -> float:
 def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tuple[Floats, Floats]:
     """Return points and normals (k, n, 3) on geodesics from points (n, 3).
 
-    ticks: ascending distances (k,) in m at which points are computed. 0 is in the centre, with
-    equally many distances on both sides.
+    ticks: ascending distances (k,) in m at which points are computed. The middle element is 0.
     """
     centre = len(ticks) // 2
     begun = shape.closest(starts)
@@ -201,7 +197,7 @@ def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tupl
 
 
 def _surface_map_of(scene: Scene) -> SurfaceMap:
-    """Return the surface map of a scene; the latest few are cached, as they are costly."""
+    """Return the surface map of a scene from a cache of the latest few scenes, or compute it."""
     key = pickle.dumps((scene.object, scene.working_range, scene.sheet, scene.name))
     if key not in _SURFACE_MAPS:
         while len(_SURFACE_MAPS) >= MAX_CACHED_SURFACE_MAPS:
@@ -218,7 +214,10 @@ def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
 
 
 def limit_path_speed(scene: Scene, times_s: Floats, points: Floats) -> Floats:
-    """Return the times (n,), stretched by one factor if the path exceeds the finger's speed."""
+    """Return the times (n,), s, stretched by one factor if the path exceeds the finger's speed.
+
+    points: positions (n, 3), m.
+    """
     fastest = float(SmoothPath.through(times_s, points).speeds().max())
     slower = max(1.0, fastest / (SPEED_FRACTION * scene.finger.max_speed_m_per_s))
     return np.asarray((times_s - times_s[0]) * slower)
@@ -235,10 +234,10 @@ def place_path(
 ) -> FingerPath:
     """Make a path in the scene from a smooth motion in surface positions.
 
-    times_s, places: sample times (n,) and surface positions (n, 3).
+    times_s, places: sample times (n,) and surface positions (n, 3), m.
 
-    The motion is scaled down by one factor if it, with wander and tremor, leaves the scene's finger
-    volume. It is slowed down by one factor if it exceeds the scene's finger speed.
+    The motion is scaled down by one factor if the path with wander and tremor leaves the scene's
+    finger volume. The motion is slowed down by one factor if it exceeds the scene's finger speed.
 
     Raises FingerPathError if the volume does not contain the front of the object.
     """
@@ -269,7 +268,7 @@ def place_path(
 
 
 def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
-    """Load a recorded fingertip path and map it into the scene. The path is named after its file.
+    """Load a recorded fingertip path and map it into the scene; label the path by its file name.
 
     The file has columns t_s, x_mm, y_mm, z_mm with y upwards, as hand trackers write it. The
     mapping preserves the motion and changes its location:
@@ -279,12 +278,12 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
        that can be stroked (`touchable`) and 50 mm of depth.
     3. Translate: the median x, y is placed in front of the centre of the object.
     4. Project: z becomes the height above the surface. The deepest 30 % of the samples push into
-       it, limited smoothly to a sixth of `push_depth_m`; the others are in the air. y becomes arc
-       length on the surface, so that moving up and down strokes it.
+       the surface, limited smoothly to a sixth of `push_depth_m`. y becomes arc length on the
+       surface, so that a vertical motion strokes the surface.
     5. Slow down, if necessary, by one factor, to 0.8 of the scene's finger speed.
 
     The samples are limited to the scene's finger volume and joined by a spline, which preserves the
-    recorded motion with its tremor.
+    recorded tremor.
 
     Raises FingerPathError for an invalid file.
     """
@@ -341,12 +340,13 @@ def _read_recording(csv_path: Path) -> Floats:
         lines: Sequence[str] = csv_path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise FingerPathError(
-            f"{csv_path}: cannot be read: {error}; give a CSV file in UTF-8"
+            f"{csv_path}: the file cannot be read: {error}; give a CSV file in UTF-8"
         ) from error
     columns = [name.strip() for name in lines[0].split(",")] if lines else []
     if missing := [name for name in wanted if name not in columns]:
         raise FingerPathError(
-            f"{csv_path}: no column {missing[0]} in the first line; required: {', '.join(wanted)}"
+            f"{csv_path}: the first line names no column {missing[0]}; required: "
+            f"{', '.join(wanted)}"
         )
     rows: list[list[float]] = []
     for number, line in enumerate(lines[1:], start=2):
@@ -354,10 +354,13 @@ def _read_recording(csv_path: Path) -> Floats:
         try:
             row = [float(cells[columns.index(name)]) for name in wanted]
         except (ValueError, IndexError) as error:
-            raise FingerPathError(f"{csv_path}: line {number}: invalid row: {error}") from error
+            raise FingerPathError(
+                f"{csv_path}: line {number}: the row is not valid: {error}; correct or delete the "
+                "line"
+            ) from error
         if not np.isfinite(row).all():
             raise FingerPathError(
-                f"{csv_path}: line {number}: not a finite number; correct or delete the line"
+                f"{csv_path}: line {number}: a value is not finite; correct or delete the line"
             )
         if rows and row[0] <= rows[-1][0]:
             raise FingerPathError(

@@ -1,8 +1,8 @@
 """Simulate the stereo camera: render images of a finger with a bright marker at its tip.
 
-The camera model, a pinhole with Brown's distortion (`rig.py`), is separate from the one that the
-nodes use, since the images serve to test theirs. The finger is a tapered capsule. By default the
-marker is a small luminous bead, whose centre is the fingertip position; `nail.py` defines others.
+The camera model, a pinhole with Brown's distortion (`rig.py`), shares no code with the camera model
+of the nodes, which the images serve to test. The finger is a tapered capsule. By default the marker
+is a small luminous bead, whose centre is the fingertip position; `nail.py` defines other markers.
 `clutter.py` describes the surroundings. All objects are drawn ray by ray and blurred by the lens,
 defocus, pixel area and motion during the exposure. Then photon and read noise are added, and the
 result is clipped and rounded to grey levels.
@@ -35,61 +35,63 @@ from flexsheet.nodes.twin.clutter import (
     Sheet,
 )
 from flexsheet.nodes.twin.nail import Nail
-from flexsheet.nodes.twin.rig import pixel_of, pixels_of, pixels_per_slope, slopes_of
+from flexsheet.nodes.twin.rig import pixels_of, pixels_per_slope, project_ray, slopes_of
 
 Window = tuple[slice, slice]
-"""Rows and columns of a rectangular part of an image."""
+"""The rows and columns of a rectangular part of an image."""
 
 Position = Callable[[float], Floats]
-"""Function that returns the fingertip position (3,) at a time in seconds from mid-exposure."""
+"""The function that returns the fingertip position (3,) at a time in seconds from mid-exposure."""
 
 MOTION_STEP_PX = 0.7
-"""Maximum distance between the positions at which a moving object is drawn during one exposure. The
-lens blur closes the gaps; motion within a step, which is ignored, would widen it by at most 4 %."""
+"""The maximum distance between the positions at which a moving object is drawn during one exposure.
+The lens blur closes the gaps; motion within a step, which is ignored, would widen it by at most 4
+%."""
 
 LIGHT = np.array([-0.6, 0.7, 0.4])
-"""World direction towards the lamp at the upper left, of about unit length."""
+"""The world direction towards the lamp at the upper left, of about unit length."""
 
 SHADE = 0.35
-"""Fraction by which skin is darker at the outline of a limb than along its centre line."""
+"""The fraction by which skin is darker at the outline of a limb than along its centre line."""
 
 SIDE_LIGHT = 0.2
-"""Fraction by which the side of a limb that faces the lamp is brighter, and the other darker."""
+"""The fraction by which the lamp brightens the facing side of a limb and darkens the other side."""
 
 MIN_DEPTH_M = 0.02
-"""Objects closer to a camera than this are not drawn."""
+"""The minimum distance from a camera, in metres, at which objects are drawn."""
 
 ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
-"""Positions along a limb (0: start, 1: end) that are projected to find the window with the limb."""
+"""The projected positions along a limb (0: start, 1: end) that determine its window."""
 
 EMPTY_FRACTION = 1.2
-"""Two overlapping windows are joined if the joined area is at most this multiple of their sum."""
+"""The maximum ratio of the area of two joined windows to the sum of the areas of both windows."""
 
 LIT_RADIUS_M, LIT_LEVEL = 0.0028, 150.0
-"""Radius of a projected mark that has the area of 10 x 10 pixels of 0.5 mm, and the grey level that
-it adds to the sheet."""
+"""The radius of a projected mark (the area is that of 10 x 10 pixels of 0.5 mm), and the grey level
+that the mark adds to the sheet."""
 
 NO_POINTS = np.zeros((0, 3))
 
 SPOTS = 61
-"""Number of Gaussian spots that make up a flat marker."""
+"""The number of Gaussian spots that make up a flat marker."""
 
 GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
 GRAIN = 1 << 21
-"""Length of the stored sequence of normal deviates; images take their noise from random parts."""
+"""The length of the stored sequence of random numbers from which images take their noise."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """Properties of the image sensor and lens; grey levels (0..255) are proportional to the light.
+    """The properties of the image sensor and lens; grey levels (0..255) are proportional to the
+    light.
 
     photons_per_level: full-well capacity in photons, divided by 255. The variance of the photon
     noise at level L is L / photons_per_level.
     blur_px: standard deviation of the lens's point spread function in focus.
     aperture_m, focus_m: aperture diameter and focused distance. A point at depth z spreads to a
-    disc of diameter focal_px * aperture_m * |1/z - 1/focus_m|. It is drawn as a Gaussian with the
-    same standard deviation, a quarter of the diameter.
+    disc of diameter focal_px * aperture_m * |1/z - 1/focus_m|. The disc is drawn as a Gaussian
+    with the same standard deviation, a quarter of the diameter.
     exposure: factor on all light; well above 1 the marker saturates.
     noisy_backgrounds: number of precomputed noisy background images per camera.
     """
@@ -107,22 +109,22 @@ class Sensor:
     noisy_backgrounds: int = 8
 
     def noise(self, levels: Singles) -> Singles:
-        """Return the standard deviation of the photon and read noise at each grey level."""
+        """Return the standard deviation of photon and read noise for grey levels (any shape)."""
         variance = levels * np.float32(1.0 / self.photons_per_level) + np.float32(
             self.read_noise**2
         )
         return np.asarray(np.sqrt(variance), dtype=np.float32)
 
     def spread_px(self, depth_m: float, focal_px: float) -> float:
-        """Return the blur (standard deviation) of a point due to lens, defocus and pixel area."""
+        """Return the blur of a point (standard deviation, px) by lens, defocus and pixel area."""
         defocus_px = 0.25 * focal_px * self.aperture_m * abs(1.0 / depth_m - 1.0 / self.focus_m)
         return float(np.sqrt(self.blur_px**2 + defocus_px**2 + 1.0 / 12.0))
 
     def out_of_focus(self, defocus_px: float, depth_m: float, focal_px: float) -> Sensor:
-        """Return this sensor refocused farther away, so that a point at `depth_m` is blurred.
+        """Return a copy of the sensor that is focused behind `depth_m`, which blurs a point there.
 
-        The defocus alone has the standard deviation `defocus_px`. Raises ValueError if even focus
-        at infinity gives less.
+        defocus_px: standard deviation of the defocus alone. Raises ValueError if focus at infinity
+        gives less defocus.
         """
         nearer = 4.0 * defocus_px / (focal_px * self.aperture_m)
         focus = 1.0 / depth_m - nearer
@@ -159,16 +161,22 @@ class CameraView:
         return np.asarray(-self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3])
 
     def see(self, point_world: Floats) -> tuple[Floats, float]:
-        """Return the pixel (2,) and depth (m) of a world point; for depths <= 0 the pixel is 0."""
+        """Return the pixel (2,) and depth (m) of a world point (3,).
+
+        The pixel is (0, 0) if the depth is not positive.
+        """
         x, y, z = (
             self.camera_from_world[:3, :3] @ point_world + self.camera_from_world[:3, 3]
         ).tolist()
         if z <= 0:
             return np.zeros(2), z
-        return np.array(pixel_of(self.lens, x / z, y / z)), z
+        return np.array(project_ray(self.lens, x / z, y / z)), z
 
     def window(self, pixels: Sequence[tuple[float, float]], reach_px: float) -> Window | None:
-        """Return the bounding box of pixels, enlarged by `reach_px`; None if outside the image."""
+        """Return the bounding box of pixels, enlarged by `reach_px` and limited to the image.
+
+        Return None if the bounding box lies outside the image.
+        """
         height, width = self.canvas.shape
         rows = slice(
             max(math.floor(min(y for _, y in pixels) - reach_px), 0),
@@ -182,7 +190,7 @@ class CameraView:
 
 
 class TwinCamera:
-    """Simulated stereo camera, which renders image pairs; `seed` determines the noise."""
+    """A simulated stereo camera, which renders image pairs; `seed` determines the noise."""
 
     def __init__(
         self,
@@ -226,9 +234,9 @@ class TwinCamera:
         marker_radius_m: float | None = None,
         marker_offset_m: Floats | None = None,
     ) -> TwinCamera:
-        """Return a copy of this camera, with the same background but a different marker or sensor.
+        """Return a copy of the camera with another marker or sensor; the background is unchanged.
 
-        marker_offset_m: vector from the fingertip to the marker, in the world frame.
+        marker_offset_m: vector (3,) from the fingertip to the marker, in the world frame.
         """
         other = copy.copy(self)
         other.sensor = self.sensor if sensor is None else sensor
@@ -248,7 +256,7 @@ class TwinCamera:
         """Render the left and right image of a finger whose tip moves along `position`.
 
         marker: whether the finger wears a marker.
-        time_s: simulation time at mid-exposure, which determines where moving clutter is.
+        time_s: simulation time at mid-exposure, which determines the positions of moving clutter.
         lit_points: points (n, 3) of the sheet that the projector lights.
         """
         left, right = (
@@ -262,7 +270,10 @@ class TwinCamera:
     def levels(
         self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Singles, Singles]:
-        """Render both images (height, width) without noise, saturation and rounding."""
+        """Render the left and right image (height, width) without noise, saturation and rounding.
+
+        The arguments are those of `picture`.
+        """
         pictures = []
         for eye, instants_s, tips in self._views(position, exposure_s):
             windows = self._draw(eye, tips, time_s + instants_s, marker=marker)
@@ -273,7 +284,10 @@ class TwinCamera:
     def _views(
         self, position: Position, exposure_s: float
     ) -> Iterator[tuple[CameraView, Floats, Floats]]:
-        """Yield each camera with times (n,) from mid-exposure and the fingertip (n, 3) at them."""
+        """Yield each camera with sampling times (n,) and fingertip positions (n, 3) at these times.
+
+        Times are in seconds from mid-exposure.
+        """
         instants_s, tips = self._instants(position, exposure_s)
         left, right = self.eyes
         yield left, instants_s, tips
@@ -285,7 +299,7 @@ class TwinCamera:
     def _instants(self, position: Position, exposure_s: float) -> tuple[Floats, Floats]:
         """Return times (n,) from mid-exposure and fingertip positions (n, 3), for motion blur.
 
-        They are so dense that the fingertip moves at most MOTION_STEP_PX between two of them.
+        Between successive times the fingertip moves by at most MOTION_STEP_PX in the image.
         """
         ends = [position(share * exposure_s) for share in (-0.5, 0.5)]
         travel_px = 0.0
@@ -298,9 +312,9 @@ class TwinCamera:
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
     def _exposed(self, eye: CameraView, windows: list[Window]) -> Image:
-        """Return a noisy background into which the drawn windows of the canvas are copied.
+        """Return an image: noisy background, with the drawn windows of the canvas copied into it.
 
-        Then restore the canvas to the background.
+        The canvas is then reset to the background.
         """
         image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
         for window in disjoint(windows):
@@ -322,7 +336,7 @@ class TwinCamera:
         marker: bool,
         lit: Floats = NO_POINTS,
     ) -> list[Window]:
-        """Draw the finger and all moving objects on the camera's canvas; return drawn windows.
+        """Draw the finger and all moving objects on the camera's canvas; return the drawn windows.
 
         tips: fingertip positions (n, 3) during the exposure. times_s: their times (n,).
         """
@@ -380,15 +394,16 @@ class TwinCamera:
         *,
         lit: bool,
     ) -> Window | None:
-        """Draw a tapered capsule between two world points (2, 3); return its window.
+        """Draw a tapered capsule between two world points (2, 3) and return the drawn window.
 
         Return None if the capsule is not visible.
 
-        lit: whether the lamp shades it from the side; otherwise its level is constant.
-        motion: (3,) m, of the limb during the exposure, which widens the blurred edges.
+        lit: whether the lamp shades the capsule from the side; otherwise its level is constant.
+        motion: displacement (3,) of the limb during the exposure, m, which widens the blurred
+        edges.
 
-        The profile of the edges is a cubic, within 2 % of the normal distribution function. It is
-        not valid for a limb that is thinner than its blurred edges.
+        The profile of the edges is a cubic, within 2 % of the normal distribution function. The
+        cubic is not valid for a limb that is thinner than its blurred edges.
         """
         (x0, y0, z0), (x1, y1, z1) = apply(eye.camera_from_world, ends).tolist()
         if min(z0, z1) <= MIN_DEPTH_M:
@@ -400,7 +415,7 @@ class TwinCamera:
         spread_px = math.hypot(self.sensor.spread_px(z0, eye.lens.fx_px), travel_px / math.sqrt(12))
         # Lens distortion bends straight lines, so the bounding box of the ends does not suffice.
         pixels = [
-            pixel_of(eye.lens, u0 + share * (u1 - u0), v0 + share * (v1 - v0)) for share in ALONG
+            project_ray(eye.lens, u0 + share * (u1 - u0), v0 + share * (v1 - v0)) for share in ALONG
         ]
         window = eye.window(pixels, scale * max(width0, width1) + 3.0 * spread_px)
         if window is None:
@@ -431,11 +446,12 @@ class TwinCamera:
     def _disc(
         self, eye: CameraView, places: Floats, radius_m: float, level: float, *, adds: bool = False
     ) -> Window | None:
-        """Draw a luminous ball that passes world points (n, 3) during the exposure.
+        """Draw a luminous ball that passes through world points (n, 3) during the exposure.
 
-        Return its window, or None if it is not visible.
+        Return the drawn window, or None if the ball is not visible.
 
-        adds: whether its light is added to the background instead of hiding it.
+        adds: whether the ball's light is added to the background; otherwise the ball hides the
+        background.
         """
         in_camera = apply(eye.camera_from_world, places)
         if in_camera[:, 2].min() <= MIN_DEPTH_M:
@@ -443,7 +459,7 @@ class TwinCamera:
         x, y, z = in_camera.mean(axis=0).tolist()
         spread_px = self.sensor.spread_px(z, eye.lens.fx_px)
         reach_px = pixels_per_slope(eye.lens, x / z, y / z) * radius_m / z + 4.0 * spread_px
-        pixels = [pixel_of(eye.lens, x / z, y / z) for x, y, z in in_camera.tolist()]
+        pixels = [project_ray(eye.lens, x / z, y / z) for x, y, z in in_camera.tolist()]
         window = eye.window(pixels, reach_px)
         if window is None:
             return None
@@ -454,12 +470,12 @@ class TwinCamera:
         return window
 
     def _flat_disc(self, eye: CameraView, places: Floats, normal: Floats) -> Window | None:
-        """Draw the marker as a flat disc that passes world points (n, 3) during the exposure.
+        """Draw the marker as a flat disc that passes through world points (n, 3) while exposed.
 
-        Return its window, or None if it is not visible or seen from behind.
+        Return the drawn window, or None if the disc is not visible or seen from behind.
 
-        The disc is a sum of Gaussian spots. If it is larger than the blur, its light is within 1 %
-        of that of a uniform disc.
+        The disc is a sum of Gaussian spots. For a disc that is larger than the blur, the sum is
+        within 1 % of the light of a uniform disc.
         """
         in_camera = apply(eye.camera_from_world, places)
         centre = in_camera.mean(axis=0)
@@ -516,7 +532,7 @@ class TwinCamera:
         return eye
 
     def _make_background(self, height: int, width: int) -> Singles:
-        """Return the image of a dim room: smooth noise of two scales, darker than the marker."""
+        """Return the image (height, width) of a dim room: smooth noise darker than the marker."""
         texture = np.zeros((height, width), dtype=np.float32)
         for cells, share in ((24, 0.7), (96, 0.3)):
             coarse = self._random.standard_normal((cells, cells), dtype=np.float32)
@@ -525,9 +541,9 @@ class TwinCamera:
         return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.marker_level), dtype=np.float32)
 
     def _grained(self, sheet: Sheet) -> Singles:
-        """Return the grey levels of the sheet's surface, with two samples per grain.
+        """Return the grey levels (rows, columns) of the sheet's surface, two samples per grain.
 
-        The texture is noise of two scales; the left side is brighter.
+        The texture is the sum of fine and coarse noise; the left side is brighter.
         """
         size = [
             2 + int(np.ceil(4.0 * half_m / sheet.grain_m))
@@ -564,7 +580,7 @@ class TwinCamera:
 
 
 def _disc_points(normal: Floats) -> Floats:
-    """Return points (SPOTS, 3), spread evenly over the unit disc perpendicular to `normal`."""
+    """Return points (SPOTS, 3) that evenly fill the unit disc perpendicular to `normal` (3,)."""
     number = np.arange(SPOTS) + 0.5
     radius, angle = np.sqrt(number / SPOTS), GOLDEN_ANGLE_RAD * number
     aside = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
@@ -577,7 +593,7 @@ def _disc_points(normal: Floats) -> Floats:
 
 @lru_cache(maxsize=4)
 def _slopes(lens: Lens, width: int, height: int) -> Floats:
-    """Return x/z and y/z (height, width, 2) of the rays through all pixels; cached."""
+    """Return x/z and y/z (height, width, 2) of the rays through all pixels."""
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     slopes = slopes_of(lens, pixels.astype(np.float64))
     slopes.setflags(write=False)
@@ -587,12 +603,15 @@ def _slopes(lens: Lens, width: int, height: int) -> Floats:
 def rasterize_ball(
     eye: CameraView, centres: Floats, radius_m: float, spread_px: float, window: Window
 ) -> Singles:
-    """Return the fraction of each pixel's light that comes from a ball.
+    """Return the fraction (rows, columns) of each pixel's light that comes from a ball.
 
-    The fraction is the mean over the ball's centres (n, 3) during the exposure, in the camera
-    frame. A ray passes a centre at the distance d = |ray x centre| / |ray|. For a disc of radius r
-    that is blurred by a Gaussian of standard deviation s, the fraction is a non-central chi-square
-    distribution function. It has two degrees of freedom and non-centrality (d/s)^2, at (r/s)^2.
+    centres: positions (n, 3) of the ball during the exposure, in the camera frame, m; the result is
+    the mean over these positions.
+    spread_px: standard deviation s of the blur.
+
+    A ray passes a centre at the distance d = |ray x centre| / |ray|. For a disc of radius r, the
+    fraction is the non-central chi-square distribution function at (r/s)^2, with two degrees of
+    freedom and the non-centrality (d/s)^2.
     """
     single = np.float32
     u, v = eye.slopes_x[window], eye.slopes_y[window]
@@ -611,7 +630,7 @@ def rasterize_ball(
 
 
 def quantize(levels: Singles) -> Image:
-    """Convert grey levels to integers as the sensor's converter does: round, clip to 0..255."""
+    """Round grey levels (any shape) to integers and limit them to 0..255."""
     return np.minimum(np.maximum(np.rint(levels), 0.0), 255.0).astype(np.uint8)
 
 
@@ -630,10 +649,10 @@ def _wipe(eye: CameraView, windows: list[Window]) -> None:
 
 
 def disjoint(windows: list[Window]) -> list[Window]:
-    """Return windows that cover the same pixels and do not overlap.
+    """Return windows that do not overlap and cover the same pixels as the given windows.
 
     Two overlapping windows are joined. If the joined window would be too large (EMPTY_FRACTION),
-    the overlap is cut off one of them.
+    the overlap is removed from one of the two windows.
     """
     apart: list[Window] = []
     pending = list(windows)

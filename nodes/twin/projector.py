@@ -1,7 +1,7 @@
 """Simulate a projector that lights a flat sheet; compute the errors of its calibration.
 
-The projector model is separate from the one that the nodes use, because it serves to test theirs.
-A sheet that is not pushed lies flat between two parallel edges, so that a plane represents it.
+The projector model shares no code with that of the nodes, which the simulator serves to test. A
+plane represents the sheet, because an untouched sheet lies flat between two parallel edges.
 """
 
 from __future__ import annotations
@@ -19,38 +19,38 @@ from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
     pose_matrix,
+    rotation_from_rpy,
     rotation_from_vector,
+    rpy_from_rotation,
     transform,
-    transform_from_rpy,
 )
 from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
 
 RAYS = 2
-"""Number of rays per camera pixel in each direction."""
+"""The number of rays per camera pixel in each direction."""
 
 ROOM_LEVEL, LIT_LEVEL, DARK_LEVEL = 14.0, 150.0, 9.0
-"""Grey levels of the room behind the sheet, and of the sheet: the level that full light adds, and
-the level where black is projected."""
+"""Three grey levels: the room behind the sheet, the level that full projector light adds to the
+sheet, and the sheet where black is projected."""
 
 SPREAD_PX = 0.5
-"""Blur (standard deviation) of a projected pixel on the sheet, due to lens and rubber."""
+"""The blur (standard deviation) of a projected pixel on the sheet, due to lens and rubber."""
 
 WINDOW_MARGIN = 0.05
-"""Margin around the outline of the sheet in an image, in slopes x/z and y/z of rays."""
+"""The margin around the outline of the sheet in an image, in slopes x/z and y/z of rays."""
 
 FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
 OFFSET_DEVIATION_M, ROTATION_DEVIATION_RAD = 0.004, 0.006
 RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
-"""Standard deviations of the true projector from the scene's: focal length (relative), principal
-point, position, rotation and distortion."""
+"""The standard deviations of the true projector's radial and tangential distortion."""
 
 
 def make_true_projector(projector: Projector, *, seed: int) -> Projector:
-    """Return a projector with random deviations from the scene's, as real devices have.
+    """Return a copy of the scene's projector with random deviations, as real devices have.
 
-    Its pose deviates as if it had been measured with a tape. Deviations are normal, limited to two
-    standard deviations.
+    The deviations of the pose are those of a measurement by tape. Deviations are normally
+    distributed and limited to two standard deviations.
     """
     random = np.random.default_rng(seed)
 
@@ -76,30 +76,16 @@ def make_true_projector(projector: Projector, *, seed: int) -> Projector:
             ),
             "world_from_projector": Pose(
                 position_m=pose.position_m + OFFSET_DEVIATION_M * deviation(3),
-                rpy_rad=_rpy(turned @ transform_from_rpy([0.0] * 3, pose.rpy_rad)[:3, :3]),
+                rpy_rad=rpy_from_rotation(turned @ rotation_from_rpy(pose.rpy_rad)),
             ),
         }
-    )
-
-
-def _rpy(rotation: Floats) -> Floats:
-    """Convert a rotation matrix to roll, pitch, yaw about fixed x, y, z axes (rad).
-
-    They are not unique at a pitch of +-90 degrees.
-    """
-    return np.array(
-        [
-            np.arctan2(rotation[2, 1], rotation[2, 2]),
-            -np.arcsin(np.clip(rotation[2, 0], -1.0, 1.0)),
-            np.arctan2(rotation[1, 0], rotation[0, 0]),
-        ]
     )
 
 
 def sheet_poses(count: int) -> list[Floats]:
     """Return various poses `world_from_sheet` (4, 4) at which the arms can hold the sheet.
 
-    They differ in distance and tilt because the calibration of a projector requires it.
+    The poses differ in distance and tilt, as the calibration of a projector requires.
     """
     poses = []
     for number in range(count):
@@ -113,10 +99,13 @@ def sheet_poses(count: int) -> list[Floats]:
 
 
 class LitSheet:
-    """Stereo camera in front of a flat sheet that the projector lights from behind."""
+    """A stereo camera in front of a flat sheet that the projector lights from behind."""
 
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
-        """Store the simulated devices; camera, projector: true parameters."""
+        """Store the simulated devices.
+
+        camera, projector: true parameters. seed: random seed of the image noise.
+        """
         self._scene, self._camera, self._projector = scene, camera, projector
         self._random = np.random.default_rng(seed)
         self._sensor = Sensor()
@@ -177,7 +166,7 @@ class LitSheet:
     ) -> tuple[slice, slice]:
         """Return the rows and columns of the image that can show the sheet.
 
-        Returns the whole image if a part of the sheet is behind the eye.
+        Return the whole image if a part of the sheet is behind the camera.
         """
         height, width = self._camera.height_px, self._camera.width_px
         half = 0.5 * np.array([self._scene.sheet.width_m, self._scene.sheet.height_m])
@@ -198,10 +187,10 @@ class LitSheet:
     def _lit_by(
         self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats, bend: Floats | None
     ) -> tuple[Singles, Singles, NDArray[np.bool_]]:
-        """Return the projector columns and rows that light the points of the sheet that rays hit.
+        """Return the projector columns and rows that light the sheet where camera rays hit it.
 
-        rays: x/z and y/z (rows, columns, 2) in the camera frame. The third result is whether a ray
-        hits the sheet.
+        rays: x/z and y/z (rows, columns, 2) in the camera frame. The third result states whether
+        each ray hits the sheet.
         """
         directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
         directions = directions @ world_from_eye[:3, :3].T
@@ -242,7 +231,10 @@ def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats,
 
 
 def pixels_lighting(projector: Projector, points: Floats) -> Floats:
-    """Return the projector pixels (..., 2) that light world points (..., 3) in front of it."""
+    """Return the projector pixels (..., 2) that light world points (..., 3).
+
+    The points must be in front of the projector.
+    """
     from_world = inverse(pose_matrix(projector.world_from_projector))
     local = points @ from_world[:3, :3].T + from_world[:3, 3]
     return pixels_of(projector.lens, local[..., :2] / local[..., 2:])
@@ -251,11 +243,11 @@ def pixels_lighting(projector: Projector, points: Floats) -> Floats:
 def errors_at_eye(
     believed: Projector, true: Projector, eye: Floats, planes: Sequence[Floats], half_m: float
 ) -> Floats:
-    """Return how far from their intended positions projected points appear to the eye, (n,).
+    """Return the distances (n,), m, of projected points from their intended positions for an eye.
 
-    The distances are in m on the imaginary screen, the world plane z = 0. Points on a grid of
-    +-half_m on planes (4, 4) are lit by the pixels that the calibrated projector `believed`
-    computes. The true projector casts their light elsewhere on the plane.
+    The distances are measured on the imaginary screen, the world plane z = 0. The points form a
+    grid of +-half_m on each plane (4, 4). The calibrated projector `believed` determines the pixels
+    of the points, and the projector `true` casts the light of these pixels.
     """
     axis = np.linspace(-half_m, half_m, 9)
     flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)

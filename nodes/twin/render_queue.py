@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Generic, TypeVar
 
 Key = tuple[str, ...]
-"""Label, correction and viewpoint of a frame, which identify a job."""
+"""The label, correction and viewpoint of a frame, which identify a rendering job."""
 
 J = TypeVar("J")
 
 
 class RenderQueue(Generic[J]):
-    """Queue of rendering jobs in order of arrival, which prevents repeated rendering.
+    """A queue of rendering jobs in order of arrival, which prevents repeated rendering.
 
     max_length: maximum number of waiting jobs.
     min_interval_s: minimum time before a job with the same key is rendered again.
@@ -32,7 +32,7 @@ class RenderQueue(Generic[J]):
         return len(self._jobs) >= self._max_length
 
     def is_known(self, key: Key, now_ns: int) -> bool:
-        """Return whether a job with this key is waiting, or was rendered in `min_interval_s`."""
+        """Return whether a job with this key is waiting or was rendered within `min_interval_s`."""
         if key in self._jobs:
             return True
         return key in self._recent_ns and self._is_recent(self._recent_ns[key], now_ns)
@@ -43,7 +43,7 @@ class RenderQueue(Generic[J]):
     def reject(self, key: Key) -> bool:
         """Record that a job was rejected because the queue is full.
 
-        Return True the first time for this key, so that the caller reports it only once.
+        Return whether this is the first rejection for the key, which the caller should report.
         """
         is_new = key not in self._rejected
         self._rejected.add(key)
@@ -54,11 +54,11 @@ class RenderQueue(Generic[J]):
         self._jobs[key] = job
 
     def next(self) -> tuple[Key, J]:
-        """Return key and content of the oldest job, which stays in the queue until `finish`."""
+        """Return key and content of the oldest job without removing the job from the queue."""
         return next(iter(self._jobs.items()))
 
     def finish(self, key: Key, now_ns: int) -> None:
-        """Remove a rendered job, and remember when it was rendered."""
+        """Remove a rendered job, and store the time `now_ns` of its rendering."""
         self._jobs.pop(key, None)
         self._rejected.discard(key)
         self._recent_ns[key] = now_ns

@@ -1,8 +1,8 @@
 """Simulate the stereo camera's true geometry and lenses.
 
 The section `camera` of a scene corresponds to a data sheet. The simulated device deviates from it,
-and only a calibration determines the deviations. The camera model here is separate from the one
-that the nodes use, because it serves to test theirs.
+and only a calibration determines the deviations. The camera model shares no code with that of the
+nodes, which the simulator serves to test.
 """
 
 from __future__ import annotations
@@ -20,35 +20,36 @@ from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 T = TypeVar("T", float, Floats)
 
 FOCAL_DEVIATION = 0.005
-"""Relative standard deviation of the focal length between devices of one model."""
+"""The relative standard deviation of the focal length between devices of one model."""
 
 ASPECT_DEVIATION = 0.0005
-"""Relative standard deviation of fy from fx, which is small since pixels are nearly square."""
+"""The relative standard deviation of fy from fx, which is small since pixels are nearly square."""
 
 CENTRE_DEVIATION_PX = 4.0
-"""Standard deviation of the principal point, due to the mounting of the sensor, for an image 640 px
-wide."""
+"""The standard deviation of the principal point between devices, in an image 640 px wide."""
 
+# k1 and k2 of typical lenses with 66 degrees of horizontal field of view, which data sheets omit.
 RADIAL = (-0.30, 0.11)
+"""The mean of the radial distortion coefficients k1 and k2."""
+
 RADIAL_DEVIATION = (0.015, 0.01)
-"""Mean and standard deviation of k1 and k2 for typical lenses with 66 degrees of horizontal field
-of view; data sheets do not state them."""
+"""The standard deviation of the radial distortion coefficients k1 and k2."""
 
 TANGENTIAL_DEVIATION = 0.0004
 OFFSET_DEVIATION_M = 0.0001
-"""Standard deviation, per axis, of the right camera's position."""
+"""The standard deviation, per axis, of the right camera's position."""
 
 ROTATION_DEVIATION_RAD = 0.004
-"""Standard deviation, per axis, of the right camera's rotation: 0.23 degrees."""
+"""The standard deviation, per axis, of the right camera's rotation: 0.23 degrees."""
 
 NEWTON_STEPS = 12
 
 
 def make_true_camera(camera: StereoCamera) -> StereoCamera:
-    """Return true camera parameters, which deviate at random from the scene's.
+    """Return true camera parameters, which deviate at random from those in the scene.
 
-    The random seed is the device name. The deviations are normal, limited to two standard
-    deviations. The pose of the left camera, image size, rate and exposure remain unchanged.
+    The random seed is the device name. The deviations are normally distributed and limited to two
+    standard deviations. The pose of the left camera, image size, rate and exposure are unchanged.
     """
     name = hashlib.sha256(camera.device.encode()).digest()
     random = np.random.default_rng(np.frombuffer(name, dtype=np.uint32))
@@ -86,16 +87,18 @@ def make_true_camera(camera: StereoCamera) -> StereoCamera:
 
 
 def pixels_of(lens: Lens, slopes: Floats) -> Floats:
-    """Project rays (x/z, y/z) (..., 2) to pixels (..., 2) by Brown's distortion."""
-    return np.stack(_seen(lens, slopes[..., 0], slopes[..., 1]), axis=-1)
+    """Project rays to pixels (..., 2) with Brown's distortion.
+
+    slopes: x/z and y/z of the rays (..., 2).
+    """
+    return np.stack(project_ray(lens, slopes[..., 0], slopes[..., 1]), axis=-1)
 
 
-def pixel_of(lens: Lens, slope_x: float, slope_y: float) -> tuple[float, float]:
-    """Project one ray like `pixels_of`, but many times faster."""
-    return _seen(lens, slope_x, slope_y)
+def project_ray(lens: Lens, u: T, v: T) -> tuple[T, T]:
+    """Return the pixel column and row of a ray, or arrays of both for arrays of rays.
 
-
-def _seen(lens: Lens, u: T, v: T) -> tuple[T, T]:
+    u, v: x/z and y/z of the ray. For a single ray, floats are many times faster than arrays.
+    """
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -107,7 +110,7 @@ def _seen(lens: Lens, u: T, v: T) -> tuple[T, T]:
 def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
     """Return the derivatives dx/du, dx/dv and dy/dv of Brown's distortion; dy/du equals dx/dv.
 
-    u, v: x/z and y/z of the ray; x, y: the same after distortion.
+    u, v: x/z and y/z of the ray; x, y: the slopes after distortion.
     """
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v
@@ -119,18 +122,19 @@ def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
 
 
 def pixels_per_slope(lens: Lens, slope_x: float, slope_y: float) -> float:
-    """Return the local image scale: pixels per unit of the slopes x/z and y/z near a ray.
+    """Return the image scale near a ray, in pixels per unit of the slopes x/z and y/z.
 
-    It is the square root of the determinant of the projection's derivative.
+    The scale is the square root of the determinant of the projection's derivative.
     """
     xx, xy, yy = _slopes_of_distortion(lens, slope_x, slope_y)
     return math.sqrt(lens.fx_px * lens.fy_px * abs(xx * yy - xy * xy))
 
 
 def slopes_of(lens: Lens, pixels: Floats) -> Floats:
-    """Return the rays (x/z, y/z) (..., 2) of pixels (..., 2): the inverse of `pixels_of`.
+    """Return the slopes x/z and y/z (..., 2) of the rays through pixels (..., 2).
 
-    It uses Newton's method, and is valid wherever the distortion is injective.
+    The function inverts `pixels_of` by Newton's method. The result is valid wherever the distortion
+    is injective.
     """
     focal = np.array([lens.fx_px, lens.fy_px])
     slopes = np.asarray((pixels - np.array([lens.cx_px, lens.cy_px])) / focal, dtype=np.float64)

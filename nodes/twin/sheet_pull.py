@@ -18,14 +18,14 @@ from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, TrueRubber, solve
 
 CELLS = 8
-"""Number of node intervals per side of the sheet's mesh. Without a finger, the force differs by 1 %
-from that with 32."""
+"""The number of node intervals per side of the sheet's mesh. Without a finger, the force differs by
+1 % from the force with 32 intervals."""
 
 STRETCHES = (1.0, 1.01, 1.03, 1.06, 1.1, 1.15, 1.2, 1.3)
 
 
 def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> TrueRubber:
-    """Make the simulated sheet; `sheet` has the true dimensions and material."""
+    """Make the simulated sheet from its true dimensions and material."""
     gradient = (0.0, 0.0) if apparatus is None else apparatus.sheet.thickness_gradient_ratio
     return TrueRubber(
         sheet.width_m,
@@ -38,13 +38,13 @@ def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> TrueRubber:
 
 
 def true_friction(apparatus: Apparatus | None) -> float | None:
-    """Return the friction coefficient between finger and sheet; None: touched rubber sticks."""
+    """Return the friction coefficient of finger and sheet, or None if touched rubber sticks."""
     return None if apparatus is None else apparatus.sheet.friction_coefficient
 
 
 @dataclass(slots=True)
 class SheetPull:
-    """Force with which the sheet pulls on both arms, and the compliance of the arms.
+    """The force with which the sheet pulls on both arms, and the compliance of the arms.
 
     The force of a finger on the sheet is neglected, since it is small compared with the tension.
     distances_m, forces_n: (n,) tension as a function of the distance between the clamped edges.
@@ -86,19 +86,16 @@ class SheetPull:
         )
 
     def force_n(self, distance_m: float) -> float:
-        """Return the tension if the edges would be at `distance_m` with rigid arms.
+        """Return the tension, N, of a sheet whose edges would be at `distance_m` with rigid arms.
 
-        The flanges yield until the tension and the stiffness of the arms are in equilibrium.
+        The compliant flanges move until the sheet and the arms are in equilibrium.
         """
         forces_n = self._rubber_ratio * self.forces_n
         rigid_m = self.distances_m + sum(self.compliances_m_per_n) * forces_n
         return float(np.interp(distance_m, rigid_m, forces_n))
 
     def _remember(self, distance_m: float, time_s: float) -> None:
-        """Update hysteresis and creep with the tension at a distance.
-
-        Does nothing if they are not modelled.
-        """
+        """Update the hysteresis and creep, if modelled, with the tension at a distance."""
         if self.history is None:
             return
         elastic_n = self.force_n(distance_m) / self._rubber_ratio

@@ -1,8 +1,9 @@
 """Tabulate the force of the simulated sheet on a finger, to look it up every millisecond.
 
 The membrane model takes a tenth of a second per push. The table contains the normal force of pushes
-along the sheet's normal. It is the product of two parts: the force at the sheet's centre for
-several stretch ratios, and the ratio of the force at other positions to it, at the mean stretch.
+along the sheet's normal. The force is the product of two factors. One is the force at the sheet's
+centre for several stretch ratios. The other is the ratio of the force at other positions to the
+force at the centre, at the mean stretch.
 """
 
 from __future__ import annotations
@@ -20,19 +21,20 @@ from flexsheet.nodes.cache import Specification, cached, encode_fields
 from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.twin.membrane import NotConvergedError, TrueRubber, solve
 from flexsheet.nodes.twin.sheet_pull import true_rubber
+from flexsheet.nodes.twin.sheet_surface import lagrange
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 VERSION = 1
-"""Version of the computation; tables of another version are computed again."""
+"""The version of the computation; cached tables of other versions are computed again."""
 
 CELLS = 16
-"""Number of cells per side of the mesh; the force differs by 1 to 4 % from that with 32 cells."""
+"""The number of cells per side of the mesh. With 32 cells, the force differs by 1 to 4 %."""
 
 DEPTH_FRACTIONS = np.array([0.04, 0.12, 0.25, 0.45, 0.7, 1.0])
-"""Depths of the solved pushes, as fractions of the scene's maximum push depth."""
+"""The depths of the solved pushes, as fractions of the scene's maximum push depth."""
 
 POSITION_FRACTIONS = np.array([0.0, 0.2, 0.375])
-"""Distances of the pushes from the sheet's centre, as fractions of its width and height."""
+"""The distances of the pushes from the sheet's centre, as fractions of its width and height."""
 
 STRETCH_NODES = 3
 STRETCH_MARGIN = 0.01
@@ -41,7 +43,7 @@ DEPTH_STEPS = 256
 
 @dataclass(frozen=True, slots=True)
 class SheetReaction:
-    """Normal force (N) of the sheet on a finger over stretch, position and indentation.
+    """The normal force (N) of the sheet on a finger over stretch, position and indentation.
 
     width_m, height_m: dimensions of the sheet at rest, (1,). stretches (s,): stretch ratios.
     depths_m (d,): depths in equal steps from 0. centre_n (s, d): force at the centre. ratios
@@ -57,37 +59,27 @@ class SheetReaction:
     ratios: Floats
 
     def curve_n(self, distance_m: float, x_m: float, y_m: float) -> Floats:
-        """Return the forces (d,) at `depths_m`; zero for a position that is not on the sheet.
+        """Return the forces (d,), N, at `depths_m`; zeros for a position beside the sheet.
 
         distance_m: distance between the edges. x_m, y_m: position relative to the sheet's centre.
         """
         if abs(x_m) >= 0.5 * distance_m or abs(y_m) >= 0.5 * self.height_m[0]:
             return np.zeros(len(self.depths_m))
         stretch = np.clip(distance_m / self.width_m[0], self.stretches[0], self.stretches[-1])
-        centre = _lagrange(self.stretches, float(stretch)) @ self.centre_n
+        centre = lagrange(self.stretches, float(stretch)) @ self.centre_n
         last = POSITION_FRACTIONS[-1]
         # The force is an even function of both coordinates.
         across, along = (
-            _lagrange(POSITION_FRACTIONS**2, min(abs(fraction), last) ** 2)
+            lagrange(POSITION_FRACTIONS**2, min(abs(fraction), last) ** 2)
             for fraction in (x_m / distance_m, y_m / self.height_m[0])
         )
         return np.asarray(centre * np.einsum("i,j,ijd->d", across, along, self.ratios))
 
 
-def _lagrange(nodes: Floats, at: float) -> Floats:
-    """Return the values (n,) of the Lagrange polynomials of `nodes` (n,) at one position."""
-    return np.array(
-        [
-            np.prod([(at - other) / (node - other) for other in nodes if other != node])
-            for node in nodes
-        ]
-    )
-
-
 def load_or_compute_reaction(
     scene: Scene, apparatus: Apparatus | None, cache_dir: Path | None = None
 ) -> SheetReaction:
-    """Return the cached table for the true sheet of a scene; compute it if missing (10 s)."""
+    """Return the force table of a scene's true sheet from the cache, or compute it in 10 s."""
     true_scene = apply_apparatus(scene, apparatus)
     sheet = true_scene.sheet
     rubber = replace(
@@ -117,10 +109,14 @@ def load_or_compute_reaction(
 def compute_reaction(
     rubber: TrueRubber, stretches: Floats, depths_m: Floats, *, finger_radius_m: float
 ) -> SheetReaction:
-    """Solve the pushes of the table. The sheet's weight is neglected."""
+    """Compute the force table with the membrane model; the sheet's weight is neglected.
+
+    stretches: stretch ratios (s,). depths_m: push depths (n,). Raises NotConvergedError if the
+    shallow pushes have no solution.
+    """
 
     def push_n(stretch: float, across: float, along: float) -> Floats:
-        """Return the forces (n,) at the depths; across, along: fractions of width and height."""
+        """Return the forces (n,), N, at a position in fractions of the sheet's width and height."""
         half_m = 0.5 * stretch * rubber.width_m
         edges = [transform(np.eye(3), [side * half_m, 0.0, 0.0]) for side in (-1.0, 1.0)]
         at = 2.0 * across * half_m, along * rubber.height_m

@@ -21,20 +21,22 @@ from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 CELLS = 8
-"""Membrane elements per side. The sag at the usable height differs by 0.3 % from that with 32."""
+"""The number of membrane elements per side. The sag at the usable height differs by 0.3 % from the
+sag with 32 elements."""
 
 STRETCH_NODES = 4
 LEANS = np.array([0.35, 0.7, 1.0])
-"""Vertical components of the sheet normal at which the membrane is solved; at 0 there is no sag."""
+"""The vertical components of the sheet normal in the sag table; the sag is zero at 0."""
 
 STRETCH_MARGIN = 0.005
-"""Extension of the table beyond the scene's range of stretch ratios; further values are clipped."""
+"""The extension of the sag table beyond the scene's range of stretch ratios at both ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPlanes:
-    """Planes at n times: points (n, 3) m, unit normals and x axes (n, 3), and distances between the
-    clamped edges (n,) m. For planes through the edges, the points are midway between both edges.
+    """The planes at n times: points (n, 3) m, unit normals and x axes (n, 3), and distances between
+    the clamped edges (n,) m. For planes through the edges, the points are midway between both
+    edges.
     """
 
     points: Floats
@@ -43,8 +45,21 @@ class SheetPlanes:
     distances_m: Floats
 
 
+def make_edge_plane(left: Floats, right: Floats) -> Floats:
+    """Return the pose (4, 4) of the plane through both edges (4, 4) of the sheet.
+
+    The origin is midway between the edges, x points to the right edge and z towards the user.
+    """
+    across = right[:3, 3] - left[:3, 3]
+    across = across / np.linalg.norm(across)
+    normal = np.cross(across, left[:3, 1] + right[:3, 1])
+    normal /= np.linalg.norm(normal)
+    rotation = np.column_stack([across, np.cross(normal, across), normal])
+    return transform(rotation, 0.5 * (left[:3, 3] + right[:3, 3]))
+
+
 class SagTable:
-    """Table of the unloaded sheet's sag over stretch, tilt and position, solved by the membrane."""
+    """A table of the unloaded sheet's sag over stretch, tilt and position."""
 
     def __init__(
         self, rubber: TrueRubber, min_stretch_ratio: float, max_stretch_ratio: float
@@ -61,14 +76,14 @@ class SagTable:
     def evaluate(
         self, distances_m: Floats, leans: Floats, x_m: Floats, y_m: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the sag along the normal (n,) m, and its derivatives along x and y (n,).
+        """Return the sag along the normal (n,), m, and its derivatives along x and y (n,).
 
-        distances_m: between the edges. leans: vertical component of the sheet normal. x_m, y_m:
-        position relative to the sheet's centre.
+        distances_m: distances (n,) between the edges. leans: vertical components (n,) of the sheet
+        normals. x_m, y_m: positions (n,) relative to the sheet's centre.
         """
         stretches = np.clip(distances_m / self._width_m, *self._range)
-        by_stretch = _lagrange(self._stretches, stretches) / _compute_tension(stretches)
-        by_lean = leans * _lagrange(LEANS**2, leans**2) / LEANS[:, None]
+        by_stretch = lagrange(self._stretches, stretches) / _compute_tension(stretches)
+        by_lean = leans * lagrange(LEANS**2, leans**2) / LEANS[:, None]
         across = np.clip(x_m / distances_m + 0.5, 0.0, 1.0)
         result = np.zeros((3, len(x_m)))
         for fields, tension, weights in zip(
@@ -81,15 +96,16 @@ class SagTable:
 
 
 def _compute_tension(stretch: Floats) -> Floats:
-    """Return the normalized tension of a uniaxially stretched neo-Hookean sheet.
+    """Return the normalized tension (n,) of a uniaxially stretched neo-Hookean sheet.
 
-    The product of sag and tension hardly depends on the stretch, so it is interpolated accurately.
+    The product of sag and tension hardly depends on the stretch, which makes its interpolation
+    accurate.
     """
     return stretch - stretch**-2
 
 
-def _lagrange(nodes: Floats, at: Floats) -> Floats:
-    """Return the values (nodes, n) of the Lagrange polynomials of `nodes` at positions (n,)."""
+def lagrange(nodes: Floats, at: Floats | float) -> Floats:
+    """Return the values (nodes, ...) of the Lagrange polynomials of `nodes` at positions (...)."""
     factors = [
         np.prod([(at - other) / (node - other) for other in nodes if other != node], axis=0)
         for node in nodes
@@ -100,7 +116,10 @@ def _lagrange(nodes: Floats, at: Floats) -> Floats:
 def _solve_sag(
     rubber: TrueRubber, stretch: float, lean: float
 ) -> scipy.interpolate.RectBivariateSpline:
-    """Solve the sag of a tilted sheet over the position between the edges (0..1) and y (m)."""
+    """Solve the sag (m) of a tilted sheet as a function of x and y.
+
+    x: position between the edges (0..1). y: m. lean: vertical component of the sheet normal.
+    """
     cosine = np.sqrt(1.0 - lean**2)
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, cosine, lean], [0.0, -lean, cosine]])
     half_m = 0.5 * stretch * rubber.width_m
@@ -118,7 +137,7 @@ def _cached_table(rubber: TrueRubber, low: float, high: float) -> SagTable:
 
 @dataclass(frozen=True, slots=True)
 class SheetSurface:
-    """Surface of a scene's unloaded sheet. table: its sag; None for a sheet without weight."""
+    """The surface of a scene's unloaded sheet. table: its sag; None for a sheet without weight."""
 
     table: SagTable | None
 

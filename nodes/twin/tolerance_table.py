@@ -1,8 +1,9 @@
 """List the tolerances of real hardware, and generate random apparatuses from them.
 
-An apparatus holds the true parameters of the simulated hardware, as deviations from the scene,
-which holds those that the nodes assume. The option `--apparatus seed:N` generates a random one from
-this table. Each row has its own stream of random numbers, so that a new row changes no other value.
+An apparatus holds the true parameters of the simulated hardware, as deviations from the parameters
+in the scene, which the nodes assume. The option `--apparatus seed:N` generates a random apparatus
+from this table. Each row has its own stream of random numbers, so that a new row changes no other
+value.
 Seeds 0 to 99 are for development; no method may be tuned on any other seed. A calibrated apparatus
 describes a laboratory that has calibrated its devices. Its deviations are the residual errors of
 the calibrations.
@@ -23,15 +24,16 @@ from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
 
 MAX_DEVIATION_SIGMAS = 3.0
-"""Limit of normal random samples; a laboratory would notice and correct a larger deviation."""
+"""The maximum deviation of a random sample, in standard deviations. A laboratory would notice and
+correct a larger deviation."""
 
 
 class Profile(StrEnum):
-    """Generation of the laboratory's equipment.
+    """The age of the laboratory's equipment.
 
     modern: a 60 Hz camera with a short read-out, and robot controllers with a short period.
-    paper: equipment as in Furukawa et al. 2007. The camera has 15 to 48 Hz and reads out for most
-        of a frame; the controller period is 7.1 ms.
+    paper: equipment as in Furukawa et al. 2007: a camera of 15 to 48 Hz, whose read-out takes most
+        of a frame period, and a controller period of 7.1 ms.
     """
 
     MODERN = "modern"
@@ -39,20 +41,20 @@ class Profile(StrEnum):
 
 
 class Distribution(Protocol):
-    """Interface of a probability distribution of one quantity."""
+    """An interface of a probability distribution of one quantity."""
 
     def draw(self, random: np.random.Generator) -> Any:
         """Return a random sample."""
         ...
 
     def at(self, sigmas: float) -> Any:
-        """Return the value whose cumulative probability is that of a normal deviate of `sigmas`."""
+        """Return the quantile that corresponds to `sigmas` standard deviations of a normal one."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """Normal distribution, limited to MAX_DEVIATION_SIGMAS and to the range `low` to `high`."""
+    """A normal distribution, limited to MAX_DEVIATION_SIGMAS and to the range `low` to `high`."""
 
     mean: float
     sigma: float
@@ -69,7 +71,7 @@ class Normal:
 
 @dataclass(frozen=True, slots=True)
 class LogNormal:
-    """Log-normal distribution, limited to MAX_DEVIATION_SIGMAS."""
+    """A log-normal distribution, limited to MAX_DEVIATION_SIGMAS."""
 
     median: float
     sigma_ln: float
@@ -84,7 +86,7 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True)
 class HalfNormal:
-    """Distribution of the absolute value of a normal deviate, limited to MAX_DEVIATION_SIGMAS."""
+    """A half-normal distribution (absolute normal values), limited to MAX_DEVIATION_SIGMAS."""
 
     sigma: float
 
@@ -97,7 +99,7 @@ class HalfNormal:
 
 @dataclass(frozen=True, slots=True)
 class Uniform:
-    """Uniform distribution from `low` to `high`."""
+    """A uniform distribution from `low` to `high`."""
 
     low: float
     high: float
@@ -112,7 +114,7 @@ class Uniform:
 
 @dataclass(frozen=True, slots=True)
 class LogUniform:
-    """Distribution from `low` to `high` whose logarithm is uniform."""
+    """A distribution from `low` to `high` whose logarithm is uniform."""
 
     low: float
     high: float
@@ -127,7 +129,7 @@ class LogUniform:
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """Choice of one of a few values in ascending order, all equally likely."""
+    """A choice of one of a few values in ascending order, all equally likely."""
 
     values: tuple[float, ...]
 
@@ -141,7 +143,7 @@ class OneOf:
 
 @dataclass(frozen=True, slots=True)
 class Always:
-    """Constant value, without tolerance."""
+    """A constant value, without tolerance."""
 
     value: float | str
 
@@ -154,15 +156,16 @@ class Always:
 
 @dataclass(frozen=True, slots=True)
 class Tolerance:
-    """Row of the table: the distribution of one parameter of the apparatus.
+    """A row of the tolerance table: the distribution of one parameter of the apparatus.
 
     key: dotted path in the apparatus; "*" stands for both arms or both lenses.
-    unit, scale: unit in tables, and the factor from SI units to it.
-    modern: distribution of every component, or a tuple with one for each component.
+    unit, scale: unit in tables, and the factor from SI units to this unit.
+    modern: distribution of every component, or a tuple with one distribution per component.
     source, calibrated_source: source of the numbers.
     paper: distribution for the profile `paper`; None: the distribution `modern`.
     calibrated: distribution after calibration; None if no calibration affects the parameter.
-    pair: if given, both arms share a random sample, to which each adds a sample of `pair`.
+    pair: distribution of the difference between the arms; each arm adds its own sample of `pair` to
+        the common sample. None: the samples of both arms are independent.
     frame_periods: profiles in which the sample is in periods of the true camera rate, not seconds.
     """
 
@@ -211,7 +214,7 @@ _ROWS = (
               "drift 0.2 mrad, from memory", calibrated=Normal(0.0, 0.045e-3),
               calibrated_source="docs/camera.md: residual 0.024 px of 540"),
     Tolerance("camera.rate_hz", "Hz", 1.0, Always(60.0), "USB3 cameras: 60 to 120 Hz",
-              paper=OneOf((15.0, 30.0, 48.0)), calibrated_source=""),
+              paper=OneOf((15.0, 30.0, 48.0))),
     Tolerance("camera.read_out_s", "ms (paper: frames)", MS, Uniform(1.5e-3, 4e-3),
               "computed: 614,400 bytes over USB3, or over 1394a at 0.9 frame",
               paper=Always(0.9), frame_periods=(Profile.PAPER,)),
@@ -343,11 +346,11 @@ NOT_SIMULATED: dict[str, str] = {
     "finger.hand_damping_ratio": _ONLY_COUPLED,
     "finger.hand_stiffness_n_per_m": _ONLY_COUPLED,
 }
-"""Keys of an apparatus without effect in the shipped graphs, with the reason."""
+"""The keys of an apparatus that have no effect in the shipped graphs, and the reason for each."""
 
 
 def expand_key(key: str) -> tuple[str, ...]:
-    """Return the paths for which the key of a row stands: left and right if it contains "*"."""
+    """Return the paths that a key stands for: one for each side if the key contains "*"."""
     return tuple(key.replace("*", side) for side in ("left", "right")) if "*" in key else (key,)
 
 
@@ -356,8 +359,8 @@ def sample_apparatus(
 ) -> Apparatus:
     """Generate a random apparatus for a scene; equal arguments give equal results.
 
-    All profiles, calibrated or not, use the same random numbers for the same seed, so that they
-    can be compared in pairs.
+    All profiles use the same random numbers for the same seed, with and without calibration, so
+    that results can be compared in pairs.
     """
     values = nominal_apparatus(scene).model_dump(mode="json")
     for row in TOLERANCES.values():
@@ -375,11 +378,11 @@ def deviate_apparatus(
     profile: Profile = Profile.MODERN,
     calibrated: bool = False,
 ) -> Apparatus:
-    """Make an apparatus in which only the parameter of one row deviates, to test its effect.
+    """Make an apparatus in which only the parameter `key` deviates from the scene.
 
     sigmas: size of the deviation, in standard deviations of a normal distribution. All components
     of a vector, and both arms or lenses, deviate equally. Raises KeyError for a key that is not in
-    the table.
+    the tolerance table.
     """
     row = TOLERANCES[key]
     given = row.of(profile, calibrated=calibrated)
@@ -388,11 +391,8 @@ def deviate_apparatus(
     period_s = 1.0 / scene.camera.rate_hz if profile in row.frame_periods else 1.0
     for path in expand_key(key):
         like = value_at(values, path)
-        each = (
-            given
-            if isinstance(given, tuple)
-            else (given,) * (len(like) if isinstance(like, list) else 1)
-        )
+        count = len(like) if isinstance(like, list) else 1
+        each = given if isinstance(given, tuple) else (given,) * count
         found = [one.at(sigmas) for one in each]
         set_value(values, path, found if isinstance(like, list) else _timed(found[0], period_s))
     return Apparatus.model_validate(values)
@@ -420,7 +420,7 @@ def _draw_row(
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:
-    """Return the random generator of one parameter, which is independent of other parameters."""
+    """Return the random generator of the parameter `name`; the parameters are independent."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 
@@ -464,9 +464,9 @@ TRUTH_SECTIONS = ("camera", "arms", "sheet", "finger", "gauge", "eyes", "project
 
 
 def list_differences(apparatus: Apparatus) -> list[tuple[str, Any, Any, str]]:
-    """List the parameters in which an apparatus differs from a nominal one.
+    """List the parameters of an apparatus that differ from the nominal values.
 
-    An entry is (path, value, nominal value, unit), with values in the unit of the table.
+    An entry is (path, value, nominal value, unit), with values in the unit of the tolerance table.
     """
     mine = apparatus.model_dump(mode="json")
     nominal = Apparatus(scene=apparatus.scene).model_dump(mode="json")

@@ -21,17 +21,18 @@ from flexsheet.nodes.models.shapes.triangles import find_degenerate, nearest_in_
 Indices = NDArray[np.intp]
 
 AROUND, ALONG = 160, 40
-"""Number of vertices around the x axis, and of rows along it (twice for rounded shapes)."""
+"""The number of vertices around the x axis, and the number of vertex rows along the x axis. Rounded
+shapes have twice as many rows."""
 PLANE_CELLS = 64
 MAX_EDGE_M = 0.004
-"""Maximum edge length of the triangles of a mesh object after subdivision."""
+"""The maximum edge length of the triangles of a mesh object after subdivision."""
 NEAREST_VERTICES = 3
-"""Number of skin vertices near a point whose triangles are searched for its nearest point."""
+"""The number of skin vertices near a point whose triangles are searched for the nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrueObject:
-    """Mesh of the virtual object's surface at one time.
+    """A mesh of the virtual object's surface at one time.
 
     vertices: (vertices, 3) in the world frame; they are doubled along sharp edges.
     triangles: (triangles, 3) indices of vertices, facing outward.
@@ -48,7 +49,7 @@ class TrueObject:
 
 
 class TrueBody:
-    """Virtual object of a scene, of any shape; a plane is the rectangle that can be touched."""
+    """The virtual object of a scene, of any shape; a plane is the rectangle that can be touched."""
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object
@@ -81,15 +82,15 @@ class TrueBody:
     ) -> TrueObject:
         """Return the deformed object: each point moves with the nearest point of the skin at rest.
 
-        skin_vertices: (skin vertices, 3) at rest.
-        displacement: (skin vertices, 3), interpolated linearly in skin_triangles (triangles, 3).
+        skin_vertices: (skin vertices, 3) at rest, m.
+        displacement: (skin vertices, 3), m, interpolated linearly in skin_triangles (triangles, 3).
 
-        Raises ValueError if the displacement belongs to another skin, or if no triangle of the skin
-        has an area.
+        Raises ValueError if displacement and skin have different shapes, or if no triangle of the
+        skin has an area.
         """
         if displacement.shape != skin_vertices.shape:
             raise ValueError(
-                f"displacement has {len(displacement)} vertices, but the skin has "
+                f"the displacement has {len(displacement)} vertices, but the skin has "
                 f"{len(skin_vertices)}; give both from the same mesh"
             )
         corners, weights = self._on_skin(skin_vertices, skin_triangles)
@@ -98,9 +99,9 @@ class TrueBody:
     def _on_skin(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer]
     ) -> tuple[Indices, Floats]:
-        """Return, for each vertex of the object, three skin vertices and their weights.
+        """Return three skin vertices (vertices, 3) and weights (vertices, 3) per object vertex.
 
-        Both arrays are (vertices, 3). They are cached until the skin changes.
+        Both arrays are cached until the skin changes.
         """
         key = skin_vertices.tobytes() + skin_triangles.tobytes()
         if self._skin is None or self._skin[0] != key:
@@ -121,10 +122,10 @@ class TrueBody:
 
 
 def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
-    """Find the nearest point of a mesh to each of some points (points, 3).
+    """Find the point of a mesh that is nearest to each of the points (points, 3).
 
-    Return the corners (points, 3) of its triangle and its barycentric weights (points, 3). Raises
-    ValueError if no triangle has an area.
+    Return the triangle corners (points, 3) and barycentric weights (points, 3) of the nearest
+    points. Raises ValueError if no triangle has an area.
     """
     triangles = triangles[~find_degenerate(vertices, triangles)]
     if not len(triangles):
@@ -154,10 +155,10 @@ def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices
 
 
 def _strip(rows: int, around: int) -> Indices:
-    """Return the triangles between successive rings of `around` vertices each.
+    """Return the triangles (n, 3) between successive rings of `around` vertices each.
 
-    They face outward if the rings are ordered along +x and the vertices of a ring from +z towards
-    +y.
+    The triangles face outward if the rings are ordered along +x and the vertices of a ring from +z
+    towards +y.
     """
     i, j = (v.ravel() for v in np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij"))
     here, beside = i * around + j, i * around + (j + 1) % around
@@ -207,7 +208,8 @@ def _rectangle(width_m: float, height_m: float) -> tuple[Floats, Indices]:
 def _directions() -> Floats:
     """Return unit vectors (directions, 3) that cover the sphere.
 
-    They are ordered in rows around the x axis, from -x to +x; -x and +x themselves come last.
+    The vectors are ordered in rows around the x axis, from -x to +x. The vectors -x and +x come
+    last.
     """
     polar = np.pi * np.arange(1, 2 * ALONG) / (2 * ALONG)
     rows = np.sin(polar)[:, None, None] * _turned()
@@ -216,7 +218,7 @@ def _directions() -> Floats:
 
 
 def _star(vertices: Floats) -> tuple[Floats, Indices]:
-    """Return vertices and triangles of a closed surface with one vertex per `_directions`."""
+    """Return vertices and triangles of a closed surface with one vertex per direction vector."""
     rows, count = 2 * ALONG - 1, len(vertices)
     first, last = np.arange(AROUND), (rows - 1) * AROUND + np.arange(AROUND)
     caps = [_fan(first, count - 2), _fan(last[::-1], count - 1)]
@@ -224,10 +226,9 @@ def _star(vertices: Floats) -> tuple[Floats, Indices]:
 
 
 def _cast_rays(geometry: Geometry, shape: Shape) -> Floats:
-    """Return the points (directions, 3) where rays from the centre leave a solid.
+    """Return the points (directions, 3), m, where rays from the centre leave a solid.
 
-    The rays have the directions `_directions`. The solid must be star-shaped: each of its points
-    must be visible from the centre.
+    The solid must be star-shaped: each of its points must be visible from the centre.
     """
     away = _directions()
     match geometry:

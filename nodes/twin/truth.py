@@ -35,19 +35,20 @@ from flexsheet.nodes.node import NodeParameters
 
 
 class SimulatorParameters(NodeParameters):
-    """Parameters of a simulator node; no other nodes receive the apparatus."""
+    """The parameters of a simulator node, which only simulators have."""
 
     apparatus: Apparatus | None = Field(
         default=None,
-        description="true hardware parameters, set by `--apparatus`; null: those of the scene",
+        description="true hardware parameters, set by `--apparatus`; null: the true parameters are "
+        "those of the scene",
     )
 
 
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
-    """Return how much later the projector shows a frame than its renderer assumes, s.
+    """Return the true time at which the projector shows a frame, minus the assumed time, s.
 
-    The assumed latency is that of the frame, or the nominal one if no frame was displayed. Without
-    an apparatus, the renderer's assumption is true.
+    The renderer's assumed latency is stored in the frame; without a displayed frame, it is the
+    nominal latency. The result is 0 without an apparatus.
     """
     if apparatus is None:
         return 0.0
@@ -58,11 +59,11 @@ def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> fl
 
 
 def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
-    """Return the scene with the true devices; if there is no apparatus, return the scene itself.
+    """Return the scene with the true devices, or the scene itself if there is no apparatus.
 
-    Everything that is not a device remains unchanged, since it is virtual or a requirement. The
-    returned camera still has the lenses of its data sheet; `make_true_camera` adds the deviations
-    of the individual device.
+    Virtual objects and requirements in the scene are unchanged. The returned camera has the lenses
+    of its data sheet plus the apparatus offsets; `make_true_camera` adds the deviations of the
+    individual camera.
     """
     if apparatus is None:
         return scene
@@ -167,7 +168,8 @@ def _true_arm(arm: ArmSpec, truth: ArmTruth) -> ArmSpec:
 def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[float, ...]) -> Pose:
     """Return a pose that is translated in its parent frame and rotated about its own origin.
 
-    If the rotation is zero, the angles are returned unchanged, without rounding error.
+    shift_m: translation (3,). rotation_rad: rotation vector (3,); zero leaves the angles exactly
+    unchanged.
     """
     rpy_rad = pose.rpy_rad
     if any(rotation_rad):
@@ -179,9 +181,10 @@ def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[fl
 def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
     """Return the same hardware, described in the world frame that the stereo camera defines.
 
-    Calibrations define the world by the left camera, so that its pose in the scene is exact. The
+    Calibrations define the world by the left camera, whose pose in the scene is then exact. The
     pose errors of the camera therefore become opposite pose errors of arms, projector and eyes. The
-    finger's path, the direction of gravity and the finger's tilt are kept in the new world frame.
+    finger's path, the direction of gravity and the finger's tilt have the same coordinates in the
+    new world frame.
     """
     nominal = apparatus.nominal or devices_of(scene)
     true_scene = apply_apparatus(scene, apparatus)

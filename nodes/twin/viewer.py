@@ -2,44 +2,74 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from dataclasses import dataclass
+from typing import Self
 
+import numpy as np
+
+from flexsheet.messages.apparatus import EyesTruth
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Side
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rotation_from_vector
 from flexsheet.nodes.twin.eye import Rays, first_hits
-from flexsheet.nodes.twin.head import HeadSway
+from flexsheet.nodes.twin.finger import SineSum
 from flexsheet.nodes.twin.membrane import DeformedSheet
 
-Floats = NDArray[np.float64]
+MIN_SWAY_FREQUENCY_RATIO = 0.1
+"""The lowest frequency of the head's sway, relative to the highest frequency."""
 
 ALIGNMENT_RAD = 1e-3
-"""Standard deviation per axis of the angle between two points that appear aligned to an eye.
+"""The standard deviation per axis of the angle between two points that appear aligned to an eye.
 
-A bead 0.13 m in front of a sheet at 0.4 m is out of focus by 1.2 dioptres. With a pupil of 3 mm it
-appears as a disc of 3.6 mrad. A person can locate its centre to about a quarter of this diameter.
+A bead 0.13 m in front of a sheet at 0.4 m is out of focus by 1.2 dioptres. With a pupil of 3 mm the
+bead appears as a disc of 3.6 mrad. A person can locate the centre of the disc to about a quarter of
+this diameter.
 """
 
 
+@dataclass(frozen=True, slots=True)
+class HeadSway:
+    """The slow random motion of a person's head, as a function of time.
+
+    sway_m: standard deviation per axis.
+    """
+
+    sway_m: float
+    noise: SineSum
+
+    @classmethod
+    def drawn(cls, eyes: EyesTruth, seed: int) -> Self | None:
+        """Generate the random motion for true eye parameters; return None for a head at rest."""
+        if not eyes.sway_m:
+            return None
+        band_hz = (MIN_SWAY_FREQUENCY_RATIO * eyes.sway_frequency_hz, eyes.sway_frequency_hz)
+        return cls(eyes.sway_m, SineSum.drawn(band_hz, np.random.default_rng(seed)))
+
+    def at(self, time_s: float) -> Floats:
+        """Return the displacement (3,) of the eyes at `time_s`, m."""
+        return np.asarray(self.sway_m * self.noise.at(time_s)[0])
+
+
 class Viewer:
-    """Person with the eyes of `true_scene`; sway: motion of the head, or None if it is at rest."""
+    """A person who has the true eyes of a scene and aligns points by sight."""
 
     def __init__(
         self, true_scene: Scene, sway: HeadSway | None, random: np.random.Generator
     ) -> None:
+        """Store the eyes of the scene and the motion of the head, None for a head at rest."""
         self._eyes, self._sway, self._random = true_scene.eyes, sway, random
 
     def locate_eye(self, side: Side, time_s: float) -> Floats:
-        """Return the world position (3,) of an eye at a time, m."""
+        """Return the world position (3,) of an eye at `time_s`, m."""
         aside_m = (0.5 if side == "right" else -0.5) * self._eyes.interocular_m
         moved = np.zeros(3) if self._sway is None else self._sway.at(time_s)
         return np.asarray(self._eyes.centre_world_m + aside_m * np.eye(3)[0] + moved)
 
     def align(self, side: Side, bead: Floats, sheet: DeformedSheet, time_s: float) -> Floats | None:
-        """Return the point (3,) of the sheet that an eye sees behind a bead (3,), in the world, m.
+        """Return the world point (3,), m, of the sheet that an eye sees behind a bead (3,).
 
-        The point contains a random alignment error. Returns None if the sheet is not behind the
+        The point contains a random alignment error. Return None if the sheet is not behind the
         bead.
         """
         eye = self.locate_eye(side, time_s)
