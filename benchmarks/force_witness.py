@@ -47,6 +47,8 @@ Ints = NDArray[np.int64]
 
 MAX_DEPTH = 1.5
 """Maximum depth, in finger radii, at which the programs are compared."""
+SUMMARY_DEPTH_MM = 2.0
+"""Minimum depth of the summary; at smaller depths the two meshes are too coarse."""
 MESHES = SCALES[:2]
 """Scales of the two meshes."""
 SUBDIVISIONS = 4
@@ -231,6 +233,15 @@ def compare(scene: Scene, depths: Sequence[float]) -> list[dict[str, float]]:
     return rows
 
 
+def summarize(rows: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Return the largest difference and the largest uncertainty from SUMMARY_DEPTH_MM on, in %."""
+    deep = [row for row in rows if row["depth_mm"] > SUMMARY_DEPTH_MM - 0.01]
+    return {
+        "max_difference_percent": max(abs(row["difference_percent"]) for row in deep),
+        "max_uncertainty_percent": max(row["calculix_uncertainty_percent"] for row in deep),
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", nargs="?", type=Path, default=SCENE_FILE)
@@ -239,7 +250,7 @@ def main() -> None:
     rows = compare(load_scene(given.scene), [depth for depth in DEPTHS if depth < MAX_DEPTH])
     if given.json:
         version = subprocess.run(["ccx", "-v"], capture_output=True, text=True, check=False).stdout
-        print(json.dumps({"version": version.strip(), "rows": rows}))
+        print(json.dumps({"version": version.strip(), **summarize(rows), "rows": rows}))
         return
     for row in rows:
         print(
