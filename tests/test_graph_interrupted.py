@@ -83,13 +83,20 @@ def test_ctrl_c_at_any_moment_leaves_nothing(runs_folder: Path, words: str) -> N
 
 
 @pytest.mark.parametrize(
-    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
+    ("number", "words"),
+    [
+        (signal.SIGINT, "starting the nodes"),
+        *(
+            pytest.param(number, "waiting for the soft body", marks=pytest.mark.long)
+            for number in (signal.SIGINT, signal.SIGTERM)
+        ),
+    ],
 )
-def test_an_interrupted_demo_leaves_nothing(runs_folder: Path, number: int) -> None:
+def test_an_interrupted_demo_leaves_nothing(runs_folder: Path, number: int, words: str) -> None:
     settings = [part for setting in on_ports(free_ports()) for part in ("--set", setting)]
     settings += ["--set", "fem_solver.compute_table=false"]
     demo = start(runs_folder, "demo", "--output", str(runs_folder / "demo"), *settings)
-    read_until(demo, "waiting for the soft body")
+    read_until(demo, words)
     code, rest = end(demo, number)
     assert code == 1, rest
     assert "interrupted" in rest
