@@ -13,7 +13,7 @@ SOURCES := flexsheet messages nodes launch benchmarks website
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: setup demo try test test-long lint cached bench bench-gpu bench-peers faults deploy-trial soak fuzz limits load tune-scenes \
+.PHONY: setup demo try test test-parallel test-long lint cached bench bench-gpu bench-peers faults deploy-trial soak fuzz limits load tune-scenes \
 	pages charts \
 	docs lock release clean
 
@@ -62,24 +62,28 @@ lint: $(DEV_STAMP)
 	$(BIN)/python -m tests.check_words
 	$(BIN)/mypy
 
-# Compute results that each test process would otherwise compute: the sheet's deflection shapes,
-# and the bytecode of the package and the tests, whose assertions pytest rewrites.
+# Write the bytecode of the package and the tests, whose assertions pytest rewrites; each test process
+# would otherwise compile them.
 cached: $(DEV_STAMP)
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m compileall -q $(SOURCES)
-	$(BIN)/flexsheet precompute launch/scenes/cylinder.yaml
 	PYTHONDONTWRITEBYTECODE= $(BIN)/pytest --collect-only -qq > /dev/null || true  # the tests report errors
 
-# Tests marked `alone` depend on timing and run one at a time; the others run in parallel. Both parts
-# run, even if the first fails. The last lines list the skipped tests with the reasons. BLAS uses one
-# thread, because more would compete with the processes that tests start.
+# BLAS uses one thread, because more would compete with the processes that tests start.
+test-parallel: cached
+	OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= SKIPPED_FILE=$(SKIPPED) \
+		$(BIN)/pytest -m "not alone and not long" --durations=25 --numprocesses $(WORKERS) \
+		--dist worksteal
+
+# Tests marked `alone` depend on timing and run one at a time; the others run in parallel, beside the
+# linters. Both parts run, even if the first fails. The last lines list the skipped tests with the
+# reasons.
 test: $(DEV_STAMP)
 	@$(BIN)/python -m tests.system_packages --tests
 	@mkdir -p build && : > $(SKIPPED)
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint cached
 	@status=0; \
-	export OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= SKIPPED_FILE=$(SKIPPED); set -x; \
-	$(BIN)/pytest -m "not alone and not long" --durations=25 --numprocesses $(WORKERS) --dist worksteal \
+	$(MAKE) --no-print-directory --keep-going --jobs=2 --output-sync=line lint test-parallel \
 		|| status=$$?; \
+	export OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= SKIPPED_FILE=$(SKIPPED); set -x; \
 	$(BIN)/pytest -m "alone and not long" --durations=15 $$(grep -l mark.alone tests/test_*.py) \
 		|| status=$$?; \
 	{ set +x; } 2> /dev/null; \
