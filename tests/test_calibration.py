@@ -344,14 +344,15 @@ def test_untilted_boards_do_not_determine_a_rig(tmp_path: Path) -> None:
     """With frontal boards only, focal length and distance are not observable."""
     pictures = Pictures([], [])
     middle = board_points(BOARD).mean(axis=0)
+    left_rays, right_rays = rays_of(LEFT_MATRIX), rays_of(RIGHT_MATRIX)
     for number in range(6):
         place = np.array([0.05 + 0.01 * (number % 3), 0.01 * (number % 2), 0.45]) - middle
-        for paths, matrix, camera_from_left in (
-            (pictures.left, LEFT_MATRIX, np.eye(4)),
-            (pictures.right, RIGHT_MATRIX, rigid.transform(np.eye(3), [-0.1, 0.0, 0.0])),
+        for paths, side, rays, camera_from_left in (
+            (pictures.left, "left", left_rays, np.eye(4)),
+            (pictures.right, "right", right_rays, rigid.transform(np.eye(3), [-0.1, 0.0, 0.0])),
         ):
-            paths.append(tmp_path / f"{len(paths)}{matrix[0, 0]:.0f}.png")
-            picture = render(rigid.transform(np.eye(3), place), rays_of(matrix), camera_from_left)
+            paths.append(tmp_path / f"{side}{len(paths)}.png")
+            picture = render(rigid.transform(np.eye(3), place), rays, camera_from_left)
             cv2.imwrite(str(paths[-1]), picture)
     with pytest.raises(CalibrationError, match=r"do not determine the rig.*tilt of the board"):
         calibrate(pictures.left, pictures.right)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ from flexsheet.messages.apparatus import Apparatus, identify_scene, nominal_appa
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.base import Header
 from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.marker_calibration import MarkerCalibration
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import ArmState
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
@@ -260,11 +262,17 @@ def test_the_reported_edges_yield_to_the_tension_of_the_sheet() -> None:
     assert right.values[:, 0] == pytest.approx([0.126] * 2, abs=1e-6)
 
 
-def test_the_marker_is_calibrated_in_the_usual_orientation_of_the_finger() -> None:
-    """The triangulator assumes `direction_world`, so the offset must contain the finger's tilt."""
+@cache
+def fit_tilted_marker() -> tuple[Apparatus, MarkerCalibration]:
+    """Fit the marker offset of a finger that is tilted against its usual orientation."""
     given = changed("finger", marker_from_pad_m=[1e-3, -1e-3, 0.010], finger_tilt_rad=[0.2, -0.15])
     touches = simulate_touches(SCENE, given, calibration=load_calibration(OPTICS), seed=1)
-    found = fit_marker(touches, SCENE, "twin")
+    return given, fit_marker(touches, SCENE, "twin")
+
+
+def test_the_marker_is_calibrated_in_the_usual_orientation_of_the_finger() -> None:
+    """The triangulator assumes `direction_world`, so the offset must contain the finger's tilt."""
+    given, found = fit_tilted_marker()
     used_m = world_from_finger(SCENE.finger.direction_world) @ np.array(found.marker_from_pad_m)
     true_m = find_marker_offset(given)
     assert np.abs(used_m - true_m).max() < 3.0 * max(found.standard_deviations_m)
@@ -463,9 +471,7 @@ def test_predicted_errors_match_errors_drawn_from_the_same_uncertainties() -> No
     """The reference draws fingertip errors without the evaluator: marker and timestamp."""
     covariance_m2 = 1e-8 * np.array([[4.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
     optics = load_calibration(OPTICS)
-    given = changed("finger", marker_from_pad_m=[1e-3, -1e-3, 0.010])
-    touches = simulate_touches(SCENE, given, calibration=optics, seed=1)
-    marker = fit_marker(touches, SCENE, "twin").model_copy(
+    marker = fit_tilted_marker()[1].model_copy(
         update={"covariance_m2": tuple(map(tuple, covariance_m2.tolist()))}
     )
     known = Knowledge(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from flexsheet.launch.calibration.edge_fit import EdgeFitError, HeldPose, fit_edges
+from flexsheet.launch.calibration.edge_fit import EdgeFit, EdgeFitError, HeldPose, fit_edges
 from flexsheet.launch.calibration.edge_marks import (
     ALONG,
     COLUMNS,
@@ -23,6 +24,7 @@ from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import ArmsTruth, ArmTruth, CameraTruth, nominal_apparatus
 from flexsheet.messages.calibration import load_calibration
 from flexsheet.messages.scene import ArmSpec, Scene
+from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
@@ -61,16 +63,22 @@ def draw_edges(random: np.random.Generator, stretch: float) -> tuple[Any, Any]:
     return place_edges(pose, stretch * SCENE.sheet.width_m)
 
 
+@cache
 def held_poses(seed: int) -> tuple[Any, list[HeldPose]]:
     # The camera's own errors are left out, since they are common to marks and finger.
     apparatus = sample_apparatus(SCENE, seed).model_copy(update={"camera": CameraTruth()})
     return apparatus, simulate_edge_marks(SCENE, apparatus, calibration=OPTICS, seed=seed)
 
 
+@cache
+def fitted_edges(seed: int) -> dict[Side, EdgeFit]:
+    return fit_edges(held_poses(seed)[1], SCENE)
+
+
 @pytest.mark.parametrize("seed", [3, pytest.param(11, marks=pytest.mark.long)])
 def test_fitted_arms_hold_the_edges_where_they_are_commanded(seed: int) -> None:
-    apparatus, poses = held_poses(seed)
-    fits = fit_edges(poses, SCENE)
+    apparatus, _ = held_poses(seed)
+    fits = fitted_edges(seed)
     measured = with_arms(SCENE, **{side: fit.arm for side, fit in fits.items()})
     random = np.random.default_rng(seed + 1000)
     errors: dict[str, list[float]] = {"before": [], "after": []}
@@ -143,7 +151,7 @@ def test_one_wrong_mark_hardly_matters() -> None:
         first.marks[0], position_world_m=first.marks[0].position_world_m + np.array([0, 8e-3, 0])
     )
     corrupted = [replace(first, marks=(wrong, *first.marks[1:])), *poses[1:]]
-    clean, other = fit_edges(poses, SCENE)["left"].arm, fit_edges(corrupted, SCENE)["left"].arm
+    clean, other = fitted_edges(3)["left"].arm, fit_edges(corrupted, SCENE)["left"].arm
     arms = [ArmGeometry(with_arms(SCENE, left=arm), "left") for arm in (clean, other)]
     joints = poses[3].left_rad
     one, two = (arm.world_from_edge(joints)[:3, 3] for arm in arms)

@@ -341,9 +341,13 @@ def few_pushes(monkeypatch: pytest.MonkeyPatch) -> None:
 async def test_the_table_is_made_while_the_linear_method_answers(
     few_pushes: None, tmp_path: Path
 ) -> None:
+    small = scene(
+        geometry={"shape": "cylinder", "radius_m": 0.028, "length_m": 0.06},
+        world_from_object={"position_m": [0.0, 0.0, -0.028], "rpy_rad": [0.0, 0.0, 0.0]},
+    )
     bench = Bench(cache_dir=tmp_path, method="nonlinear_table", workers=1)
     await bench.node.setup()
-    await bench.node.step("scene", scene(), header())
+    await bench.node.step("scene", small, header())
     tip = fingertip((0.0, 0.0, -0.003))
     first = await bench.push(tip)
     assert first.method == "linear"
@@ -367,7 +371,7 @@ async def test_the_table_is_made_while_the_linear_method_answers(
     # from now on it is there from the start, and for who leaves the choice to the node
     again = Bench(cache_dir=tmp_path)
     await again.node.setup()
-    await again.node.step("scene", scene(), header())
+    await again.node.step("scene", small, header())
     answer = await again.push(tip)
     assert answer.method == "nonlinear_table"
     assert answer.displacement_world_m.tobytes() == first.displacement_world_m.tobytes()

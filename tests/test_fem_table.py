@@ -60,7 +60,7 @@ def coarse() -> Iterator[None]:
         patch.setattr(snapshots, "FINE_DEPTHS_M", (0.0015, 0.003))
         patch.setattr(snapshots, "SPACING_RATIO", 1.0)
         patch.setattr(snapshots, "STATIONS", (0.0, 0.6))
-        patch.setattr(snapshots, "ANGLE_STEP_RAD", 0.5)
+        patch.setattr(snapshots, "ANGLE_STEP_RAD", 0.9)
         patch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
         yield
 

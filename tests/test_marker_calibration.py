@@ -23,7 +23,6 @@ from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, CameraTruth, FingerTruth
-from flexsheet.messages.calibration import load_calibration
 from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.marker_calibration import load_marker_calibration
 from flexsheet.messages.types import Fingertip, StereoPair
@@ -174,15 +173,6 @@ def make_apparatus() -> Apparatus:
     return Apparatus(scene=SCENE.name, finger=finger)
 
 
-def test_simulated_touches_give_the_apparatus_offset() -> None:
-    touches = simulate_touches(
-        SCENE, make_apparatus(), calibration=load_calibration(OPTICS), seed=3
-    )
-    fit = fit_marker(touches)
-    assert np.abs(fit.marker_from_pad_m - OFFSET_M).max() < 5e-4
-    assert fit.residual_rms_m < 5e-4
-
-
 async def test_the_calibrated_fingertip_is_the_pad(tmp_path: Path) -> None:
     file, truth = tmp_path / "marker.yaml", tmp_path / "apparatus.yaml"
     truth.write_text("scene: cylinder\nfinger:\n  marker_from_pad_m: [0.012, 0.002, 0.008]\n")
@@ -256,6 +246,7 @@ def test_exactly_one_source_is_required(tmp_path: Path) -> None:
     assert "--rows CSV and --twin SCENE" in str(result.exception)
 
 
+@pytest.mark.long
 def test_a_marker_on_the_nail_is_found_in_the_orientations_of_touches() -> None:
     """Drawn in front of a round finger, it was found in 6 of 24 orientations."""
     drawn = sample_apparatus(SCENE, 1)

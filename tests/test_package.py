@@ -85,9 +85,9 @@ def test_no_module_is_imported_under_two_names(tmp_path: Path) -> None:
         "for name in NODES: node_class(name)\n"
         "print(json.dumps(sorted(sys.modules)))"
     )
-    for path in (str(ROOT), str(tmp_path)):
-        loaded = json.loads(run_python(code, tmp_path, path).splitlines()[-1])
-        assert not [name for name in loaded if name.split(".")[0] in FOLDERS]
+    path = os.pathsep.join((str(tmp_path), str(ROOT)))
+    loaded = json.loads(run_python(code, tmp_path, path).splitlines()[-1])
+    assert not [name for name in loaded if name.split(".")[0] in FOLDERS]
 
 
 def test_sources_import_the_package_by_its_name() -> None:

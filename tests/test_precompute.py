@@ -26,6 +26,7 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     indentation shapes, which take longest."""
     monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.002, 0.0025, 0.003))
     monkeypatch.setattr(snapshots, "FINE_DEPTHS_M", (0.0015, 0.003))
+    monkeypatch.setattr(snapshots, "FINE_RATIO", 1.0)
     monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
     monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
     monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)

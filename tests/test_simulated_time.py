@@ -46,7 +46,7 @@ def follow(lag_ms: float, *, lag_known: bool = False, hz: float = 0.6) -> dict[s
     arms = {side: {"servo_lag_s": 1e-3 * lag_ms} for side in ("left", "right")}
     apparatus = Apparatus.model_validate({"scene": "cylinder", "arms": arms})
     return follow_in_simulated_time(
-        SCENE, swing(0.006, hz, 4.0), apparatus, LoopSettings(lag_known=lag_known)
+        SCENE, swing(0.006, hz, 3.0), apparatus, LoopSettings(lag_known=lag_known)
     )
 
 
