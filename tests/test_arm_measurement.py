@@ -31,7 +31,7 @@ from flexsheet.nodes.twin.arms import (
     Servo,
 )
 from tests.arm_states import connect_control
-from tests.examples import examples
+from tests.examples import examples, long_except
 from tests.rv_1a import (
     JOINT_SPEED_RAD_PER_S,
     SPEED_RAD_PER_S,
@@ -182,7 +182,7 @@ def assert_no_leap(arms: Arms) -> None:
         assert arm.max_tool_speed <= MAX_TOOL_SPEED
 
 
-@pytest.mark.parametrize("reading", READINGS)
+@pytest.mark.parametrize("reading", long_except(READINGS, offset, lagging))
 def test_no_arm_leaps_by_a_false_measurement(reading: Callable[[ServoArm], Reading]) -> None:
     """The same holds after the fault, after a reset with a false measurement, and later."""
     arms = servo_pair()

@@ -20,7 +20,7 @@ from flexsheet.nodes.arm_bridge.goal import Goal
 from flexsheet.nodes.arm_bridge.link import ArmFault, ArmStatus, Floats
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from tests.arm_states import arm_state
-from tests.examples import examples
+from tests.examples import examples, long_except
 from tests.test_arm_control import HOME, STEP_S, Arm, distance, on_time, pair, run, sheet_at
 from tests.test_arm_loop import SCENE_FILE
 
@@ -110,7 +110,7 @@ def trip_watchdog(arm: Arm) -> None:
     arm.control.on_measurement(arm.joints, (ArmFault.WATCHDOG,))
 
 
-@pytest.mark.parametrize("problem", [lose_arm, trip_watchdog])
+@pytest.mark.parametrize("problem", long_except([lose_arm, trip_watchdog], trip_watchdog))
 def test_an_arm_that_was_away_comes_back_standing(problem: Callable[[Arm], None]) -> None:
     arms = following()
     problem(arms[0])

@@ -183,6 +183,7 @@ def drawn(rig: Floats, points: Floats) -> tuple[Floats, Floats]:
     return np.asarray(left), np.asarray(right[:, 0])
 
 
+@pytest.mark.long
 def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
     """For independent noise, the errors of 40 fits scatter as each fit estimates."""
     true = numbers_of(make_true_camera(scene_camera()))

@@ -70,6 +70,7 @@ async def test_the_renderer_draws_each_mark_where_its_message_says(stereo: Stere
     np.testing.assert_allclose(frame.marks_world_m[:, :2], PLACES, atol=6e-4)
 
 
+@pytest.mark.long
 async def test_a_moved_projector_is_named_from_images() -> None:
     """Project marks on the simulated sheet, and let the triangulator find them in images."""
     reported = []

@@ -220,6 +220,7 @@ def test_row_of_figure_11(bench: CorrectionBench) -> None:
     assert 20.0 < mean_mm(bench, "none", bench.situation(turn, None), tilt_sizes) < 28.0
 
 
+@pytest.mark.long
 def test_row_of_figure_13(bench: CorrectionBench) -> None:
     """Pushed by 50 mm, four triangles reduce the paper's ten mm and more to a few millimetres."""
     pushed = bench.situation(*bench.pushed(0.05))

@@ -44,6 +44,7 @@ def small_scene() -> Scene:
     return Scene.model_validate(content)
 
 
+@pytest.mark.long
 def test_every_method_is_compared_with_a_finer_newton(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

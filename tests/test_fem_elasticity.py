@@ -196,7 +196,7 @@ def test_error_falls_with_the_third_power_of_the_element_size() -> None:
     """The boundary values are those of a smooth equilibrium field: the gradient of a harmonic
     potential."""
     errors = []
-    for n in (2, 4, 8):
+    for n in (3, 6):
         nodes, elements = box((n, n, n), (1.0, 1.0, 1.0))
         x, y, z = nodes.T
         exact = np.column_stack([np.cos(2 * x) * np.cosh(2 * y), np.sin(2 * x) * np.sinh(2 * y), z])

@@ -50,9 +50,10 @@ from flexsheet.nodes.fem_solver.mesh.quality import (
 from flexsheet.nodes.fem_solver.mesh.smoothing import _distortion
 from flexsheet.nodes.fem_solver.mesh.solid import SUBTRIANGLES, add_midside_nodes, orient_tetrahedra
 from flexsheet.nodes.models.shapes import make_shape
-from tests.examples import examples
+from tests.examples import examples, long_except
 from tests.linear_elasticity import solve, stiffness_matrix
 from tests.scenes import load_values
+from tests.shared import compute_once
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -109,7 +110,7 @@ def rotated_pose(rpy_rad: list[float]) -> dict[str, Any]:
 
 @cache
 def mesh(name: str, spacing: float = SPACING) -> SolidMesh:
-    return mesh_scene(scene(SHAPES[name]), spacing)
+    return compute_once(f"mesh-{name}-{spacing}", lambda: mesh_scene(scene(SHAPES[name]), spacing))
 
 
 def solid_volume(solid: SolidMesh) -> float:
@@ -216,7 +217,7 @@ def test_volume_and_area_are_the_shapes(name: str, volume_error: float, area_err
     assert hull_area(solid, boundary_faces(solid.elements)) == pytest.approx(area, rel=area_error)
 
 
-@pytest.mark.parametrize("name", ["sphere", "ellipsoid"])
+@pytest.mark.parametrize("name", long_except(["sphere", "ellipsoid"], "sphere"))
 def test_volume_converges_with_curved_elements(name: str) -> None:
     volume, _ = expected(SHAPES[name])
     coarse, fine = (abs(solid_volume(mesh(name, h)) / volume - 1) for h in (0.007, FINER))
@@ -236,7 +237,7 @@ def test_skin_nodes_lie_on_the_surface_and_normals_are_its(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SHAPES)
-@pytest.mark.parametrize("spacing", [SPACING, FINER])
+@pytest.mark.parametrize("spacing", long_except([SPACING, FINER], SPACING))
 def test_the_skin_is_as_fine_as_asked_where_fingers_go(name: str, spacing: float) -> None:
     solid = mesh(name, spacing)
     faces = solid.contact_nodes[solid.contact_faces]
@@ -248,7 +249,7 @@ def test_the_skin_is_as_fine_as_asked_where_fingers_go(name: str, spacing: float
     assert neighbours.max() <= 2.0 * spacing
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", long_except(SHAPES, "sphere", "cylinder"))
 def test_behind_and_below_the_mesh_is_coarser(name: str) -> None:
     solid = mesh(name, 0.0035)
     front = solid.contact_nodes[solid.contact_faces]
@@ -303,7 +304,7 @@ def test_about_a_focus_a_cylinders_mesh_leans_to_no_side(angle_rad: float) -> No
     assert min_jacobian_ratios(mesh.nodes, mesh.elements).min() > MIN_JACOBIAN_RATIO
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", long_except(SHAPES, "sphere", "cylinder", "mesh"))
 def test_the_same_scene_gives_the_same_mesh(name: str) -> None:
     first, again = mesh(name), build_mesh(mesh_spec(scene(SHAPES[name]), SPACING))
     for part in ("nodes", "elements", "fixed", "skin", "contact_nodes", "contact_faces"):
@@ -377,7 +378,7 @@ def test_a_liver_is_meshed() -> None:
     assert hull_area(solid, boundary_faces(solid.elements)) == pytest.approx(area, rel=0.08)
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", long_except(SHAPES, "sphere", "cylinder"))
 def test_the_number_of_nodes_is_foreseen(name: str) -> None:
     for spacing in (SPACING, FINER):
         budget = mesh_budget(mesh_spec(scene(SHAPES[name]), spacing))
@@ -385,7 +386,7 @@ def test_the_number_of_nodes_is_foreseen(name: str) -> None:
         assert budget.bytes > 1000 * budget.nodes
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", long_except(SHAPES, "sphere", "plane"))
 def test_a_base_holds_the_lowest_skin(name: str) -> None:
     support = {"kind": "base", "height_m": 0.012, "down_world": [0.0, -2.0, 0.0]}
     one = scene(SHAPES[name], support=support)
@@ -397,7 +398,7 @@ def test_a_base_holds_the_lowest_skin(name: str) -> None:
     require_sound(solid)
 
 
-@pytest.mark.parametrize("name", ["sphere", "cylinder", "mesh"])
+@pytest.mark.parametrize("name", long_except(["sphere", "cylinder", "mesh"], "sphere", "cylinder"))
 def test_patches_hold_the_skin_within(name: str) -> None:
     # turned about x: a cylinder's mesh frame is turned back, the patches turn with the object
     place = rotated_pose([0.4, 0.0, 0.0])
@@ -438,7 +439,7 @@ def test_a_strip_holds_what_faces_away(name: str) -> None:
     assert (solid.fixed[solid.skin] == (angle <= 0.75 + 1e-9)).all()
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", long_except(SHAPES, "sphere", "rounded_box", "mesh"))
 def test_a_push_on_every_shape_goes_in_and_is_held(name: str) -> None:
     solid = mesh(name, 0.008) if name == "plane" else mesh(name)
     stiffness = stiffness_matrix(
@@ -558,7 +559,7 @@ def test_a_lattice_fills_its_box_with_outward_diagonals() -> None:
     places=st.lists(st.tuples(*[st.floats(-1, 1)] * 3), min_size=1, max_size=4),
     depth=st.integers(1, 4),
 )
-@settings(max_examples=20, deadline=None)
+@examples(8)
 def test_bisection_conforms_with_three_shapes_only(
     places: list[tuple[float, float, float]], depth: int
 ) -> None:

@@ -12,6 +12,7 @@ from scipy.special import ellipk, ellipkinc
 
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from tests.examples import long_except
 from tests.fem_fields import dofs_of, equilibrium, lame, relative_errors, surface_loads
 from tests.fem_verification import Record, at_most, between, near
 from tests.linear_elasticity import solve, stiffness_matrix
@@ -265,7 +266,10 @@ def test_cooks_membrane_nearly_incompressible(record_property: Record) -> None:
     near(record_property, what, cook_mixed_tip(nu), published, 0.005)
 
 
-@pytest.mark.parametrize(("nu", "low"), [(0.3, 0.99), (0.45, 0.985), (0.49, 0.97), (0.499, 0.965)])
+@pytest.mark.parametrize(
+    ("nu", "low"),
+    long_except([(0.3, 0.99), (0.45, 0.985), (0.49, 0.97), (0.499, 0.965)], (0.499, 0.965)),
+)
 def test_locking_grows_towards_incompressibility(
     record_property: Record, nu: float, low: float
 ) -> None:
@@ -279,6 +283,7 @@ def test_locking_grows_towards_incompressibility(
     between(record_property, what, tip / cook_mixed_tip(nu), low, 1.0)
 
 
+@pytest.mark.long
 def test_cooks_membrane_at_large_strain(record_property: Record) -> None:
     """A neo-Hookean panel with nu = 0.4999, whose corner rises by 40 % of the end's height, locks
     like the linear one.

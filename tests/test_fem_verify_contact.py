@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.fem_solver import newton
 from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from tests.examples import long_except
 from tests.fem_fields import dofs_of
 from tests.fem_verification import Record, at_most, between, near
 from tests.half_space import half_space
@@ -34,7 +35,7 @@ def boussinesq(points: Floats, force: float, nu: float) -> Floats:
     return np.column_stack([aside * points[:, 0], aside * points[:, 1], -down])
 
 
-@pytest.mark.parametrize("nu", [0.3, 0.45, 0.499])
+@pytest.mark.parametrize("nu", long_except([0.3, 0.45, 0.499], 0.45))
 def test_point_load_on_a_half_space(record_property: Record, nu: float) -> None:
     """A quarter of a block has the half-space's displacement on its outer faces. The test measures
     the indentation around the load, and its decrease with the distance.
@@ -144,6 +145,7 @@ def sunk_at(r: float, patch: float, force: float) -> float:
     return float((1 - NU**2) / E * pressure / (2 * patch) * bend)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("penalty", "name", "off"),
     [pytest.param(HARD, "hard", 0.04, marks=pytest.mark.long), (SHIPPED, "own", 0.1)],
@@ -187,6 +189,7 @@ def test_light_pushes_follow_hertz(
     between(record_property, f"Hertz, power of force, {name} bed", float(power), 1.45, 1.55)
 
 
+@pytest.mark.long
 def test_what_the_bed_costs_is_known(record_property: Record) -> None:
     """With the solver's penalty, the skin penetrates the finger by less than a hundredth of its
     radius. For a light contact this is significant, and reduces the force at the same depth.

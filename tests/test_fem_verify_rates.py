@@ -101,6 +101,7 @@ def test_linear_rates(record_property: Record) -> None:
     at_most(record_property, "linear, L2 error of the finest mesh", errors[-1][0], 1e-3)
 
 
+@pytest.mark.long
 def test_neo_hookean_rates(record_property: Record) -> None:
     """The same waves are used with strains up to a third in the neo-Hookean body.
 

@@ -32,7 +32,7 @@ from flexsheet.nodes.twin.gestures import (
     tap_fast,
 )
 from flexsheet.nodes.twin.paths import map_to_surface, recorded_path
-from tests.examples import examples
+from tests.examples import examples, long_except
 from tests.scenes import load_values
 
 Floats = NDArray[np.float64]
@@ -96,7 +96,7 @@ gestures = pytest.mark.parametrize("gesture", GESTURES.values(), ids=GESTURES)
 
 @gestures
 @given(scene=scenes(), seed=st.integers(0, 99))
-@examples(4)
+@examples(2)
 def test_a_gesture_keeps_to_the_scenes_speed_and_volume(
     gesture: Gesture, scene: Scene, seed: int
 ) -> None:
@@ -115,7 +115,7 @@ def test_position_and_velocity_are_continuous_and_acceleration_is_a_hands(gestur
     path = gesture(SCENE)
     motion = motion_on(path, SCENE)
     step = 1e-4
-    times = np.arange(0.0, path.times_s[-1] + 0.6, 5e-3)
+    times = np.arange(0.0, path.times_s[-1] + 0.6, 1e-2)
     here, there = ([motion.at(time + after) for time in times] for after in (0.0, step))
     positions, velocities = (
         [np.array([getattr(state, name) for state in states]) for states in (here, there)]
@@ -244,10 +244,10 @@ def test_lines_with_rounded_corners_would_miss_that_reach() -> None:
     assert missed[1] < 1e-6
 
 
-@gestures
-def test_halving_the_samples_changes_no_gesture(gesture: Gesture) -> None:
+@pytest.mark.parametrize("name", long_except(GESTURES, "stroke-push", "tap", "circle"))
+def test_halving_the_samples_changes_no_gesture(name: str) -> None:
     """The samples describe the whole motion."""
-    path = gesture(SCENE)
+    path = GESTURES[name](SCENE)
     whole = validate_path(path.times_s, path.positions_world_m, "spline")
     keep = np.unique(np.append(np.arange(0, len(path.times_s), 2), len(path.times_s) - 1))
     half = validate_path(path.times_s[keep], path.positions_world_m[keep], "spline")

@@ -154,6 +154,7 @@ def test_without_noise_the_base_is_found_exactly(side: Side) -> None:
     assert all(one.reason == "" for one in fit.residuals)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("noise_px", "joint_noise_rad"),
     [

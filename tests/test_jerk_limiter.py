@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
 from flexsheet.nodes.models.rigid import is_rigid, transform, transform_from_rpy
 from flexsheet.nodes.planner.jerk_limiter import JerkBounds, JerkLimitedState, step_sheet
+from tests.examples import examples
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
@@ -35,7 +36,7 @@ def at(place: Floats, velocity: Floats | None = None) -> SheetMotion:
 
 
 @given(st.floats(1e-5, 0.3))
-@settings(max_examples=40, deadline=None)
+@examples(15)
 def test_a_still_target_is_reached_and_hardly_passed(distance: float) -> None:
     motion, places = START, []
     for _ in range(400):

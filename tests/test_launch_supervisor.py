@@ -421,6 +421,7 @@ def contains_estop(bag: Path) -> bool:
     return "estop" in BagReader(bag).topics
 
 
+@pytest.mark.long
 async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None:
     nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
     plan = load_graph(write(tmp_path, nodes, hosts=HOSTS), record=tmp_path / "a.mcap")

@@ -26,6 +26,7 @@ from flexsheet.nodes.triangulator.marker import (
     window_around,
 )
 from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
+from tests.examples import long_except
 from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
@@ -146,7 +147,10 @@ def drawn(
     return discs
 
 
-@pytest.mark.parametrize(("radius_px", "motion_px"), [(1.6, 0.0), (3.2, 0.0), (3.2, 4.0), (6.0, 0)])
+@pytest.mark.parametrize(
+    ("radius_px", "motion_px"),
+    long_except([(1.6, 0.0), (3.2, 0.0), (3.2, 4.0), (6.0, 0)], (1.6, 0.0), (3.2, 0.0), (6.0, 0)),
+)
 def test_the_fit_is_near_the_bound_with_a_true_covariance(
     radius_px: float, motion_px: float
 ) -> None:

@@ -136,6 +136,7 @@ def as_bytes(frames: list[Any]) -> list[bytes]:
     return [bytes(frame) for frame in frames]
 
 
+@examples(25)
 @given(messages, headers, st.sampled_from([0, 64, 1024]))
 def test_round_trip(message: Message, header: Header, inline_bytes: int) -> None:
     frames = as_bytes(encode(message, header, inline_bytes=inline_bytes))

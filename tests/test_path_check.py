@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -26,6 +26,7 @@ from flexsheet.nodes.arm_bridge.path_check import (
 )
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform_from_rpy
+from tests.examples import examples
 from tests.test_arm_control import (
     HOME,
     SCENE,
@@ -216,7 +217,7 @@ shift = st.tuples(st.floats(-0.12, 0.12), st.floats(-0.15, 0.15), st.floats(-0.1
 lean = st.tuples(st.floats(-1.2, 1.2), st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
 
 
-@settings(max_examples=6, deadline=None)
+@examples(3)
 @example(shift=(0.0, 0.0, 0.125), lean=(0.0, 0.5, 0.0), stretch=1.0)
 @given(shift=shift, lean=lean, stretch=st.floats(0.9, 1.1))
 def test_a_clear_path_is_followed_without_a_fault_and_both_bridges_agree(

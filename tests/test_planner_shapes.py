@@ -37,7 +37,7 @@ from flexsheet.nodes.planner.contact_state import (
     UnpresentableError,
 )
 from flexsheet.nodes.planner.trajectory import PlannedStep
-from tests.examples import examples
+from tests.examples import examples, long_except
 from tests.plans import STEP_S, STILL, PlannerHarness, scene_with
 from tests.shared import compute_once
 
@@ -637,10 +637,10 @@ def object_way_m(planned: list[PlannedStep]) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-@pytest.mark.parametrize("name", ["cylinder", "sphere", "ellipsoid", "box", "meshed"])
 @pytest.mark.parametrize(
-    "deepest_share", [*(pytest.param(share, marks=pytest.mark.long) for share in (0.1, 0.4)), 0.8]
+    "name", long_except(["cylinder", "sphere", "ellipsoid", "box", "meshed"], "cylinder", "meshed")
 )
+@pytest.mark.parametrize("deepest_share", long_except((0.1, 0.4, 0.8), 0.8))
 def test_stroking_while_pushing_neither_steps_nor_slips(name: str, deepest_share: float) -> None:
     """A finger strokes back and forth and pushes in and out simultaneously, to a fraction of the
     radius."""

@@ -279,6 +279,7 @@ def test_another_sheet_or_finger_has_another_file_and_another_modulus_has_not(
         assert (other != own) == differs
 
 
+@pytest.mark.long
 def test_the_family_of_shapes_distinguishes_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(deflection_cache, "load_or_compute", lambda scene, folder: few_dents())
     shallow = SCENE.working_range.model_copy(update={"push_depth_m": 0.02})

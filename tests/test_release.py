@@ -109,6 +109,7 @@ def test_the_wheel_contains_every_file_of_the_package(wheel: Path) -> None:
     assert sorted(set(tracked) - names) == []
 
 
+@pytest.mark.long
 def test_the_wheel_runs_without_a_checkout(installed: Environment, tmp_path: Path) -> None:
     assert installed.run("flexsheet", "--version", cwd=tmp_path) == f"flexsheet {VERSION}\n"
     read = json.loads(installed.run("python", "-c", READ_ALL, cwd=tmp_path).splitlines()[-1])

@@ -46,6 +46,8 @@ from tests.colours import luminance
 
 LONELY = ("scene", "fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "status",
           "twin/finger", "stereo", "twin/eye", "frame", "bookmark", "estop")  # fmt: skip
+SHORT = ("scene", "fingertip", "arm_left", "status", "stereo")
+"""Topics that a bag lacks in `make test`."""
 
 
 @pytest.fixture(scope="module")
@@ -411,7 +413,15 @@ def test_text_has_the_contrast_of_wcag_aa(scheme: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "leave_out", [*((name,) for name in LONELY), LONELY], ids=lambda names: "+".join(names)[:20]
+    "leave_out",
+    [
+        *(
+            pytest.param((name,), marks=() if name in SHORT else pytest.mark.long)
+            for name in LONELY
+        ),
+        LONELY,
+    ],
+    ids=lambda names: "+".join(names)[:20],
 )
 def test_a_bag_may_lack_any_topic(
     tmp_path: Path, leave_out: tuple[str, ...], monkeypatch: pytest.MonkeyPatch

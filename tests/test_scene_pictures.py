@@ -25,6 +25,7 @@ from flexsheet.nodes.renderer.object_surface import DeformationTransfer, VertexN
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from flexsheet.nodes.twin.true_object import TrueBody
+from tests.examples import long_except
 from tests.fingertips import fingertip
 
 Floats = NDArray[np.float64]
@@ -252,6 +253,12 @@ async def chain(case: Case) -> AsyncIterator[Chain]:
     await chain.eye.close()
 
 
+@pytest.mark.parametrize(
+    "case",
+    long_except(SCENES, *(path for path in SCENES if path.stem in ("cylinder", "organ"))),
+    indirect=True,
+    ids=lambda path: path.stem,
+)
 async def test_the_eye_sees_what_it_ought_to(chain: Chain) -> None:
     picture = await chain.picture("flat")
     seen, expected = picture.seen[..., 0] / 255.0, picture.expected[..., 0] / 255.0
@@ -263,6 +270,7 @@ async def test_the_eye_sees_what_it_ought_to(chain: Chain) -> None:
         assert width == pytest.approx(wanted, abs=0.5)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", [path for path in SCENES if path.stem == "organ"], indirect=True)
 async def test_a_deformed_object_is_seen_as_deformed(chain: Chain, case: Case) -> None:
     rest = await chain.picture("soft")

@@ -90,9 +90,9 @@ def around(axes: tuple[float, float, float], count: int = 600) -> Floats:
     [
         ((RADIUS,) * 3, 2, 0.15, 3e-5, 0.05),
         ((RADIUS,) * 3, 3, 0.02, 3e-6, 0.02),
-        ((RADIUS,) * 3, 4, 0.003, 2e-7, 0.005),
+        pytest.param((RADIUS,) * 3, 4, 0.003, 2e-7, 0.005, marks=pytest.mark.long),
         (AXES, 3, 2.0, 1e-4, 0.2),
-        (AXES, 4, 0.4, 2e-5, 0.1),
+        pytest.param(AXES, 4, 0.4, 2e-5, 0.1, marks=pytest.mark.long),
     ],
 )
 def test_the_error_against_a_known_surface_is_bounded(

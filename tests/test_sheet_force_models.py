@@ -112,6 +112,7 @@ def test_a_sheet_of_another_form_is_outside() -> None:
     assert "square" in ScaledSheetModel(tall).invalid_reason(SheetPush(1.05, RADIUS), 0.012)
 
 
+@pytest.mark.long
 def test_a_slack_sheet_answers_with_the_cube_of_the_depth() -> None:
     law = ScaledSheetModel(RUBBER)
     assert force(law, 1.0, 0.02) == pytest.approx(8.0 * force(law, 1.0, 0.01), rel=1e-9)

@@ -38,6 +38,7 @@ SHEET = SheetSpec(
 RADIUS = 0.007
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("stretch", "place"),
     [

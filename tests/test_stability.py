@@ -36,6 +36,7 @@ from flexsheet.nodes.models.hand_loop import (
 from flexsheet.nodes.planner.oscillation_watchdog import FADE_S, OscillationWatchdog
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
+from tests.examples import long_except
 from tests.hand_bounds import make_bounds_60_hz
 from tests.test_planner import SCENE
 
@@ -91,7 +92,7 @@ def test_the_state_over_a_period_is_that_of_small_steps(delay_s: float) -> None:
         held += step_s * rate
 
 
-@pytest.mark.parametrize("towards", [True, False])
+@pytest.mark.parametrize("towards", long_except([True, False], True))
 def test_the_predicted_boundary_is_that_of_the_simulation(towards: bool) -> None:
     hands = draw_hands(1, 7)
     trials = [

@@ -339,6 +339,7 @@ def test_a_graph_without_image_or_force_has_no_error_of_them() -> None:
     assert point["image_mm"] is point["force_percent"] is point["exposure_to_light_ms"] is None
 
 
+@pytest.mark.long
 def test_methods_change_the_errors_of_the_stages_that_they_belong_to() -> None:
     scene = load_scene(SCENES / "rigid-plane.yaml")
     calibrations = NodeCalibrations.of(load_graph(DEMO_FILE))

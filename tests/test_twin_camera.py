@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -262,7 +262,7 @@ def centre_and_spread(light: Floats) -> tuple[Floats, Floats]:
 
 
 @given(offset=st.tuples(*[st.floats(-0.06, 0.06)] * 2))
-@settings(max_examples=10, deadline=None)
+@examples(4)
 def test_a_second_marker_is_at_the_requested_position(
     rig: StereoCamera, plain: TwinCamera, offset: tuple[float, float]
 ) -> None:
@@ -294,7 +294,7 @@ def test_a_highlight_overlaps_the_marker_as_requested(
 
 
 @given(share=st.floats(0.0, 1.0))
-@settings(max_examples=12, deadline=None)
+@examples(5)
 def test_an_occluder_hides_the_requested_fraction_of_the_marker(
     rig: StereoCamera, plain: TwinCamera, share: float
 ) -> None:
@@ -312,7 +312,7 @@ def test_a_wholly_covered_marker_leaves_nothing_in_that_view(rig: StereoCamera) 
 
 
 @given(defocus_px=st.floats(0.0, 4.0))
-@settings(max_examples=10, deadline=None)
+@examples(4)
 def test_out_of_focus_the_marker_spreads_as_in_optics_and_keeps_its_light(
     rig: StereoCamera, plain: TwinCamera, defocus_px: float
 ) -> None:
@@ -499,13 +499,14 @@ def disc_misfit(p: Floats, image: Image, x0: int, y0: int) -> Floats:
     return np.asarray(((image[y, x] - level) / EVEN.noise(level.astype(np.float32))).ravel())
 
 
+@pytest.mark.long
 def test_a_most_likely_fit_reaches_the_bound_and_does_not_beat_it(disc: TwinCamera) -> None:
     bound = fingertip_bound(disc, still, exposure_s=0.0)
     place = disc.eyes[0].see(TIP + BESIDE)[0]
     x0, y0 = np.rint(place).astype(int)
     guess = np.array([*place, 3.2, 0.75, 40.0, 175.0])
     found = []
-    for _ in range(300):
+    for _ in range(200):
         image, _ = disc.picture(still, exposure_s=0.0)
         found.append(least_squares(disc_misfit, guess, args=(image, x0, y0)).x[:2] - place)
     spread = np.mean(np.square(found - np.mean(found, axis=0)))

@@ -42,6 +42,7 @@ from flexsheet.messages.topics import TOPICS, find_topic
 from flexsheet.messages.types import Skin, SoftBody, Status, StereoPair
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from tests.arm_states import arm_state
+from tests.examples import long_except
 from tests.fingertips import fingertip
 from tests.scenes import CYLINDER_FILE, load_cylinder
 from tests.waiting import DEADLINE_S, until
@@ -404,7 +405,7 @@ def test_the_command_prints_address_and_layout(
     assert "choose another port" in str(refused.exception)
 
 
-@pytest.mark.parametrize("connected", [False, True])
+@pytest.mark.parametrize("connected", long_except([False, True], True))
 async def test_ctrl_c_ends_the_command_at_once(short_folder: Path, connected: bool) -> None:
     (short_folder / "plan.json").write_text(load_plan(short_folder).model_dump_json())
     process = await asyncio.create_subprocess_exec(
