@@ -202,9 +202,15 @@ async def test_a_status_that_is_repeated_makes_no_arm_leap(
     [
         ("silent", "no answer"),
         ("slow", "no answer"),
-        ("exception", "Modbus exception 4"),
-        ("bad_crc", "its CRC is wrong"),
-        ("old_version", "register map version 0, not 1"),
+        # tests/test_modbus.py tests the error texts of these.
+        *(
+            pytest.param(fault, words, marks=pytest.mark.long)
+            for fault, words in (
+                ("exception", "Modbus exception 4"),
+                ("bad_crc", "its CRC is wrong"),
+                ("old_version", "register map version 0, not 1"),
+            )
+        ),
         ("repeated", "answer to command"),
     ],
 )
@@ -313,7 +319,13 @@ def without(listeners: Listeners, topics: tuple[str, ...], keep: int) -> Listene
     }
 
 
-@pytest.mark.parametrize("topics", [("sheet_target",), ("sheet_target", "arm_left", "arm_right")])
+@pytest.mark.parametrize(
+    "topics",
+    [
+        pytest.param(("sheet_target",), marks=pytest.mark.long),
+        ("sheet_target", "arm_left", "arm_right"),
+    ],
+)
 async def test_a_network_cut_between_the_computers_holds_then_stops_then_continues(
     topics: tuple[str, ...],
 ) -> None:
