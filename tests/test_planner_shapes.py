@@ -88,11 +88,11 @@ def bowl() -> dict[str, Any]:
     """Return a block of 100 x 100 mm with a concave top of 60 mm radius, z = r^2 / 2R."""
     import trimesh
 
-    ticks = np.linspace(-0.05, 0.05, 41)
+    ticks = np.linspace(-0.05, 0.05, 31)
     x, y = (part.ravel() for part in np.meshgrid(ticks, ticks, indexing="ij"))
     top = np.column_stack([x, y, (x * x + y * y) / 0.12])
     bottom = np.column_stack([x, y, np.full(len(x), -0.03)])
-    cells = np.arange(41 * 41).reshape(41, 41)
+    cells = np.arange(len(x)).reshape(len(ticks), -1)
     a, b, c, d = (
         part.ravel() for part in (cells[:-1, :-1], cells[1:, :-1], cells[1:, 1:], cells[:-1, 1:])
     )
