@@ -23,6 +23,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
+from benchmarks.fault_timeline import FaultTimeline
 from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, LIGHT, Lab, missing
 from tests.lab_bags import Arm, Floats, Gap, Times, gaps, measure_hold, read_arm, wanted
@@ -153,8 +154,11 @@ def longest_away_s(reported: list[tuple[float, set[str]]], span: Span) -> float:
     return longest_s
 
 
-async def matrix(lab: Lab, only: str) -> list[Result]:
-    """Run all faults, or those whose name contains `only`."""
+async def matrix(lab: Lab, only: str, *, timeline: bool = False) -> list[Result]:
+    """Run all faults, or those whose name contains `only`.
+
+    timeline: print the events after each fault.
+    """
     await lab.start_all()
     lab.stroke()
     results = []
@@ -162,7 +166,10 @@ async def matrix(lab: Lab, only: str) -> list[Result]:
     async def case(name: str, work: Work) -> None:
         if only not in name:
             return
-        result = await run_fault(lab, name, work)
+        async with FaultTimeline(lab) as recorded:
+            result = await run_fault(lab, name, work)
+        if timeline:
+            print(recorded.describe(result.during_ns[0] * 1e-9), file=sys.stderr)
         print(json.dumps(asdict(result)), file=sys.stderr, flush=True)
         results.append(result)
 
@@ -321,6 +328,7 @@ async def main() -> int:
         metavar="WORD",
         help="part of the names of the faults or, with --random, of the kinds of faults",
     )
+    parser.add_argument("--timeline", action="store_true", help="print the events after faults")
     parser.add_argument("--light", action="store_true", help="without soft body and renderer")
     parser.add_argument("--hold-after", type=float, metavar="S", help="of both bridges, s")
     parser.add_argument("--stop-after", type=float, metavar="S", help="of both bridges, s")
@@ -340,7 +348,7 @@ async def main() -> int:
     patience = {"hold_after_s": given.hold_after, "stop_after_s": given.stop_after}
     patience = {name: value for name, value in patience.items() if value is not None}
     async with Lab(without=LIGHT if given.light else (), **patience) as lab:
-        results = await matrix(lab, given.only)
+        results = await matrix(lab, given.only, timeline=given.timeline)
         for process in lab.launchers.values():
             process.send_signal(signal.SIGINT)
         for process in lab.launchers.values():
