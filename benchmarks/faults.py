@@ -19,11 +19,15 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
+import psutil
+
 from benchmarks.fault_timeline import FaultTimeline
+from flexsheet.launch.running.runs import RUN_VARIABLE
 from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, LIGHT, Lab, missing
 from tests.lab_bags import Arm, Floats, Gap, Times, gaps, measure_hold, read_arm, wanted
@@ -214,17 +218,31 @@ async def kill(lab: Lab, host: str, node: str, span: Span) -> None:
 
 
 async def kill_launcher(lab: Lab, host: str, span: Span) -> None:
-    """Kill the launcher with its nodes, and restart it as systemd does."""
-    process = lab.launchers[host]
+    """Kill the launcher, and restart it when its nodes have ended, as systemd does.
+
+    The time counts from the restart. systemd's pause before it (RestartSec, 2 s) is left out.
+    """
+    process, directory = lab.launchers[host], lab.run_directory(host)
+    assert directory is not None
     span.killed_side = host if host in SIDES else None
     span.begin()
     process.kill()
     await asyncio.to_thread(process.wait)
-    await asyncio.sleep(4.0)
+    await lab.until(lambda: not is_run_alive(directory.name), f"the nodes of {host} to end")
     span.end()
     span.killed_side = None
     lab.start(host)
     await lab.watch_usual(host)
+
+
+def is_run_alive(run_id: str) -> bool:
+    """Return whether a process of the run exists."""
+    for process in psutil.process_iter():
+        # Processes may end in the meantime.
+        with suppress(psutil.Error):
+            if process.environ().get(RUN_VARIABLE) == run_id:
+                return True
+    return False
 
 
 def worst_gaps(lost: list[Gap], results: list[Result]) -> list[Gap | None]:

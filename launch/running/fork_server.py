@@ -51,7 +51,7 @@ class ForkedProcess:
         self.returncode: int | None = None
 
     def wait(self) -> int:
-        """Reap the process, and return its exit code; minus the signal's number if it was killed."""
+        """Reap the process; return its exit code, or minus the signal that has ended it."""
         if self.returncode is None:
             _, status = os.waitpid(self.pid, 0)
             self.returncode = os.waitstatus_to_exitcode(status)
@@ -172,6 +172,7 @@ def serve(socket_fd: int) -> str:
     if os.getppid() != int(os.environ[PARENT_VARIABLE]):
         sys.exit("the launcher has exited")
     with socket.socket(fileno=socket_fd) as control:
+        import_module("flexsheet.nodes.runner")
         _import_nodes(json.loads(control.recv(REQUEST_BYTES)))
         if len(os.listdir("/proc/self/task")) > 1:
             sys.exit("a module has started a thread, so this process cannot be forked")
@@ -201,10 +202,9 @@ def serve(socket_fd: int) -> str:
 
 
 def _import_nodes(types: Iterable[str]) -> None:
-    """Import the runner and the modules of the node types of this package."""
+    """Import the modules of those node types that belong to this package."""
     from flexsheet.nodes import NODES, node_class
 
-    import_module("flexsheet.nodes.runner")
     for name in types:
         if name not in NODES:
             continue

@@ -18,7 +18,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Callable, Collection
 from functools import partial
@@ -105,6 +104,7 @@ class Child:
         environment: dict[str, str],
         lifeline: int,
         report: Report,
+        *,
         fork_server: ForkServer | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
@@ -469,14 +469,15 @@ class RunningGraph:
         self._run = create_run()
         if swept:
             self._report(LAUNCHER, f"ended {len(swept)} processes of earlier launchers")
+        self._lifeline = os.pipe()
+        if self._processes:
+            # It imports modules while this process prepares the run.
+            self._start_fork_server()
         _check_ports(self.plan, self._host)
         if self.plan.keys:
             self._rings = make_rings(self.plan, self.run, self._host)
             self._keys_watch = asyncio.create_task(self._watch_keys(), name="keys")
         self._write_run_files()
-        self._lifeline = os.pipe()
-        if self._processes:
-            self._start_fork_server()
         if self._host in (None, MAIN):
             self._publish_latched("scene", self.plan.scene_message())
             self._publish_latched("twin/apparatus", self.plan.apparatus_message())
@@ -686,6 +687,7 @@ class RunningGraph:
         if server is not None and not await server.is_ready():
             if self._fork_server is not None:
                 self._fork_server = None
+                server.close()
                 self._report(LAUNCHER, f"nodes are started without {FORK_SERVER}; see its log")
             server = None
         child = Child(
@@ -694,7 +696,7 @@ class RunningGraph:
             {**self._environment(), **nice},
             self._lifeline[0],
             self._report,
-            server,
+            fork_server=server,
         )
         self._children[process.name] = child
         return child
