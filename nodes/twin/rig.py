@@ -137,10 +137,10 @@ def slopes_of(lens: Lens, pixels: Floats) -> Floats:
     is injective.
     """
     x_px, y_px = pixels[..., 0], pixels[..., 1]
-    # Separate arrays, because numpy computes with contiguous ones several times faster.
+    # Separate arrays, because numpy is about twice as fast with contiguous ones.
     u, v = (x_px - lens.cx_px) / lens.fx_px, (y_px - lens.cy_px) / lens.fy_px
     for _ in range(NEWTON_STEPS):
-        seen_x, seen_y = _seen(lens, u, v)
+        seen_x, seen_y = project_ray(lens, u, v)
         off_u, off_v = (seen_x - x_px) / lens.fx_px, (seen_y - y_px) / lens.fy_px
         xx, xy, yy = _slopes_of_distortion(lens, u, v)
         determinant = xx * yy - xy * xy
