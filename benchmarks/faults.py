@@ -19,10 +19,15 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
+import psutil
+
+from benchmarks.fault_timeline import FaultTimeline
+from flexsheet.launch.running.runs import RUN_VARIABLE
 from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, LIGHT, Lab, missing
 from tests.lab_bags import Arm, Floats, Gap, Times, gaps, measure_hold, read_arm, wanted
@@ -153,8 +158,11 @@ def longest_away_s(reported: list[tuple[float, set[str]]], span: Span) -> float:
     return longest_s
 
 
-async def matrix(lab: Lab, only: str) -> list[Result]:
-    """Run all faults, or those whose name contains `only`."""
+async def matrix(lab: Lab, only: str, *, timeline: bool = False) -> list[Result]:
+    """Run all faults, or those whose name contains `only`.
+
+    timeline: print the events after each fault.
+    """
     await lab.start_all()
     lab.stroke()
     results = []
@@ -162,7 +170,10 @@ async def matrix(lab: Lab, only: str) -> list[Result]:
     async def case(name: str, work: Work) -> None:
         if only not in name:
             return
-        result = await run_fault(lab, name, work)
+        async with FaultTimeline(lab) as recorded:
+            result = await run_fault(lab, name, work)
+        if timeline:
+            print(recorded.describe(result.during_ns[0] * 1e-9), file=sys.stderr)
         print(json.dumps(asdict(result)), file=sys.stderr, flush=True)
         results.append(result)
 
@@ -207,17 +218,31 @@ async def kill(lab: Lab, host: str, node: str, span: Span) -> None:
 
 
 async def kill_launcher(lab: Lab, host: str, span: Span) -> None:
-    """Kill the launcher with its nodes, and restart it as systemd does."""
-    process = lab.launchers[host]
+    """Kill the launcher, and restart it when its nodes have ended, as systemd does.
+
+    The time counts from the restart. systemd's pause before it (RestartSec, 2 s) is left out.
+    """
+    process, directory = lab.launchers[host], lab.run_directory(host)
+    assert directory is not None
     span.killed_side = host if host in SIDES else None
     span.begin()
     process.kill()
     await asyncio.to_thread(process.wait)
-    await asyncio.sleep(4.0)
+    await lab.until(lambda: not is_run_alive(directory.name), f"the nodes of {host} to end")
     span.end()
     span.killed_side = None
     lab.start(host)
     await lab.watch_usual(host)
+
+
+def is_run_alive(run_id: str) -> bool:
+    """Return whether a process of the run exists."""
+    for process in psutil.process_iter():
+        # Processes may end in the meantime.
+        with suppress(psutil.Error):
+            if process.environ().get(RUN_VARIABLE) == run_id:
+                return True
+    return False
 
 
 def worst_gaps(lost: list[Gap], results: list[Result]) -> list[Gap | None]:
@@ -321,6 +346,7 @@ async def main() -> int:
         metavar="WORD",
         help="part of the names of the faults or, with --random, of the kinds of faults",
     )
+    parser.add_argument("--timeline", action="store_true", help="print the events after faults")
     parser.add_argument("--light", action="store_true", help="without soft body and renderer")
     parser.add_argument("--hold-after", type=float, metavar="S", help="of both bridges, s")
     parser.add_argument("--stop-after", type=float, metavar="S", help="of both bridges, s")
@@ -340,7 +366,7 @@ async def main() -> int:
     patience = {"hold_after_s": given.hold_after, "stop_after_s": given.stop_after}
     patience = {name: value for name, value in patience.items() if value is not None}
     async with Lab(without=LIGHT if given.light else (), **patience) as lab:
-        results = await matrix(lab, given.only)
+        results = await matrix(lab, given.only, timeline=given.timeline)
         for process in lab.launchers.values():
             process.send_signal(signal.SIGINT)
         for process in lab.launchers.values():

@@ -28,7 +28,13 @@ import gc
 import os
 import sys
 
+# Importing `typing` would lengthen the start.
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from typing import NoReturn
+
 NODE_FLAG = "--node"
+FORK_SERVER_FLAG = "--fork-server"
 
 # Pydantic would search every installed package for plugins; none is used.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
@@ -37,14 +43,13 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 def main() -> None:
     """Run the command, or with `--node CONFIG` nodes, as the launcher does."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
-        from flexsheet.launch.running.child import apply_niceness, exit_with_parent
+        _run_node(sys.argv[2])
+    if len(sys.argv) == 4 and sys.argv[1] == FORK_SERVER_FLAG:
+        from flexsheet.launch.running.fork_server import serve
 
-        exit_with_parent()
-        apply_niceness()
         _shorten_imports()
-        from flexsheet.nodes.runner import main as run_node
-
-        sys.exit(run_node(sys.argv[2]))
+        # Only the processes that it forks return from `serve`.
+        _run_node(serve(int(sys.argv[2])))
     _avoid_garbage_collection()
     if sys.argv[1:3] == ["arms", "stop"]:
         # Importing the command line takes several times longer than sending the stop.
@@ -56,9 +61,23 @@ def main() -> None:
     run_command()
 
 
+def _run_node(config_file: str) -> NoReturn:
+    """Run the nodes of a configuration file, and end the process."""
+    from flexsheet.launch.running.child import apply_niceness, exit_with_parent
+
+    exit_with_parent()
+    apply_niceness()
+    _shorten_imports()
+    from flexsheet.nodes.runner import main as run_node
+
+    sys.exit(run_node(config_file))
+
+
 def _shorten_imports() -> None:
     """Shorten the imports of a node, until `nodes.runner` enables garbage collection again."""
     gc.disable()
+    if "structlog" in sys.modules:
+        return
     # Without `rich`, structlog leaves out its coloured tracebacks, which nodes do not print.
     sys.modules["rich"] = None  # type: ignore[assignment]  # makes `import rich` fail
     import structlog  # noqa: F401

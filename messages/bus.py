@@ -65,6 +65,9 @@ The largest such frame is the last one of a CURVE handshake.
 
 HANDSHAKE_MS = 5000
 REOPEN_DELAY_S = 0.5
+RECONNECT_MS = 100
+"""Maximum period of reconnection attempts; it delays all readers after the restart of a node."""
+
 WATCHED_RECONNECT_MS = 50
 """The maximum reconnection period for subscribers that report the end of a connection."""
 
@@ -791,7 +794,7 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         zmq.RCVHWM: length,
         zmq.LINGER: LINGER_MS,
         zmq.RECONNECT_IVL: 20,
-        zmq.RECONNECT_IVL_MAX: 500,
+        zmq.RECONNECT_IVL_MAX: RECONNECT_MS,
         # ZeroMQ closes connections that do not complete the handshake in this time.
         zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
     }

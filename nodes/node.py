@@ -287,6 +287,8 @@ class Node:
     """Whether the node is left out of a graph in which no other node reads its topics."""
     opens_devices: ClassVar[bool] = False
     """Whether the node opens devices, ports or files, so that a replay must not start it."""
+    late_modules: ClassVar[tuple[str, ...]] = ()
+    """Modules that the node imports only after its start, if parameters or messages require it."""
 
     async def settle(self) -> None:
         """Wait for the work that handlers have started; a replay awaits it after each step."""

@@ -153,6 +153,7 @@ class Lab:
         self.launch_file = self.folder / "launch" / "three.yaml"
         self.newest: dict[str, Message] = {}
         self.seen: list[tuple[str, Message]] = []
+        self.listeners: list[Callable[[str, Message], None]] = []
         self._write_launch_file(without, {"arming": arming, **bridge}, watchdog_s)
         self.launchers: dict[str, subprocess.Popen[bytes]] = {}
         self._subscribers: dict[str, list[Subscriber]] = {}
@@ -297,6 +298,8 @@ class Lab:
             self.newest[key] = message
             if isinstance(message, ArmState):
                 self.seen.append((topic, message))
+            for listener in self.listeners:
+                listener(key, message)
 
         return take
 
@@ -312,7 +315,7 @@ class Lab:
             await self.watch_usual(host)
 
     async def watch_usual(self, host: str) -> None:
-        arm = [f"arm_{host}"] if host != "main" else ["sheet_target", "twin/finger"]
+        arm = [f"arm_{host}"] if host != "main" else ["sheet_target", "fingertip", "twin/finger"]
         await self.watch(host, "host", *arm)
 
     def stroke(self) -> None:

@@ -374,7 +374,8 @@ async def test_a_node_that_ignores_signals_is_killed_with_its_children(
     plan = plan_of(tmp_path, beacon=beacon(parameters={"unreachable": True, "with_child": True}))
     async with RunningGraph(plan) as graph:
         await graph.wait_ready(DEADLINE_S)
-        assert len(processes_of(graph.run.id)) == 2
+        # The node, its child process, and the fork server.
+        assert len(processes_of(graph.run.id)) == 3
     assert graph.exit_codes == {"beacon": -signal.SIGKILL}
     wait_until(lambda: not processes_of(graph.run.id), "the killed child to be gone")
     assert_nothing_left(runs_root)
@@ -560,7 +561,8 @@ def test_a_killed_launcher_leaves_no_node_behind(
     process = start_command(started, "launch", str(write(tmp_path, nodes)))
     wait_for_words(process, "are ready")
     (run,) = runs.list_live_runs()
-    assert len(processes_of(run.id)) == 4
+    # Three nodes, a child process, and the fork server.
+    assert len(processes_of(run.id)) == 5
     process.kill()
     process.communicate(timeout=DEADLINE_S)
     wait_until(lambda: len(processes_of(run.id)) <= 2, "the nodes that listen to end")

@@ -18,7 +18,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections import deque
 from collections.abc import Callable, Collection
 from functools import partial
@@ -40,6 +39,7 @@ from flexsheet.launch.plans.plan_model import (
 )
 from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from flexsheet.launch.running.code_state import read_git_state
+from flexsheet.launch.running.fork_server import NODE_ARGUMENTS, ForkServer
 from flexsheet.launch.running.host import HostAgent
 from flexsheet.launch.running.keys import KeyWatch, make_rings
 from flexsheet.launch.running.priority import describe_nice_problem, min_nice_step
@@ -75,7 +75,10 @@ LIVENESS_PERIOD_S = 0.5
 STACK_DUMP_S = 0.5
 """The time between the request to a hanging node to log its call stacks and its end by SIGKILL."""
 
+FORK_SERVER = "fork-server"
 LOG_READ_BYTES = 65_536
+GROUP_REAPS, GROUP_REAP_S = 20, 0.1
+"""Attempts to reap the processes that a node has started, and the time between them, s."""
 
 Report = Callable[[str, str], None]
 """The function that is called with (node, line) for each log line; the launcher is "launch"."""
@@ -101,11 +104,13 @@ class Child:
         environment: dict[str, str],
         lifeline: int,
         report: Report,
+        *,
+        fork_server: ForkServer | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
         self._name, self._report = config.name, report
         name = config.name
-        config_file = run.directory / f"{name}.json"
+        config_file = config_path(run, name)
         self.ready: asyncio.Future[None] = self._loop.create_future()
         self.exited: asyncio.Future[int] = self._loop.create_future()
         self._partial = b""
@@ -120,21 +125,13 @@ class Child:
         try:
             with_pipe = config.model_copy(update={"ready_fd": ready_write})
             write_file(config_file, with_pipe.model_dump_json())
-            # During the start of Python, SIGINT would raise KeyboardInterrupt. The first statement
-            # of the process unblocks the signal.
-            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
-                self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", "flexsheet", "--node", str(config_file)],
-                    stdin=subprocess.DEVNULL,
-                    stdout=output_write,
-                    stderr=output_write,
-                    start_new_session=True,
-                    pass_fds=(ready_write, lifeline),
-                    env=environment,
-                )
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+            self._process = (
+                None
+                if fork_server is None
+                else fork_server.fork(config_file, environment, output_write, ready_write)
+            ) or _start_python(
+                config_file, environment, output_write, pass_fds=(ready_write, lifeline)
+            )
         except BaseException:
             os.close(self._output)
             os.close(self._ready_fd)
@@ -248,6 +245,7 @@ class Child:
             # Until the process is reaped, no other process gets the id of its process group.
             os.killpg(self.pid, signal.SIGKILL)
             self._process.wait()
+        self._reap_group(GROUP_REAPS)
         for fd in (self._pidfd, self._output, self._ready_fd):
             self._loop.remove_reader(fd)
         while self._read_output():
@@ -257,7 +255,37 @@ class Child:
         for fd in (self._pidfd, self._output, self._ready_fd):
             os.close(fd)
         self._close_logs()
-        self.exited.set_result(self._process.returncode)
+        self.exited.set_result(self._process.wait())
+
+    def _reap_group(self, tries: int) -> None:
+        """Reap the killed processes of the group, whose parent this process now is (subreaper)."""
+        try:
+            while os.waitpid(-self.pid, os.WNOHANG) != (0, 0):
+                pass
+        except ChildProcessError:
+            return
+        if tries and not self._loop.is_closed():
+            self._loop.call_later(GROUP_REAP_S, self._reap_group, tries - 1)
+
+
+def _start_python(
+    config_file: Path, environment: dict[str, str], output: int, *, pass_fds: tuple[int, int]
+) -> subprocess.Popen[bytes]:
+    # During the start of Python, SIGINT would raise KeyboardInterrupt. The first statement
+    # of the process unblocks the signal.
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return subprocess.Popen(
+            [*NODE_ARGUMENTS, "--node", str(config_file)],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            start_new_session=True,
+            pass_fds=pass_fds,
+            env=environment,
+        )
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
 
 
 class RunningGraph:
@@ -294,6 +322,7 @@ class RunningGraph:
         self._rings: dict[str, KeyRing] = {}
         self._keys_watch: asyncio.Task[None] | None = None
         self._lifeline: tuple[int, int] | None = None
+        self._fork_server: ForkServer | None = None
         self._stopping = False
 
     @property
@@ -405,6 +434,8 @@ class RunningGraph:
             self._publishers.clear()
             for agent in self._agents.values():
                 await agent.close()
+            if self._fork_server is not None:
+                await self._fork_server.stop()
             if self._lifeline is not None:
                 for fd in self._lifeline:
                     os.close(fd)
@@ -438,12 +469,15 @@ class RunningGraph:
         self._run = create_run()
         if swept:
             self._report(LAUNCHER, f"ended {len(swept)} processes of earlier launchers")
+        self._lifeline = os.pipe()
+        if self._processes:
+            # It imports modules while this process prepares the run.
+            self._start_fork_server()
         _check_ports(self.plan, self._host)
         if self.plan.keys:
             self._rings = make_rings(self.plan, self.run, self._host)
             self._keys_watch = asyncio.create_task(self._watch_keys(), name="keys")
         self._write_run_files()
-        self._lifeline = os.pipe()
         if self._host in (None, MAIN):
             self._publish_latched("scene", self.plan.scene_message())
             self._publish_latched("twin/apparatus", self.plan.apparatus_message())
@@ -588,7 +622,7 @@ class RunningGraph:
 
     async def _run_once(self, process: ResolvedProcess) -> str | None:
         """Run a process until it ends; return its failure as text, or None if there is no error."""
-        child = self._spawn(process)
+        child = await self._spawn(process)
         await asyncio.wait(
             (child.ready, child.exited),
             timeout=process.start_deadline_s,
@@ -642,27 +676,57 @@ class RunningGraph:
             child.end_hanging()
         return hangs
 
-    def _spawn(self, process: ResolvedProcess) -> Child:
+    async def _spawn(self, process: ResolvedProcess) -> Child:
         assert self._lifeline is not None  # made before any supervisor
+        nice = {NICE_VARIABLE: str(max(process.settings.nice, min_nice_step()))}
+        config = ProcessConfig(
+            name=process.name,
+            nodes=tuple(node_config(self.plan, node, self.run) for node in process.nodes),
+        )
+        server = self._fork_server
+        if server is not None and not await server.is_ready():
+            if self._fork_server is not None:
+                self._fork_server = None
+                server.close()
+                self._report(LAUNCHER, f"nodes are started without {FORK_SERVER}; see its log")
+            server = None
+        child = Child(
+            config,
+            self.run,
+            {**self._environment(), **nice},
+            self._lifeline[0],
+            self._report,
+            fork_server=server,
+        )
+        self._children[process.name] = child
+        return child
+
+    def _environment(self) -> dict[str, str]:
+        """Return the environment variables of all processes."""
+        assert self._lifeline is not None
         environment = {
             **os.environ,
             RUN_VARIABLE: self.run.id,
             PARENT_VARIABLE: str(os.getpid()),
             LIFELINE_VARIABLE: str(self._lifeline[0]),
-            NICE_VARIABLE: str(max(process.settings.nice, min_nice_step())),
             "PYTHONUNBUFFERED": "1",
             "PYTHONFAULTHANDLER": "1",
         }
         # The processes of the graph already use all cores; BLAS threads would compete with them.
         for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment.setdefault(variable, "1")
-        config = ProcessConfig(
-            name=process.name,
-            nodes=tuple(node_config(self.plan, node, self.run) for node in process.nodes),
-        )
-        child = Child(config, self.run, environment, self._lifeline[0], self._report)
-        self._children[process.name] = child
-        return child
+        return environment
+
+    def _start_fork_server(self) -> None:
+        assert self._lifeline is not None
+        with (self.run.logs / f"{FORK_SERVER}.log").open("ab", buffering=0) as log:
+            self._fork_server = ForkServer(
+                {node.type for node in self.nodes},
+                [config_path(self.run, name) for name in self._processes],
+                environment=self._environment(),
+                lifeline=self._lifeline[0],
+                log=log,
+            )
 
     def _write_run_files(self) -> None:
         """Write the files that the recorder stores and the files by which tools find the graph."""
@@ -699,6 +763,11 @@ class RunningGraph:
                 log.write(line + "\n")
         if self._report_to is not None:
             self._report_to(node, line)
+
+
+def config_path(run: Run, process: str) -> Path:
+    """Return the path of the configuration file of a process."""
+    return run.directory / f"{process}.json"
 
 
 def _only_reads(node: ResolvedNode) -> bool:

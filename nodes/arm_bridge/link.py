@@ -22,7 +22,7 @@ MAX_UNCHANGED_S = 0.05
 """The maximum time for which a controller's counters may stay unchanged: seven cycles of 7.1 ms.
 Two exchanges within one cycle may return the same counters."""
 
-MIN_PAUSE_S, MAX_PAUSE_S = 0.05, 1.0
+MIN_PAUSE_S, MAX_PAUSE_S = 0.05, 0.2
 """The minimum and the maximum pause before a driver opens a failed connection again."""
 
 _COUNTER_PERIOD = 2**32

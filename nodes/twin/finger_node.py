@@ -76,6 +76,7 @@ class TwinFingerNode(Node):
 
     role: ClassVar[NodeRole | None] = NodeRole.FINGER_SIMULATOR
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame", "twin__arms"})
+    late_modules: ClassVar[tuple[str, ...]] = ("scipy.special",)
     parameters: TwinFingerParameters
     scene: Input[Scene]
     frame: Input[Frame]

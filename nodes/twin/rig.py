@@ -136,15 +136,16 @@ def slopes_of(lens: Lens, pixels: Floats) -> Floats:
     The function inverts `pixels_of` by Newton's method. The result is valid wherever the distortion
     is injective.
     """
-    focal = np.array([lens.fx_px, lens.fy_px])
-    slopes = np.asarray((pixels - np.array([lens.cx_px, lens.cy_px])) / focal, dtype=np.float64)
+    x_px, y_px = pixels[..., 0], pixels[..., 1]
+    # Separate arrays, because numpy is about twice as fast with contiguous ones.
+    u, v = (x_px - lens.cx_px) / lens.fx_px, (y_px - lens.cy_px) / lens.fy_px
     for _ in range(NEWTON_STEPS):
-        off = (pixels_of(lens, slopes) - pixels) / focal
-        xx, xy, yy = _slopes_of_distortion(lens, slopes[..., 0], slopes[..., 1])
+        seen_x, seen_y = project_ray(lens, u, v)
+        off_u, off_v = (seen_x - x_px) / lens.fx_px, (seen_y - y_px) / lens.fy_px
+        xx, xy, yy = _slopes_of_distortion(lens, u, v)
         determinant = xx * yy - xy * xy
-        step_u = (yy * off[..., 0] - xy * off[..., 1]) / determinant
-        step_v = (xx * off[..., 1] - xy * off[..., 0]) / determinant
-        slopes = slopes - np.stack([step_u, step_v], axis=-1)
-        if np.abs(off).max(initial=0.0) < 1e-12:
+        u = u - (yy * off_u - xy * off_v) / determinant
+        v = v - (xx * off_v - xy * off_u) / determinant
+        if max(np.abs(off_u).max(initial=0.0), np.abs(off_v).max(initial=0.0)) < 1e-12:
             break
-    return slopes
+    return np.stack([u, v], axis=-1)
