@@ -215,7 +215,9 @@ async def test_a_monitor_that_is_not_there_is_named_with_those_that_are(
     await bench.node.setup()
     small = bench.scene.projector.model_copy(update={"width_px": 801})
     header = Header(1, 0, 0, "virtual", "test", 1)
-    with pytest.raises(WindowError, match=r"scene\.projector has 801x600.*supports only 800x600"):
+    with pytest.raises(
+        WindowError, match=r"scene\.projector has 801x600 px.*supports only 800x600"
+    ):
         bench.node.on_scene(bench.scene.model_copy(update={"projector": small}), header)
     await bench.node.close()
 

@@ -335,7 +335,7 @@ def test_a_target_that_makes_no_sense_is_a_fault(motion: SheetMotion, words: str
     ("motion", "words"),
     [
         (sheet_at(z=0.29), "outside the workspace|reach|joint ranges"),
-        (sheet_at(stretch=1.2), "the sheet is|edge force"),
+        (sheet_at(stretch=1.2), "mm long, maximum 260.4 mm|the edge force is"),
     ],
 )
 def test_a_target_past_the_limits_stops_both_within_them(motion: SheetMotion, words: str) -> None:
@@ -698,7 +698,7 @@ def test_a_slack_sheet_is_held_until_the_flanges_come_too_near() -> None:
     [
         ((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), "the edges are rotated by 14.3 degrees"),
         ((0.0, 0.06, 0.0), (0.0, 0.0, 0.0), "the edge is skewed by"),
-        ((0.03, 0.0, 0.0), (0.0, 0.0, 0.0), "the sheet is"),
+        ((0.03, 0.0, 0.0), (0.0, 0.0, 0.0), "the sheet is 274.8 mm long, maximum 260.4 mm"),
         ((0.0154, 0.0, 0.0), (0.0, 0.0, 0.0), "the edge force is 20"),
     ],
 )

@@ -461,7 +461,7 @@ def test_a_plan_refuses_a_calibration_that_does_not_belong(tmp_path: Path) -> No
         (
             "device: twin-bumblebee",
             "device: other",
-            'is of the camera "other", but the scene',
+            'is of the camera "other", but the scene\'s camera is "twin-bumblebee"',
         ),
         ("width_px: 640", "width_px: 320", "is for 320x480 px"),
         ("version: 2", "version: 1", "the key `version` is 1, expected 2; calibrate again"),

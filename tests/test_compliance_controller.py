@@ -149,7 +149,8 @@ def test_a_law_that_is_asked_beyond_its_range_is_named_with_the_reason() -> None
         compliance.update(soft_body(), in_contact=False)
         indentation_m = depth_m - compliance.normal_offset(depth_m, (0.0, 0.0))[0]
         why = asked.invalid_reason(SheetPush(compliance.stretch_ratio, RADIUS), indentation_m)
-        assert bool(why) == ("is not valid here: " in compliance.note)
+        words = f"the sheet force model {asked.name} is not valid here: {why}"
+        assert bool(why) == (words in compliance.note)
         assert compliance.note.endswith(why)
         assert bool(why) == (depth_m < 0.01)
 

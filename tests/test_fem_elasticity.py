@@ -19,6 +19,7 @@ from flexsheet.nodes.fem_solver.elasticity import (
     shape_gradients,
 )
 from flexsheet.nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces, cylinder_mesh
+from flexsheet.nodes.fem_solver.mesh.solid import number_slabs
 from tests.linear_elasticity import solve, stiffness_matrix
 
 Floats = NDArray[np.float64]
@@ -98,6 +99,9 @@ def test_the_mesh_is_a_sound_solid(spacing: float) -> None:
     assert np.abs(normals.sum(axis=0)).max() < 1e-12  # closed
     enclosed = np.einsum("ij,ij->", normals, surface.mean(axis=1)) / 3
     assert enclosed == pytest.approx(np.pi * RADIUS**2 * LENGTH, rel=0.03)  # and outward
+    slab = number_slabs(mesh.nodes, mesh.elements)
+    assert np.ptp(slab[mesh.elements], axis=1).max() == 1
+    assert (np.diff(slab) >= 0).all()
 
 
 def test_the_side_is_on_the_cylinder_and_fine_in_front() -> None:
@@ -128,7 +132,7 @@ def test_exactly_the_strip_at_the_back_is_fixed(support: float, spacing: float) 
         ({"skin_spacing_m": 0.02}, "skin_spacing_m"),
         ({"skin_spacing_m": float("nan")}, "skin_spacing_m"),
         ({"support_angle_rad": 7.0}, "support_angle_rad"),
-        ({"touch_angle_rad": 3.0}, "touch_angle_rad: 3 "),
+        ({"touch_angle_rad": 3.0}, "touch_angle_rad: 3 must be positive and at most"),
     ],
 )
 def test_a_cylinder_that_cannot_be_meshed_is_rejected(change: dict[str, float], word: str) -> None:

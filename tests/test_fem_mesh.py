@@ -48,7 +48,12 @@ from flexsheet.nodes.fem_solver.mesh.quality import (
     signed_volumes,
 )
 from flexsheet.nodes.fem_solver.mesh.smoothing import _distortion
-from flexsheet.nodes.fem_solver.mesh.solid import SUBTRIANGLES, add_midside_nodes, orient_tetrahedra
+from flexsheet.nodes.fem_solver.mesh.solid import (
+    SUBTRIANGLES,
+    add_midside_nodes,
+    number_slabs,
+    orient_tetrahedra,
+)
 from flexsheet.nodes.models.shapes import make_shape
 from tests.examples import examples, long_except
 from tests.linear_elasticity import solve, stiffness_matrix
@@ -184,6 +189,9 @@ def require_sound(solid: SolidMesh) -> None:
     assert (uses == 2).all()
     assert len(np.unique(faces[:, :3])) - len(unique) + len(faces) == 2
     assert len(np.unique(solid.elements)) == len(solid.nodes)
+    slab = number_slabs(solid.nodes, solid.elements)
+    assert np.ptp(slab[solid.elements], axis=1).max() <= 1
+    assert (np.diff(slab) >= 0).all()
     assert (np.unique(faces) == solid.skin).all()
     assert (np.diff(solid.contact_nodes) > 0).all()
     assert np.isin(solid.contact_nodes, solid.skin).all()

@@ -567,5 +567,6 @@ def test_the_running_graph_and_the_simulation_agree(hand: HandImpedance, tmp_pat
     assert np.abs(graph.depths_m - expected_m).max() < 0.1 * expected_m.max()
     expected = measure_recorded(hand, recorded, path)
     steady = graph.times_s > graph.times_s[-1] - 0.2
+    assert graph.depths_m[steady].mean() == pytest.approx(expected.steady_m, rel=0.1)
     assert graph.forces_n[steady].mean() == pytest.approx(expected.steady_n, rel=0.1)
     assert graph.forces_n.max() == pytest.approx(expected.peak_n, rel=0.1)

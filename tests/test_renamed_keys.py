@@ -231,7 +231,7 @@ def test_an_old_topic_gets_an_error_that_names_the_new_one(old: str, new: str) -
         find_topic(old)
 
 
-@pytest.mark.parametrize("key", sorted(renamed_keys.REMOVED_KEYS))
+@pytest.mark.parametrize("key", sorted({"kinematics", "triangulation"} | renamed_keys.REMOVED_KEYS))
 def test_a_removed_method_in_a_scene_gets_an_error_with_a_remedy(tmp_path: Path, key: str) -> None:
     content = load_values()
     content["methods"] = {key: "any"}

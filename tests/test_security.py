@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import random
+import re
 import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -343,10 +344,11 @@ async def test_messages_of_250_mib_are_counted_and_others_continue(
 
 async def test_nothing_is_sent_beyond_loopback_without_keys() -> None:
     for address in ("192.0.2.1", "0.0.0.0", "*", "[::]", "eth0", "example.org"):
-        with pytest.raises(BusError, match=", but there are no keys"):
+        words = re.escape(f"other hosts can reach tcp://{address}:7777, but there are no keys")
+        with pytest.raises(BusError, match=words):
             Publisher(FINGER, [f"tcp://{address}:7777"])
         subscriber = Subscriber(FINGER, [f"tcp://{address}:7777"], lambda *_: None, PortCounts())
-        with pytest.raises(BusError, match=", but there are no keys"):
+        with pytest.raises(BusError, match=words):
             subscriber.start()
 
 

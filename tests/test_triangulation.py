@@ -279,3 +279,31 @@ def test_uneven_noise_is_carried_to_the_point(geometry: StereoGeometry) -> None:
         error = found.point_world - truth
         normalised.append(error @ np.linalg.solve(found.covariance, error))
     assert np.mean(normalised) == pytest.approx(3.0, rel=0.15)
+
+
+def test_errors_in_the_fingers_volume_meet_the_scenes_tolerance(scene: Scene) -> None:
+    low, high = np.array(scene.finger.volume_min_m), np.array(scene.finger.volume_max_m)
+    size = (high - low) * [1.0, 1.0, 1.0 / 3.0]
+
+    def error_m(baseline_m: float, noise_px: float) -> float:
+        """Return the root mean square error in the worst third of the volume's height."""
+        rig = scene.camera.right_from_left.copy()
+        rig[:3, 3] *= baseline_m / np.linalg.norm(rig[:3, 3])
+        geometry = StereoGeometry.of(scene.camera.model_copy(update={"right_from_left": rig}))
+        errors = []
+        for third in range(3):
+            random = np.random.default_rng(third)
+            truth = low + size * (random.random((2000, 3)) + np.array([0.0, 0.0, third]))
+            pixels = geometry.project(truth)
+            left, right = (view + noise_px * random.standard_normal(view.shape) for view in pixels)
+            found = dlt(*geometry.normalize(left, right), geometry.right_from_left)
+            away = np.linalg.norm(rigid.apply(geometry.world_from_left, found) - truth, axis=1)
+            errors.append(np.sqrt(np.mean(away**2)))
+        return float(np.max(errors))
+
+    tolerance_m = scene.tolerances.fingertip_m
+    for baseline_m in (0.1205, 0.24):
+        for noise_px in (0.01, 0.025):
+            assert error_m(baseline_m, noise_px) < tolerance_m
+    assert error_m(0.012, 0.025) > tolerance_m
+    assert error_m(0.1205, 2.0) > tolerance_m

@@ -232,7 +232,8 @@ async def test_images_of_another_camera_are_rejected_by_name(
             "webcam",
             full,
             (0, 0),
-            'come from the device "webcam", but the camera of the scene is "twin-bumblebee"',
+            'the images come from the device "webcam", '
+            'but the camera of the scene is "twin-bumblebee"',
         ),
         ("twin-bumblebee", wide, (0, 0), "left image has 752x480 px from column 0, row 0"),
         ("twin-bumblebee", full, (0, 8), "left image has 640x480 px from column 0, row 8"),
