@@ -319,7 +319,8 @@ def test_a_graph_is_checked_with_the_delay_of_its_planner(monkeypatch: pytest.Mo
     assert check_graph(load_graph(DEMO)) is None
     assert check_graph(load_graph(DEMO, settings=[*late, f"scene={RIGID}"])) is None
     shown = CliRunner().invoke(app, ["launch", str(DEMO), "--dry-run", "--set", *late])
-    assert "can oscillate at a delay of 212 ms" in " ".join(shown.stderr.split())
+    words = "can oscillate, because the sheet follows the finger with a delay of 212 ms"
+    assert words in " ".join(shown.stderr.split())
     method.name = "linear"
     assert check_graph(load_graph(DEMO, settings=late)) is None
     method.name = "nonlinear_table"

@@ -197,9 +197,17 @@ def test_a_rotation_of_the_last_joint_past_180_degrees_continues() -> None:
 @pytest.mark.parametrize(
     ("position", "limit", "words"),
     [
-        ((0.9, 0.0, 0.3), "reach", "wrist would be 828 mm from the shoulder, at most 418.5 mm"),
-        ((0.0, 0.0, 0.31), "J3", "nearest has J3 at 201.5 degrees, its range is 60 to 155"),
-        ((0.503, 0.0, 0.3), "J3", "nearest has J3 at 42.0 degrees, its range is 60 to 155"),
+        ((0.9, 0.0, 0.3), "reach", "wrist would be 828 mm from the shoulder, maximum 418.5 mm"),
+        (
+            (0.0, 0.0, 0.31),
+            "J3",
+            "nearest solution has J3 at 201.5 degrees, but its range is 60 to 155",
+        ),
+        (
+            (0.503, 0.0, 0.3),
+            "J3",
+            "nearest solution has J3 at 42.0 degrees, but its range is 60 to 155",
+        ),
     ],
 )
 def test_unreachable_poses_name_the_violated_limit(

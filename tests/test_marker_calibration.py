@@ -243,7 +243,7 @@ def test_exactly_one_source_is_required(tmp_path: Path) -> None:
     register(app)
     result = CliRunner().invoke(app, ["marker", "-o", str(tmp_path / "marker.yaml")])
     assert isinstance(result.exception, CommandError)
-    assert "--rows CSV and --twin SCENE" in str(result.exception)
+    assert "give exactly one source of touches: --rows CSV or --twin SCENE" in str(result.exception)
 
 
 @pytest.mark.long

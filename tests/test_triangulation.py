@@ -185,7 +185,7 @@ def test_a_calibration_replaces_the_optics_but_not_the_pose(scene: Scene) -> Non
 
 
 def test_a_calibration_of_another_camera_is_rejected(scene: Scene) -> None:
-    with pytest.raises(CalibrationMismatchError, match=r'device "other".*"twin-bumblebee"'):
+    with pytest.raises(CalibrationMismatchError, match=r'of the camera "other".*"twin-bumblebee"'):
         StereoGeometry.of(scene.camera, calibration_of(scene, device="other"))
     with pytest.raises(CalibrationMismatchError, match=r"1024x480 px.*640x480 px"):
         StereoGeometry.of(scene.camera, calibration_of(scene, width_px=1024))
