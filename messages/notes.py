@@ -110,7 +110,7 @@ class NodeNote(Enum):
         BUSY_FIRST + "Then read the log of the arm's bridge, and run `flexsheet arms reset`.",
     )
     STATUS_STALE = (
-        "its joints are not used",
+        "its joint angles are not used",
         "The controller's program has stopped or restarts. Check the program. Then run "
         "`flexsheet arms reset`.",
     )

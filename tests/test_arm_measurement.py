@@ -214,7 +214,7 @@ def test_a_frozen_measurement_is_a_named_fault() -> None:
     assert "trails its command" in arms[0].control.faults[0]
     assert arms[0].control.reset()
     stroke(arms, 1.0, begin_s=time_s)
-    assert "measured joints that are frozen" in arms[0].control.reason
+    assert "measured joint angles that are frozen" in arms[0].control.reason
     assert arms[0].command.mode != "move"
 
 

@@ -375,7 +375,7 @@ def test_forged_states_of_the_other_arm_move_no_arm_beyond_a_limit(
         ("not rigid", "state of the other arm: its flange is not a rigid pose"),
         ("mirrored", "state of the other arm: its flange is not a rigid pose"),
         ("nan pose", "state of the other arm: its flange is not a rigid pose"),
-        ("nan", "state of the other arm: its joints are not finite"),
+        ("nan", "state of the other arm: its joint angles are not finite"),
         ("faults", "other arm: forged"),
     ],
 )

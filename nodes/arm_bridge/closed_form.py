@@ -1,8 +1,8 @@
 """Compute the kinematics of 6-axis arms with a spherical wrist in closed form.
 
-At joint angles of zero, the joints rotate about the axes z, y, y, z, y, z.  Joint angles are (6,)
-in radians, poses are 4x4 `base_from_flange` in metres.  A branch is one of up to eight joint
-solutions of a pose.  `ClosedFormArm` in the scene defines the dimensions.
+At joint angles of zero, the joints rotate about the axes z, y, y, z, y, z. Joint angles are (6,) in
+radians, poses are 4x4 `base_from_flange` in metres. A branch is one of up to eight solutions of a
+pose for the joint angles. `ClosedFormArm` in the scene defines the dimensions.
 """
 
 from __future__ import annotations
@@ -136,19 +136,19 @@ class ClosedFormKinematics:
         self._lowest, self._highest = model.min_rad, model.max_rad
         self._elbow_to_wrist_m = hypot(self._shift_m, self._forearm_m)
         self.elbow_rad = atan2(self._shift_m, self._forearm_m)
-        """The angle of J3 at which shoulder, elbow and wrist centre are in line, rad."""
+        """The angle (rad) of J3 at which shoulder, elbow and wrist centre are in line."""
         bend = min(max(self.elbow_rad, self._lowest[2]), self._highest[2]) - self.elbow_rad
         self.max_wrist_m = hypot(
             self._upper_m + self._elbow_to_wrist_m * cos(bend), self._elbow_to_wrist_m * sin(bend)
         )
-        """The maximum distance of the wrist centre from the shoulder within the range of J3, m."""
+        """The maximum distance (m) of the wrist centre from the shoulder within the range of J3."""
 
     def jacobian(self, joints_rad: Floats) -> Floats:
         """Return the Jacobian (n, 6, 6): linear, then angular flange velocity per joint speed."""
         return self._chain.jacobian(joints_rad)
 
     def forward(self, joints_rad: ArrayLike) -> Floats:
-        """Return the flange's pose base_from_flange (4, 4) at joints (6,) rad."""
+        """Return the flange's pose base_from_flange (4, 4) at joint angles (6,) rad."""
         q1, q2, q3, q4, q5, q6 = np.asarray(joints_rad, dtype=np.float64).tolist()
         s2, c2, s23, c23 = sin(q2), cos(q2), sin(q2 + q3), cos(q2 + q3)
         out = self._upper_m * s2 - self._shift_m * c23 + self._forearm_m * s23
@@ -176,7 +176,7 @@ class ClosedFormKinematics:
         return np.array(rows).T
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return the joints (6,) rad of a pose on all branches; they may exceed their ranges."""
+        """Return the joint angles (6,) rad of a pose on all branches, also beyond their ranges."""
         return [np.array(one) for one in self.branches(base_from_flange, self.model.start_rad)]
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[Branch]:
@@ -184,7 +184,7 @@ class ClosedFormKinematics:
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return the distances (n,) of poses (n, 4, 4) from the limit of the arm's reach, m.
+        """Return the distances (n,), in m, of poses (n, 4, 4) from the limit of the arm's reach.
 
         A distance is positive if the wrist centre is within the reach.
         """
@@ -193,11 +193,11 @@ class ClosedFormKinematics:
         return np.asarray(self.max_wrist_m - away)
 
     def branches(self, base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
-        """Return all joint solutions of a flange pose, rad, in the order of `BRANCHES`.
+        """Return all joint angles (rad) that reach a flange pose, in the order of `BRANCHES`.
 
-        present_rad: present joints (6,), which determine joints that are undefined at a
+        present_rad: present joint angles (6,), which replace angles that are undefined at a
             singularity.
-        Joints may exceed their ranges.  The list is empty if the wrist centre is out of reach.
+        Angles may exceed the joint ranges.  The list is empty if the wrist centre is out of reach.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         rotation = base_from_flange[:3, :3]
@@ -231,7 +231,7 @@ class ClosedFormKinematics:
         return found
 
     def inverse_kinematics(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Return the joints (6,) rad for a flange pose that are nearest to the present joints.
+        """Return the joint angles (6,) rad for a flange pose nearest to the present angles.
 
         The nearest solution has the smallest maximum joint change.  Joint ranges may exceed 360
         degrees, so angles that differ by one revolution are also tried.  Raises UnreachableError if
@@ -255,7 +255,7 @@ class ClosedFormKinematics:
         return np.array(nearest)
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Return the joints (6,) rad for the next step of a motion.
+        """Return the joint angles (6,) rad for the next step of a motion.
 
         The result is exact except near two singularities.  Near J5 = 0, the exact J4 is the
         direction of a vector of length sin(J5).  This direction changes arbitrarily fast if the
@@ -307,8 +307,8 @@ class ClosedFormKinematics:
     def _bend(self, out: float, height: float) -> float | None:
         """Return the angle (0 to pi) between upper arm and elbow-wrist line; None if out of reach.
 
-        out, height: horizontal and vertical distance of the wrist centre from the shoulder, in the
-        plane of the arm, m.
+        out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder, in
+        the plane of the arm.
         """
         cosine = (out * out + height * height - self._upper_m**2 - self._elbow_to_wrist_m**2) / (
             2.0 * self._upper_m * self._elbow_to_wrist_m
@@ -357,7 +357,7 @@ class ClosedFormKinematics:
         return found
 
     def find_branch(self, joints_rad: ArrayLike) -> Branch:
-        """Return the branch of joints (6,) rad; at a singularity, the first one that matches."""
+        """Return the branch of joint angles (6,) rad; at a singularity, the first that matches."""
         joints = np.asarray(joints_rad, dtype=np.float64)
         return Branch(
             "front" if self._out(joints) >= 0.0 else "back",
@@ -368,10 +368,11 @@ class ClosedFormKinematics:
     def solve_joints_on_branch(
         self, base_from_flange: Floats, branch: Branch, near_rad: ArrayLike
     ) -> Floats:
-        """Return joints (n, 6) rad for flange poses (n, 4, 4) on one branch.
+        """Return joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
 
-        Joints may exceed their ranges.  They are NaN for poses out of reach.  Among the equivalent
-        angles of a joint, an angle within its range and near `near_rad` (6,) is selected.
+        Angles may exceed the joint ranges. They are NaN for poses out of reach. Among the
+        equivalent angles of a joint, an angle within its range and near `near_rad` (6,) is
+        selected.
         """
         poses = np.asarray(base_from_flange, dtype=np.float64)
         wrist = poses[:, :3, 3] - self._flange_m * poses[:, :3, 2]
@@ -412,9 +413,9 @@ class ClosedFormKinematics:
         return joints
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return the margins (n,) of joints (n, 6) to the minimum distance from each singularity.
+        """Return the margins (n,) of joint angles (n, 6) to each singularity's minimum distance.
 
-        A margin is negative if the joints are nearer to the singularity than permitted.
+        A margin is negative if the angles are nearer to the singularity than permitted.
         """
         joints = np.asarray(joints_rad, dtype=np.float64)
         elbow = np.remainder(joints[..., 2] - self.elbow_rad + 0.5 * pi, pi) - 0.5 * pi

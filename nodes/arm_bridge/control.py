@@ -100,8 +100,9 @@ RELAX_DELAY_S = 0.5
 """The time without a target or permission to move after which an arm slackens the sheet."""
 
 STALE_REASONS = {
-    Freshness.STALLED: "the counters of its status stand still, so its joints are not used",
-    Freshness.REVERSED: "the counters of its status run backwards, so its joints are not used",
+    Freshness.STALLED: "the counters of its status stand still, so its joint angles are not used",
+    Freshness.REVERSED: "the counters of its status run backwards, so its joint angles are not "
+    "used",
 }
 
 MAX_WAIT_FOR_OTHER_S = 1.0
@@ -111,12 +112,12 @@ MAX_ARMING_AGE_S = 1.0
 """The maximum age of an arming command.  An older command may not be the operator's intention."""
 
 ALIGNED_RAD = 1e-4
-"""The maximum distance of the joints from the goal of an alignment (see `path_check`) at which the
-alignment is complete."""
+"""The maximum distance of the joint angles from the goal of an alignment (see `path_check`) at
+which the alignment is complete."""
 
 MAX_BEYOND_RANGE_RAD = 0.02
-"""The maximum distance of measured joints outside their ranges.  A larger distance is a measurement
-error."""
+"""The maximum distance of measured joint angles outside their ranges. A larger distance is a
+measurement error."""
 
 RECHECK_PERIOD_S = 0.5
 """The time after which a blocked path is checked again, since the target may have moved."""
@@ -124,7 +125,7 @@ RECHECK_PERIOD_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """The delays of an input, s, after which the arm decelerates and after which it is disarmed."""
+    """The delays (s) of an input after which the arm decelerates and after which it is disarmed."""
 
     hold_after_s: float
     stop_after_s: float
@@ -132,7 +133,7 @@ class Timeouts:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command for the arm's controller: a mode of `ArmLink`, and joints (6,) rad."""
+    """A command for the arm's controller: a mode of `ArmLink`, and joint angles (6,) rad."""
 
     mode: str
     joints_rad: Floats
@@ -213,7 +214,7 @@ class ArmControl:
 
     @property
     def at_rest(self) -> bool:
-        """Return whether the commanded joints are at rest."""
+        """Return whether the commanded joint angles are constant."""
         return float(np.abs(self._velocity).max()) <= MAX_REST_RAD_PER_S
 
     @property
@@ -277,9 +278,9 @@ class ArmControl:
         arm_faults: tuple[ArmFault, ...],
         freshness: Freshness = Freshness.FRESH,
     ) -> None:
-        """Store the faults and the measured joints (6,) rad of an arm's answer.
+        """Store the faults and the measured joint angles (6,) rad of an arm's answer.
 
-        Joints that are not fresh are ignored.
+        Angles that are not fresh are ignored.
         """
         self._missed = False
         self._standstill.on_measurement(joints_rad, freshness)
@@ -569,7 +570,7 @@ class ArmControl:
     def _check_measurement(
         self, geometry: ArmGeometry, other: OtherArm | None, measured: Floats
     ) -> None:
-        """Latch a fault if the measured joints (6,) lag behind the command or violate a limit."""
+        """Latch a fault if the measured angles (6,) lag behind the command or violate a limit."""
         if self.faults or self._state not in TRACKING:
             return
         violation = check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
@@ -701,14 +702,14 @@ class ArmControl:
     def _command_sheet(
         self, sheet: SheetMotion, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Return the command for the joints that place this arm's edge for a pose of the sheet."""
+        """Return the command for the joint angles that place this arm's edge for a sheet pose."""
         try:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError as error:
             return self._latch_fault(str(error), geometry, step_s)
         jump_rad = float(np.abs(goal_rad - self.commanded_rad).max())
         if jump_rad > MAX_JOINT_JUMP_RAD:
-            text = f"the joints would jump by {np.degrees(jump_rad):.0f} degrees in one cycle"
+            text = f"the joint angles would jump by {np.degrees(jump_rad):.0f} degrees in one cycle"
             return self._latch_fault(text, geometry, step_s)
         self._sheet = sheet
         return self._command_joints(goal_rad, geometry, other, step_s)
@@ -719,7 +720,7 @@ class ArmControl:
     def _command_joints(
         self, goal_rad: Floats, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Return the command towards joints (6,) rad; latch a fault if it violates a limit."""
+        """Return the command towards angles (6,) rad; latch a fault if it violates a limit."""
         velocity = self._limit_velocity(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
         limits = self._limits(geometry)
@@ -849,7 +850,7 @@ class ArmControl:
         return self._send("move", self.commanded_rad + velocity * step_s, geometry, step_s)
 
     def _send(self, mode: str, joints_rad: Floats, geometry: ArmGeometry, step_s: float) -> Command:
-        """Return the command for joints (6,) rad after two final checks of every command.
+        """Return the command for joint angles (6,) rad after two final checks of every command.
 
         A fault is latched if the state permits no motion, or if the step exceeds the joint speeds
         or the tool speed.
@@ -880,7 +881,7 @@ class ArmControl:
         return Command(mode, bounded)
 
     def _is_at_command(self, measured: Floats, geometry: ArmGeometry) -> bool:
-        """Return whether the measured joints are near enough to the last command to restart."""
+        """Return whether the measured angles are near enough to the last command to restart."""
         shift_m = geometry.bound_edge_shift_m(self.commanded_rad, measured)
         return shift_m <= MAX_RESTART_SHIFT_M
 
@@ -888,7 +889,7 @@ class ArmControl:
         return self._standstill.is_standing(at_command=self._is_at_command(measured, geometry))
 
     def _restart_refusal(self, measured: Floats, geometry: ArmGeometry) -> str | None:
-        """Return why a motion must not start from the measured joints (6,), or None.
+        """Return why a motion must not start from the measured joint angles (6,), or None.
 
         The motion may start at the last commanded position.  At another position, the measurement
         may be wrong, and the arm would then jump.
@@ -896,7 +897,9 @@ class ArmControl:
         lowest, highest = geometry.range_rad
         beyond = max(float((lowest - measured).max()), float((measured - highest).max()))
         if beyond > MAX_BEYOND_RANGE_RAD:
-            return f"the measured joints are {np.degrees(beyond):.1f} degrees beyond their range"
+            return (
+                f"the measured joint angles are {np.degrees(beyond):.1f} degrees beyond their range"
+            )
         if self._is_at_command(measured, geometry):
             return None
         monitor = self._standstill
@@ -905,12 +908,12 @@ class ArmControl:
         angle_deg = float(np.degrees(np.abs(self.commanded_rad - measured).max()))
         defect = "jumped before" if monitor.has_jumped else "are frozen"
         return (
-            f"the arm is {angle_deg:.1f} degrees off its command according to measured joints that "
-            f"{defect}; check the arm, then restart its bridge"
+            f"the arm is {angle_deg:.1f} degrees off its command according to measured joint "
+            f"angles that {defect}; check the arm, then restart its bridge"
         )
 
     def _restart_at(self, measured: Floats, geometry: ArmGeometry) -> None:
-        """Replace the last commanded joints by the measured joints.
+        """Replace the last commanded joint angles by the measured joint angles.
 
         If the arm does not stand still, latch a fault instead.
         """

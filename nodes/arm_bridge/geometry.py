@@ -103,7 +103,7 @@ class ArmGeometry:
         return pose
 
     def bound_edge_shift_m(self, joints_rad: Floats, other_rad: Floats) -> float:
-        """Return an upper bound of the edge's displacement (m) between two sets of joints (6,)."""
+        """Return an upper bound of the edge's displacement (m) between two sets of angles (6,)."""
         return float(self._levers_m @ np.abs(joints_rad - other_rad))
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
@@ -114,20 +114,20 @@ class ArmGeometry:
         return self.world_from_base @ self._base_from_flange(joints_rad)
 
     def world_from_edge(self, joints_rad: Floats) -> Floats:
-        """Return the world pose (4, 4) of the clamped edge at joints (6,) rad."""
+        """Return the world pose (4, 4) of the clamped edge at joint angles (6,) rad."""
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
-        """Return points (4, 3) m in the base frame at joints (6,) rad.
+        """Return points (4, 3) m in the base frame at joint angles (6,) rad.
 
         The points are the centre and the ends of the clamped edge, and the flange.
         """
         return apply(self._base_from_flange(joints_rad), self.tool_points_flange)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
-        """Return joints (6,) rad that place this arm's edge for a pose of the sheet.
+        """Return joint angles (6,) rad that place this arm's edge for a pose of the sheet.
 
-        present_rad: present joints (6,), which are near the result.
+        present_rad: present joint angles (6,), which are near the result.
         The displacement of the edge by the sheet's tension is compensated.  Raises UnreachableError
         if the arm cannot reach the pose.
         """

@@ -1,9 +1,9 @@
 """Compute the kinematics of any arm with six rotary joints numerically.
 
-Joint angles are (6,) or (n, 6) in radians, poses are 4x4 `base_from_flange` in metres.  The inverse
-kinematics use a damped Newton method, which starts at known joints and has a bounded number of
-steps.  The joints for a distant pose are solved through intermediate poses, so that the arm stays
-on its branch.
+Joint angles are (6,) or (n, 6) in radians, poses are 4x4 `base_from_flange` in metres. The inverse
+kinematics use a damped Newton method, which starts at known joint angles and has a bounded number
+of steps. The joint angles for a distant pose are solved through intermediate poses, so that the arm
+stays on its branch.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from flexsheet.nodes.models.rigid import pose_matrix
 Floats = NDArray[np.float64]
 
 MAX_STEPS = 12
-"""The maximum number of Newton steps from known joints.  A control cycle typically needs 2 or 3."""
+"""The maximum number of Newton steps from known joint angles. A control cycle needs 2 or 3."""
 
 WAYPOINTS, STEPS_PER_WAYPOINT = 8, 5
 """The number of intermediate poses to a distant pose, and the number of Newton steps for each of
@@ -35,7 +35,7 @@ TOLERANCE = 1e-8
 """The error of a solved pose (m, rad) below which the iteration ends."""
 
 MAX_ERROR = 1e-6
-"""The maximum error of an accepted solution, m and rad."""
+"""The maximum error (m and rad) of an accepted solution."""
 
 DAMPING = 1e-9
 """The damping term of the normal equations, which limits the steps at a singularity."""
@@ -87,7 +87,7 @@ class SerialChain:
         return [*frames, frames[-1] @ self._flange]
 
     def forward(self, joints_rad: Floats) -> Floats:
-        """Return base_from_flange (..., 4, 4) at joints (..., 6) rad."""
+        """Return base_from_flange (..., 4, 4) at joint angles (..., 6) rad."""
         return self._frames(joints_rad)[-1]
 
     def jacobian(self, joints_rad: Floats) -> Floats:
@@ -104,7 +104,7 @@ class SerialChain:
         return flange, np.stack(rows, axis=-2)
 
     def levers_m(self, beyond_flange_m: float) -> Floats:
-        """Return upper bounds (6,) of the distances of a point from the joint axes, m.
+        """Return upper bounds (6,), in m, of the distances of a point from the joint axes.
 
         beyond_flange_m: distance of the point from the flange.
         """
@@ -122,15 +122,15 @@ class NumericKinematics:
         self._start = np.array(model.start_rad)
 
     def forward(self, joints_rad: Floats) -> Floats:
-        """Return base_from_flange (4, 4) at joints (6,) rad."""
+        """Return base_from_flange (4, 4) at joint angles (6,) rad."""
         return self._chain.forward(np.asarray(joints_rad, dtype=np.float64))
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the Jacobian (n, 6, 6) at joints (n, 6) rad."""
+        """Return the Jacobian (n, 6, 6) at joint angles (n, 6) rad."""
         return self._chain.jacobian(joints_rad)
 
     def _refine(self, poses: Floats, joints_rad: Floats, steps: int) -> tuple[Floats, Floats]:
-        """Return joints (n, 6) after Newton steps towards poses (n, 4, 4), and errors (n,)."""
+        """Return joint angles (n, 6) after Newton steps towards poses (n, 4, 4), and errors."""
         joints = joints_rad
         for left in reversed(range(steps + 1)):
             flanges, slopes = self._chain.pose_and_jacobian(joints)
@@ -146,7 +146,7 @@ class NumericKinematics:
         return joints, largest
 
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
-        """Return joints (n, 6) on the branch of `joints_rad` (6,) for poses, and errors (n,)."""
+        """Return joint angles (n, 6) for poses, on the branch of `joints_rad`, and errors (n,)."""
         start = self.forward(joints_rad)
         rotation = scipy.spatial.transform.Rotation
         turns = rotation.from_matrix(poses[:, :3, :3] @ start[:3, :3].T).as_rotvec()
@@ -160,7 +160,7 @@ class NumericKinematics:
         return self._refine(poses, joints, STEPS_PER_WAYPOINT)
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: Floats) -> Floats:
-        """Return joints (6,) rad for a flange pose (4, 4) near the present joints (6,).
+        """Return joint angles (6,) rad for a flange pose (4, 4) near the present angles (6,).
 
         Raises UnreachableError if there is no solution, if a joint is out of its range, or if the
         pose is too near to a singularity.
@@ -168,7 +168,7 @@ class NumericKinematics:
         poses, present = base_from_flange[None], np.asarray(present_rad, dtype=np.float64)
         if not (np.isfinite(poses).all() and np.isfinite(present).all()):
             raise UnreachableError(
-                "the pose of the flange or the present joints are not finite", "reach"
+                "the pose of the flange or the present joint angles are not finite", "reach"
             )
         joints, errors = self._refine(poses, present[None], MAX_STEPS)
         if not errors[0] <= MAX_ERROR:
@@ -184,7 +184,7 @@ class NumericKinematics:
                     "reach",
                 )
             raise UnreachableError(
-                f"{where}: no joint solution found near the present joints; the remaining error is "
+                f"{where}: no solution found near the present joint angles; the remaining error is "
                 f"{1e3 * errors[0]:.2g} mm or mrad",
                 "reach",
             )
@@ -207,10 +207,10 @@ class NumericKinematics:
         return np.asarray(found)
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return distinct joint solutions (6,) rad of a pose within the joint ranges.
+        """Return distinct joint angles (6,) rad that reach a pose within the joint ranges.
 
-        They are sorted by their distance from the start joints.  The search starts from random
-        joints with a fixed seed, so it may miss a solution.
+        They are sorted by their distance from the start angles. The search starts from random
+        angles with a fixed seed, so it may miss a solution.
         """
         random = np.random.default_rng(1)
         low, high = np.maximum(self._lowest, -pi), np.minimum(self._highest, pi)
@@ -229,7 +229,7 @@ class NumericKinematics:
         return sorted(found, key=lambda one: float(np.abs(one - self._start).max()))
 
     def find_branch(self, joints_rad: Floats) -> SeedBranch:
-        """Return the branch that continues from joints (6,) rad."""
+        """Return the branch that continues from joint angles (6,) rad."""
         return SeedBranch(tuple(float(angle) for angle in joints_rad))
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:
@@ -242,7 +242,7 @@ class NumericKinematics:
     def solve_joints_on_branch(
         self, base_from_flange: Floats, branch: SeedBranch, near_rad: Floats
     ) -> Floats:
-        """Return joints (n, 6) rad for poses (n, 4, 4) on one branch; NaN where out of reach."""
+        """Return joint angles (n, 6) rad for poses (n, 4, 4) on one branch; NaN if out of reach."""
         joints, errors = self._continue(base_from_flange, np.array(branch.seed_rad))
         return np.where(errors[:, None] <= MAX_ERROR, joints, np.nan)
 
@@ -251,7 +251,7 @@ class NumericKinematics:
         return float(self._chain.offsets_m.sum() + self._chain.flange_m)
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return the sum of all link lengths minus the distances (n,) of poses (n, 4, 4), m."""
+        """Return the sum (m) of all link lengths minus the distances (n,) of poses (n, 4, 4)."""
         away = np.linalg.norm(base_from_flange[:, :3, 3], axis=1)
         return np.asarray(self._max_distance_m - away)
 

@@ -44,7 +44,7 @@ class ArmKinematics(Protocol):
         ...
 
     def forward(self, joints_rad: Floats) -> Floats:
-        """Return the flange's pose base_from_flange (4, 4) at joints (6,) rad."""
+        """Return the flange's pose base_from_flange (4, 4) at joint angles (6,) rad."""
         ...
 
     def jacobian(self, joints_rad: Floats) -> Floats:
@@ -55,7 +55,7 @@ class ArmKinematics(Protocol):
         ...
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: Floats) -> Floats:
-        """Return joints (6,) rad for a flange pose (4, 4) near the present joints (6,).
+        """Return joint angles (6,) rad for a flange pose (4, 4) near the present angles (6,).
 
         The computing time is bounded, because a bridge calls this method in each control cycle.
         Raises UnreachableError if the arm cannot reach the pose.
@@ -67,7 +67,7 @@ class ArmKinematics(Protocol):
         ...
 
     def find_branch(self, joints_rad: Floats) -> Any:
-        """Return the branch of joints (6,) rad, a named tuple."""
+        """Return the branch of joint angles (6,) rad, a named tuple."""
         ...
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[Any]:
@@ -77,20 +77,20 @@ class ArmKinematics(Protocol):
     def solve_joints_on_branch(
         self, base_from_flange: Floats, branch: Any, near_rad: Floats
     ) -> Floats:
-        """Return joints (n, 6) rad for poses (n, 4, 4) on one branch; NaN where out of reach."""
+        """Return joint angles (n, 6) rad for poses (n, 4, 4) on one branch; NaN if out of reach."""
         ...
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return the distances (n,) of poses (n, 4, 4) from the limit of the arm's reach, m.
+        """Return the distances (n,), in m, of poses (n, 4, 4) from the limit of the arm's reach.
 
         A distance is positive within the reach.
         """
         ...
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return the margins (n,) of joints (n, 6) to the minimum distance from each singularity.
+        """Return the margins (n,) of joint angles (n, 6) to each singularity's minimum distance.
 
-        The result has one array for each kind of singularity. A margin is negative if the joints
+        The result has one array for each kind of singularity. A margin is negative if the angles
         are nearer to the singularity than permitted.
         """
         ...

@@ -120,9 +120,9 @@ def limit_velocity(
 ) -> Floats:
     """Return joint velocities (6,) rad/s for the next step towards a moving goal.
 
-    velocity: result of the last call.
-    goal_rad: joints at the end of the step; if they are not finite, the arm decelerates.
-    tool_points: function from joints to points (n, 3) m, whose speed is at most `max_tool_speed`.
+    velocity: result of the last call. goal_rad: joint angles at the end of the step; if they are
+    not finite, the arm decelerates. tool_points: function from joint angles to points (n, 3) m,
+    whose speed is at most `max_tool_speed`.
 
     For any goal, joints_rad + result * step_s is in range, and joint and tool speeds are within
     their limits.  The acceleration exceeds its limit only if range or tool speed require it.
@@ -255,7 +255,7 @@ def bound_step(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return the joints (6,) towards `desired_rad` that one step can reach.
+    """Return the joint angles (6,) towards `desired_rad` that one step can reach.
 
     Joint speeds and tool speed limit the step.  If they permit it, the result is the object
     `desired_rad`, otherwise a point on the straight line to it.  If `desired_rad` is not finite,
@@ -393,7 +393,7 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Return a text if commanded and measured joints (6,) rad differ too much, or None."""
+    """Return a text if commanded and measured angles (6,) rad differ too much, or None."""
     lag = float(np.abs(joints_rad - measured_rad).max())
     if not lag <= max_error_rad:
         return f"the arm trails its command by {np.degrees(lag):.1f} degrees"

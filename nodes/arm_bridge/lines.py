@@ -35,7 +35,7 @@ MAX_LINE_BYTES = 512
 
 
 def encode_line(sequence: int, mode: str, joints_rad: Floats) -> bytes:
-    """Encode a command; raise ValueError unless there are six finite joints."""
+    """Encode a command; raise ValueError unless there are six finite angles."""
     angles = " ".join(f"{angle:.9g}" for angle in validate_joints(joints_rad))
     return f"{sequence} {mode} {angles}\n".encode("ascii")
 

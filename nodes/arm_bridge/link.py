@@ -86,22 +86,22 @@ FAULT_TEXTS = {
 
 
 class Freshness(StrEnum):
-    """A classification of measured joints by the counters in the controller's answer."""
+    """A classification of measured joint angles by the counters in the controller's answer."""
 
     FIRST = "first"
     """This is the first answer since the start of the link or of the controller."""
     FRESH = "fresh"
-    """The counters have advanced, so the joints are measured again."""
+    """The counters have advanced, so the joint angles are measured again."""
     REPEATED = "repeated"
     """The counters equal those of the previous answer, but not yet for too long."""
     STALLED = "stalled"
     """The counters have not advanced for too long (`max_unchanged_s`)."""
     REVERSED = "reversed"
-    """A counter runs backwards, so the joints are older than the previous ones."""
+    """A counter runs backwards, so the joint angles are older than the previous ones."""
 
     @property
     def is_usable(self) -> bool:
-        """Return whether the measured joints may be used."""
+        """Return whether the measured joint angles may be used."""
         return self not in (Freshness.STALLED, Freshness.REVERSED)
 
 
@@ -147,7 +147,7 @@ class CounterMonitor:
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """An answer of an arm: measured joints (6,) rad, faults, and whether the joints are new.
+    """An answer of an arm: measured joint angles (6,) rad, faults, and whether the angles are new.
 
     currents_percent: motor currents (6,), percent of the rated currents; None if not reported.
     """
@@ -175,7 +175,7 @@ class ArmLink(Protocol):
     """The interface for the exchange of commands and answers with one arm.
 
     Modes: `idle` (no motion; restarts after a fault or a lost connection), `move` (to the given
-    joints), `hold` and `stop` (no motion).
+    joint angles), `hold` and `stop` (no motion).
     """
 
     def due(self, now_ns: int) -> bool:
@@ -201,8 +201,8 @@ class ConnectedLink(ABC):
     """
 
     period_s: ClassVar[float] = 0.0071
-    """The period with which the controller measures its joints.  Answers may repeat a measurement
-    for seven periods, or for MAX_UNCHANGED_S if that is longer."""
+    """The period with which the controller measures the joint angles. Answers may repeat a
+    measurement for seven periods, or for MAX_UNCHANGED_S if that is longer."""
 
     def __init__(self, host: str, port: int, *, timeout_s: float) -> None:
         self.host, self.port = host, port
@@ -281,14 +281,13 @@ class ConnectedLink(ABC):
 
 
 def validate_joints(joints_rad: Floats) -> tuple[float, ...]:
-    """Return joints (6,) rad as Python numbers; raise ValueError unless there are six finite
-    joints.
+    """Return joint angles (6,) rad as Python numbers; raise ValueError unless six are finite.
 
     The limiter already ensures this, but drivers check it again before they send a command.
     """
     joints = tuple(float(angle) for angle in joints_rad)
     if len(joints) != JOINTS or not all(math.isfinite(angle) for angle in joints):
-        raise ValueError(f"the joints of a command must be {JOINTS} finite angles, not {joints}")
+        raise ValueError(f"a command must contain {JOINTS} finite angles, not {joints}")
     return joints
 
 

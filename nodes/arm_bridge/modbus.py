@@ -149,7 +149,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
     if state >= len(STATES):
         raise ArmAnswerError(f"the status has the unknown arm state {state}")
     if not all(math.isfinite(angle) for angle in joints):
-        raise ArmAnswerError("the measured joints are not finite")
+        raise ArmAnswerError("the measured joint angles are not finite")
     return ModbusStatus(
         accepted=accepted,
         cycle=cycle,

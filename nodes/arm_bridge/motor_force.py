@@ -57,12 +57,12 @@ def estimate_pull_n(
     *,
     forward: Callable[[Floats], Floats],
 ) -> tuple[float, float]:
-    """Return the pull on the edge and its standard deviation, N, by weighted least squares.
+    """Return the pull (N) on the edge and its standard deviation, by weighted least squares.
 
-    joints_rad, currents_percent: joints (6,) rad and motor currents (6,), percent.
-    edge_flange_m: centre (3,) of the edge in the flange frame.
-    towards_base: direction of the pull, a unit vector (3,) in the base frame.
-    forward: function from joints (6,) rad to the flange's pose (4, 4) in the base frame.
+    joints_rad, currents_percent: joint angles (6,) rad and motor currents (6,), percent.
+    edge_flange_m: centre (3,) of the edge in the flange frame. towards_base: direction of the pull,
+    a unit vector (3,) in the base frame. forward: function from joint angles (6,) rad to the
+    flange's pose (4, 4) in the base frame.
     """
     at_edge = np.append(edge_flange_m, 1.0)
     edge_m = (forward(joints_rad) @ at_edge)[:3]

@@ -48,13 +48,16 @@ PACKET = (
         "send_type",
         "H",
         1,
-        "type of `data`: 0 none, 1 pose, 2 joints, 3 pulses; in an answer 0 to 11",
+        "type of `data`: 0 none, 1 pose, 2 joint angles, 3 pulses; in an answer 0 to 11",
     ),
     BlockField(
-        "receive_type", "H", 1, "requested type of the answer's `data`: 0 to 11; 8 measured joints"
+        "receive_type",
+        "H",
+        1,
+        "requested type of the answer's `data`: 0 to 11; 8 measured joint angles",
     ),
     BlockField("reserved", "x", 2, "0"),
-    BlockField("data", "f", 8, "joints in rad; the rest 0"),
+    BlockField("data", "f", 8, "joint angles in rad; the rest 0"),
     BlockField("flags", "I", 2, "structure and revolutions of a pose; 0"),
     BlockField("send_io_type", "H", 1, "0: no signals"),
     BlockField("receive_io_type", "H", 1, "0: no signals"),
@@ -94,7 +97,7 @@ class MxtStatus(ArmStatus):
 def encode(
     command: int, *, send_type: int = 0, data: Sequence[float] = (), with_currents: bool = False
 ) -> bytes:
-    """Encode a command packet that requests the measured joints.
+    """Encode a command packet that requests the measured joint angles.
 
     send_type, data: type of the command's data, and up to 8 numbers.
     with_currents: whether to request the motor currents too.
@@ -105,7 +108,7 @@ def encode(
 
 
 def encode_joints(joints_rad: Floats, *, with_currents: bool = False) -> bytes:
-    """Encode a motion to joints (6,) rad; raise ValueError unless there are six finite joints."""
+    """Encode a motion to joint angles (6,) rad; raise ValueError unless six are finite."""
     return encode(
         COMMAND_MOVE,
         send_type=TYPE_JOINTS,
@@ -130,7 +133,7 @@ def decode_answer(packet: bytes) -> MxtStatus:
     if {send_type, receive_type} - {TYPE_NONE} != {TYPE_JOINTS_MEASURED}:
         raise ArmAnswerError(
             f"the answer has the data types {send_type} and {receive_type} instead of "
-            f"{TYPE_JOINTS_MEASURED} (measured joints)"
+            f"{TYPE_JOINTS_MEASURED} (measured joint angles)"
         )
     joints = np.array(data[:JOINTS])
     if not (np.abs(joints) <= MAX_PLAUSIBLE_RAD).all():

@@ -28,7 +28,7 @@ MAX_TRAJECTORY_END_NS = round(1e9 * (MAX_PREDICTION_S + MAX_TRAJECTORY_S))
 
 @dataclass(frozen=True)
 class OtherArm:
-    """The state of the other arm: joints (6,) rad, world poses (4, 4), mode, faults and age.
+    """The state of the other arm: joint angles (6,) rad, world poses (4, 4), mode, faults and age.
 
     ready: whether the other arm may move.
     estop_engaged: whether the other arm's bridge has latched an e-stop.
@@ -89,7 +89,7 @@ class OtherArm:
     def invalid_reason(self) -> str | None:
         """Return why this state must not be used, or None."""
         if not np.isfinite(self.joints_rad).all():
-            return "its joints are not finite"
+            return "its joint angles are not finite"
         if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):
             return "its flange is not a rigid pose"
         if self.age_s < -MAX_FUTURE_S:

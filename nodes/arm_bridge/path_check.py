@@ -1,9 +1,9 @@
 """Check before a motion whether both arms can move the sheet to its target.
 
-The bridge of each arm receives the joints of both arms.  It simulates the sheet's motion and checks
-at each pose whether both arms are within their limits.  A check takes some milliseconds and
-therefore runs outside the cycle that sends commands.  If necessary, the arms are first aligned:
-they move to joints at which the sheet is flat and on the path.
+The bridge of each arm receives the joint angles of both arms. It simulates the sheet's motion and
+checks at each pose whether both arms are within their limits. A check takes some milliseconds and
+therefore runs outside the cycle that sends commands. If necessary, the arms are first aligned: they
+move to joint angles at which the sheet is flat and on the path.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ PEAK_TO_MEAN_SPEED = 1.5
 
 @dataclass(frozen=True, slots=True)
 class PathCheckRequest:
-    """A path to check: start and target of the sheet, and joints (6,) rad of both arms."""
+    """A path to check: start and target of the sheet, and joint angles (6,) rad of both arms."""
 
     start: SheetMotion
     goal: SheetMotion
@@ -131,11 +131,11 @@ class Alignment:
     """A straight joint motion of one arm from its position to the path of the sheet.
 
     An alignment is necessary if the arms have stopped with a twisted sheet, or at the end of a
-    joint's range.  Their joints then do not correspond to a pose of a flat sheet.
+    joint's range. Their joint angles then do not correspond to a pose of a flat sheet.
 
-    sheet: first pose on the path that both arms can reach.
-    from_rad, to_rad: this arm's joints (6,) at start and end.
-    duration_s: duration, equal for both arms; 0 if they need not move.
+    sheet: first pose on the path that both arms can reach. from_rad, to_rad: this arm's joint
+    angles (6,) at start and end. duration_s: duration, equal for both arms; 0 if they need not
+    move.
     """
 
     sheet: SheetMotion
@@ -144,7 +144,7 @@ class Alignment:
     duration_s: float
 
     def joints_at(self, time_s: float) -> Floats:
-        """Return the joints (6,), rad, at `time_s` after the start, s."""
+        """Return the joint angles (6,), in rad, at `time_s` after the start."""
         part = min(1.0, time_s / self.duration_s) if self.duration_s > 0.0 else 1.0
         joints: Floats = self.from_rad + smoothstep(np.array(part)) * (self.to_rad - self.from_rad)
         return joints
@@ -212,7 +212,7 @@ def _check_alignment(
                 poses[1], poses[3], left=arm.left, limits=limits[number]
             )
             if violation is None and max_change_rad > MAX_ALIGN_RAD:
-                violation = "its joints are too far from the path of the sheet"
+                violation = "its joint angles are too far from the path of the sheet"
             if violation is not None:
                 raise PathError(
                     violation,

@@ -1,8 +1,8 @@
 """Check whether the arms can reach poses of the sheet: many poses at once, or along a path.
 
-Two arms hold the sheet by its left and right edges.  Poses of the sheet are (n, 4, 4) in the world
-with stretch ratios (n,); joints are (n, 6) rad.  A margin is the distance to a limit and is
-positive within the limit.  Margins of speeds are fractions of the limit.  A branch is one of the
+Two arms hold the sheet by its left and right edges. Poses of the sheet are (n, 4, 4) in the world
+with stretch ratios (n,); joint angles are (n, 6) rad. A margin is the distance to a limit and is
+positive within the limit. Margins of speeds are fractions of the limit. A branch is one of the
 discrete joint solutions of a pose.
 """
 
@@ -75,7 +75,7 @@ DETOURS_M = (
     (0.0, 0.08, 0.0),
     (0.0, -0.08, 0.0),
 )
-"""The offsets of detours in the world, m, in the order in which they are tried."""
+"""The offsets (m) of detours in the world, in the order in which they are tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,11 +106,12 @@ class SheetPoses:
 
 @dataclass(frozen=True, slots=True)
 class ArmReach:
-    """The joints and margins of one arm for n poses of the sheet on one branch.
+    """The joint angles and margins of one arm for n poses of the sheet on one branch.
 
     joints_rad: (n, 6), NaN for poses out of reach.
-    margins: margins (n,) by limit, for each of `LIMITS`.  Margins that depend on joints are NaN for
-        poses out of reach.  Margins of singularities that the arm does not have are infinite.
+    margins: margins (n,) by limit, for each of `LIMITS`. Margins that depend on joint angles are
+        NaN for poses out of reach. Margins of singularities that the arm does not have are
+        infinite.
     """
 
     branch: Any
@@ -148,7 +149,7 @@ def compute_flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
 def compute_reach(
     geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses, branch: Any
 ) -> ArmReach:
-    """Compute the joints and margins of an arm for poses of the sheet on one branch.
+    """Compute the joint angles and margins of an arm for poses of the sheet on one branch.
 
     other: the arm that holds the other edge.
     """
@@ -162,7 +163,7 @@ def compute_reach(
 
 
 def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses) -> ArmReach:
-    """Return the joints and margins on the branch that reaches the most poses.
+    """Return the joint angles and margins on the branch that reaches the most poses.
 
     If several branches reach as many poses, the branch with the larger margins is selected.  All
     poses have the same branch, because an arm cannot change its branch while it holds the sheet.
@@ -255,9 +256,9 @@ def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
 class SheetPath:
     """A path of the sheet that both arms can follow: m poses from start to goal.
 
-    left_rad, right_rad: joints (m, 6) of both arms; each arm stays on one branch.
-    times_s: (m,) times of the poses at the speed limits of joints and edges.
-    via_m: offset of the detour in the world, m; None if the path is straight.
+    left_rad, right_rad: joint angles (m, 6) of both arms; each arm stays on one branch. times_s:
+    (m,) times of the poses at the speed limits of joints and edges. via_m: offset of the detour in
+    the world; None if the path is straight.
     """
 
     places: SheetPoses
@@ -269,7 +270,7 @@ class SheetPath:
 
 @dataclass(frozen=True, slots=True)
 class PathStep:
-    """A pose of the sheet on a path, with the joints (6,) rad of both arms."""
+    """A pose of the sheet on a path, with the joint angles (6,) rad of both arms."""
 
     sheet: SheetMotion
     left_rad: Floats
@@ -310,8 +311,8 @@ def plan_path(
 ) -> SheetPath:
     """Plan a path for both arms between two poses and stretches of the sheet.
 
-    left_rad, right_rad: joints (6,) at the start; None: all branches are tried.
-    detours_m: offsets of the detours to try if the straight path violates a limit.
+    left_rad, right_rad: joint angles (6,) at the start; None: all branches are tried. detours_m:
+    offsets of the detours to try if the straight path violates a limit.
 
     On a straight path, the sheet rotates about one axis and its stretch changes linearly.  On a
     detour, the sheet is shifted by the offset after the start, and shifted back at the end.  Raises
@@ -341,8 +342,8 @@ def plan_path_through(
 ) -> SheetPath:
     """Plan a path for both arms that is straight between the given corners.
 
-    left_rad, right_rad: joints (6,) at the first corner.
-    Raises PathError if the path violates a limit.
+    left_rad, right_rad: joint angles (6,) at the first corner. Raises PathError if the path
+    violates a limit.
     """
     begin = PathStep(
         corners[0],
@@ -362,7 +363,7 @@ def _shifted(
 def _sample_path(
     left: ArmGeometry, right: ArmGeometry, corners: Sequence[SheetMotion], begin: PathStep
 ) -> list[PathStep]:
-    """Sample a path through the corners so that joints change by at most MAX_STEP_RAD per sample.
+    """Sample a path through the corners so that joint angles change by at most MAX_STEP_RAD.
 
     Raises PathError if an arm cannot reach a sample, or if a joint would jump.
     """
@@ -407,7 +408,7 @@ def _explain_jump(
     binding = int(reach.binding[0])
     limit = "jump" if binding < 0 else LIMITS[binding]
     why = (
-        "its joints would jump"
+        "its joint angles would jump"
         if binding < 0
         else f"its joint solution violates the limit {limit} beyond this position"
     )
@@ -417,10 +418,10 @@ def _explain_jump(
 
 
 def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[Floats]:
-    """Return the joints (6,) that an arm may have at the start of a path.
+    """Return the joint angles (6,) that an arm may have at the start of a path.
 
-    given: joints near the solution; None: return one solution per branch within the joint ranges.
-    Solutions with larger distances from the range limits are first.
+    given: joint angles near the solution; None: return one solution per branch within the joint
+    ranges. Solutions with larger distances from the range limits are first.
     """
     if given is not None:
         return [_solve_joints(arm, start, given, fraction=0.0)]
@@ -458,9 +459,9 @@ def _solve_joints(
 def solve_step(
     left: ArmGeometry, right: ArmGeometry, sheet: SheetMotion, near: PathStep, *, fraction: float
 ) -> PathStep:
-    """Solve the joints of both arms for a pose of the sheet.
+    """Solve the joint angles of both arms for a pose of the sheet.
 
-    near: neighbouring step, whose joints are near the solution.
+    near: neighbouring step, whose joint angles are near the solution.
     fraction: position on the path for the error text.
     Raises PathError if one of COMMAND_LIMITS is violated.
     """

@@ -36,7 +36,7 @@ class ServoCheck:
         """Add the newest estimate of the lag, and return the checks that have enough data.
 
         round_trip_s: time from a command to its answer. The estimate may be wrong by half of this
-        time, because the arm reads its joints at an unknown time in between.
+        time, because the arm reads its joint angles at an unknown time in between.
         """
         if estimate is not None:
             deviation_s = estimate.lag_s - self._configured_lag_s

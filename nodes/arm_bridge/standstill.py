@@ -1,4 +1,4 @@
-"""Detect from an arm's measured joints whether the arm stands still."""
+"""Detect from an arm's measured joint angles whether the arm stands still."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ OVERSPEED = 1.5
 """The factor by which an arm may exceed its commanded speed while it catches up."""
 
 MEMORY_S = 0.1
-"""The time constant with which the ranges of recent commanded speeds and joints decay."""
+"""The time constant with which the ranges of recently commanded speeds and joint angles decay."""
 
 ON_PATH_RAD = 0.005
-"""The distance from the recently commanded joints within which every measurement is plausible."""
+"""The distance from recently commanded joint angles within which every measurement is plausible."""
 
 
 class StandstillMonitor:
@@ -57,7 +57,7 @@ class StandstillMonitor:
     def is_standing(self, *, at_command: bool) -> bool:
         """Return whether the arm is at rest.
 
-        at_command: whether the measured joints are at the last command.
+        at_command: whether the measured joint angles are at the last command.
         """
         return self._count >= (STANDSTILL_COUNT if at_command else SETTLED_COUNT)
 
@@ -78,7 +78,8 @@ class StandstillMonitor:
     def on_command(self, joints_rad: Floats, velocity_rad_per_s: Floats, step_s: float) -> None:
         """Update the monitor after a command that covers `step_s`.
 
-        joints_rad: commanded joints (6,). velocity_rad_per_s: commanded joint velocities (6,).
+        joints_rad: commanded joint angles (6,). velocity_rad_per_s: commanded joint velocities
+        (6,).
         """
         self._elapsed_s += step_s
         speeds = np.abs(velocity_rad_per_s)
@@ -95,7 +96,7 @@ class StandstillMonitor:
             self.restart()
 
     def on_measurement(self, joints_rad: Floats, freshness: Freshness) -> None:
-        """Update the monitor after a measurement of the joints (6,) rad."""
+        """Update the monitor after a measurement of the joint angles (6,) rad."""
         if freshness == Freshness.REPEATED:
             return
         if not freshness.is_usable:

@@ -47,7 +47,7 @@ class Event(Enum):
     ISOLATED = "the other arm is silent or e-stopped, or the clocks are not synchronized"
     FAULT = "a fault is latched"
     ESTOP = "an e-stop is latched"
-    AT_REST = "the commanded joints are at rest"
+    AT_REST = "the commanded joint angles are constant"
     RELAX = "the arm can start to slacken the sheet"
     RELAX_BLOCKED = "the arm must not, or cannot, slacken the sheet now"
     RELAX_ENDED = "the sheet is slack, or the arm does not obey"
@@ -72,7 +72,7 @@ CHECKING_STATES = frozenset({S.CHECKING, S.CHECKING_TAUT})
 READY_STATES = ARMED_AT_REST | TRACKING | PAUSING_STATES
 """The states in which the arm is armed and may move."""
 MOTION_STATES = TRACKING | PAUSING_STATES | STOPPING_STATES | RELAXING
-"""The states in which commands may change the joints."""
+"""The states in which commands may change the joint angles."""
 
 MODES: Mapping[State, ArmMode] = {
     S.STARTING: "starting",

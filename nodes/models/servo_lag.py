@@ -1,7 +1,7 @@
-"""Estimate the lag of an arm behind its commands from commanded and measured joints.
+"""Estimate the lag of an arm behind its commands from commanded and measured joint angles.
 
-The measured joints are compared with the commanded joints at each lag of a grid. The estimate is
-the lag at which the variance of the difference is smallest. For white noise, this is the
+The measured joint angles are compared with the commanded ones at each lag of a grid. The estimate
+is the lag at which the variance of the difference is smallest. For white noise, this is the
 maximum-likelihood estimate (Knapp and Carter, The generalized correlation method for estimation of
 time delay, 1976). The weight of old samples decays exponentially. A constant difference due to
 gravity or an encoder offset has no influence, so constant velocity gives no information.
@@ -35,7 +35,7 @@ With a larger fraction, the arm does not move as commanded, or its joints have r
 """
 
 CORRELATION_S = 0.1
-"""The time over which errors of the difference are correlated, so that they count as one sample."""
+"""The time over which errors of the difference are correlated, so they count as one sample."""
 
 MIN_NOISE_RATIO = 0.2
 """The minimum fraction of the difference's variance that is attributed to noise.
@@ -80,10 +80,10 @@ class LagBounds:
 
 @dataclass(frozen=True, slots=True)
 class LagEstimate:
-    """An identified lag with its standard deviation, s.
+    """An identified lag (s) with its standard deviation.
 
-    tracking_error_rad: standard deviation of measured minus commanded joints at this lag (norm over
-        the joints).
+    tracking_error_rad: standard deviation of measured minus commanded joint angles at this lag
+        (norm over the joints).
     expected_error_rad: tracking error of a critically damped servo with this lag and motion.
     """
 
@@ -124,7 +124,7 @@ class ServoLagEstimator:
         self._last_s: float | None = None
 
     def on_command(self, at_s: float, joints_rad: Floats) -> None:
-        """Add commanded joints (6,), rad, that were sent at the time `at_s`."""
+        """Add commanded joint angles (6,), rad, that were sent at the time `at_s`."""
         if not (math.isfinite(at_s) and _are_joints(joints_rad)):
             self.restart()
             return
@@ -138,7 +138,7 @@ class ServoLagEstimator:
         self._count += 1
 
     def on_measurement(self, at_s: float, joints_rad: Floats) -> None:
-        """Add joints (6,), rad, that were measured at the time `at_s`, after the newest command."""
+        """Add angles (6,), rad, that were measured at the time `at_s`, after the newest command."""
         if not (math.isfinite(at_s) and _are_joints(joints_rad)):
             return
         times = self._times_s[: self._count]
@@ -165,8 +165,8 @@ class ServoLagEstimator:
     def _add(self, measured: Floats, wanted_s: Floats, step_s: float) -> None:
         """Add one measurement to the weighted means and variances of all lags.
 
-        measured (6,): measured joints, rad. wanted_s: times of the commands to compare, one per
-            lag. step_s: weight of the measurement.
+        measured (6,): measured joint angles, rad. wanted_s: times of the commands to compare, one
+            per lag. step_s: weight of the measurement.
         """
         times, joints = self._times_s[: self._count], self._joints[: self._count]
         # For times after the newest command, that command is used.
@@ -222,7 +222,7 @@ class ServoLagEstimator:
 
 
 def _are_joints(joints_rad: Floats) -> bool:
-    """Return whether joints (6,), rad, are plausible angles. NaN is not plausible."""
+    """Return whether joint angles (6,), rad, are plausible. NaN is not plausible."""
     return bool((np.abs(joints_rad) <= MAX_JOINT_RAD).all())
 
 
