@@ -166,8 +166,8 @@ class FingerTruth(Part):
     """The deviations of the finger, its marker and its motion from the nodes' assumptions.
 
     Finger frame: origin at the contact point of the fingertip's pad (the fingertip of all
-        messages), x along the finger towards the hand, z from the pad to the nail, y = z x x (cross
-        product).
+        messages), x along the finger towards the hand, z from the pad to the nail. The y axis is
+        the cross product of the z axis and the x axis.
     """
 
     radius_offset_m: Small = 0.0

@@ -19,11 +19,11 @@ class ArmPoseFit(Part):
     used: bool
     reason: str = Field(description="reason why the pose was left out; empty if it was used")
     shift_m: NonNegative = Field(
-        description="distance between the board poses from the camera and from the joints"
+        description="distance between the board poses from the camera and from the joint angles"
     )
     rotation_rad: NonNegative
     rms_px: NonNegative = Field(
-        description="reprojection error of the corners, with the pose computed from the joints"
+        description="reprojection error of the corners, with the pose from the joint angles"
     )
 
 
@@ -54,7 +54,7 @@ class ArmBase(Part):
         description="standard deviation of one coordinate of a corner"
     )
     arm_sigma_m: NonNegative = Field(
-        description="standard deviation per axis of the flange position computed from the joints"
+        description="standard deviation per axis of the flange position from the joint angles"
     )
     arm_sigma_rad: NonNegative
     poses: tuple[ArmPoseFit, ...]

@@ -271,8 +271,8 @@ class BagWriter:
 class Chunk:
     """The position and time range of a chunk in the file.
 
-    offset, length: position and size of the chunk, bytes.
-    times_ns: log times of the messages by channel number, ns.
+    offset, length: position and size (bytes) of the chunk. times_ns: log times of the messages by
+    channel number.
     """
 
     offset: int
@@ -310,7 +310,7 @@ class TopicInfo:
 class AttachmentInfo:
     """A description of a file that is attached to a bag.
 
-    offset, length: position and size of the attachment's record in the bag, bytes.
+    offset, length: position and size (bytes) of the attachment's record in the bag.
     """
 
     name: str
@@ -666,10 +666,11 @@ class BagReader:
         migration = self._find_migration(channel)
         if migration is None:
             raise BagError(
-                f'{self.path}: topic "{channel.topic}" was recorded when '
-                f"{channel.metadata.get('type', 'its type')} had other fields, and "
-                "messages/migrations.py does not contain a migration; read it with the code of "
-                "that time, or leave the topic out (`BagReader.frames` returns its bytes)"
+                f'{self.path}: topic "{channel.topic}": the recorded message type '
+                f"{channel.metadata.get('type', '')} has other fields than the current one, and "
+                "messages/migrations.py contains no migration for it; read the bag with the "
+                "version of flexsheet that recorded it, or leave out the topic "
+                "(`BagReader.frames` returns its messages as bytes)"
             )
         return ChannelDecoder(
             TOPICS[channel.topic],

@@ -1,9 +1,9 @@
-"""Publish and subscribe by ZeroMQ sockets in the asyncio loop.
+"""Publish and subscribe by ZeroMQ sockets in the asyncio event loop.
 
-A publisher binds and subscribers connect, in any order; either side may be restarted.  A subscriber
-reads plain (not asyncio) sockets in a callback of the loop and calls the handler there, which has
-the smallest latency of the designs in `benchmarks/messaging.py`.  No `recv` is ever pending, so no
-cancelled `recv` can lose a message.
+A publisher binds and subscribers connect, in any order; either side may be restarted. A subscriber
+reads plain (not asyncio) sockets in a callback of the event loop and calls the handler there, which
+has the smallest latency of the designs in `benchmarks/messaging.py`. No `recv` is ever pending, so
+no cancelled `recv` can lose a message.
 
 A subscriber has one socket per host, which identifies the host of each message.  From each host it
 accepts only messages of the writers that run there.  Sockets that other computers can reach are
@@ -158,7 +158,7 @@ class Source:
 class Publisher:
     """A publisher of one topic.
 
-    It needs a running asyncio loop if the topic is latched, or if `keys` or `local` is given.
+    It needs a running event loop if the topic is latched, or if `keys` or `local` is given.
 
     bind: endpoints, "ipc:///path" or "tcp://address:port". "tcp://127.0.0.1:*" selects a free port.
     keys: keys of the hosts that may connect over tcp; None: tcp is bound to the loopback interface.
@@ -305,7 +305,7 @@ class Publisher:
         if self._loop is None:
             self._on_refused(text)
             return
-        # After the end of the loop there is no handler left to report to.
+        # After the end of the event loop there is no handler left to report to.
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._on_refused, text)
 
@@ -346,7 +346,7 @@ class Publisher:
 
 
 class Subscriber:
-    """A subscriber of one topic, which calls `on_message(message, header)` on the loop's thread.
+    """A subscriber of one topic, which calls `on_message(message, header)` in the event loop.
 
     connect: endpoints of all writers. A writer may start later than the subscriber, or restart.
     counts: counters of superseded, lost and rejected messages.
@@ -418,7 +418,7 @@ class Subscriber:
             )
 
     def start(self) -> None:
-        """Connect, and start to deliver messages. This requires a running loop."""
+        """Connect, and start to deliver messages. This requires a running event loop."""
         if self._started:
             raise BusError(f'topic "{self.topic.name}": start() was called twice; call it once')
         try:
@@ -671,7 +671,7 @@ class _HostConnection:
         self._disconnected.clear()
 
     def _handle_monitor_events(self) -> None:
-        """Report the end of a connection, and connect again. This is a callback of the loop.
+        """Report the end of a connection, and connect again. This is a callback of the event loop.
 
         ZeroMQ itself does not reconnect after a rejected key or after corrupted data.
         """
@@ -704,7 +704,7 @@ class _HostConnection:
             self.open()
 
     def _read(self) -> None:
-        """Deliver a batch of the messages that have arrived. This is a callback of the loop."""
+        """Deliver a batch of the arrived messages. This is a callback of the event loop."""
         if self._socket is None or self._socket.closed or self._loop is None:
             return
         drained = False

@@ -90,7 +90,7 @@ class ClockTable:
 
 
 def shift_stamps(message: M, shift_ns: int) -> M:
-    """Return a message with its timestamps shifted, ns. A timestamp of 0 (none) remains 0."""
+    """Return a message with its timestamps (ns) shifted. A timestamp of 0 (none) remains 0."""
     moved = {
         name: max(1, value + shift_ns)
         for name in find_stamp_fields(type(message))

@@ -6,7 +6,7 @@ A publisher passes each message to the subscribers in its process. It sends the 
     `INLINE_BYTES` are copied, as for a socket, because a sender may reuse them. Larger arrays are
     shared. All arrays are read-only for the subscribers.
 
-A handler runs in a callback of the loop after the sender's callback, never inside `send`.
+A handler runs in a callback of the event loop after the sender's callback, never inside `send`.
 """
 
 from __future__ import annotations
@@ -175,7 +175,7 @@ class LocalConnection:
         return self._loop is None
 
     def open(self) -> None:
-        """Start to receive messages. This requires a running loop."""
+        """Start to receive messages. This requires a running event loop."""
         self._loop = asyncio.get_running_loop()
         for channel in self._channels:
             channel.add(self)

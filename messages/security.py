@@ -276,7 +276,7 @@ class ZapAuthenticator:
         self._socket.close(linger=0)
 
     def _answer(self) -> None:
-        """Answer all pending requests. This is a callback of the loop."""
+        """Answer all pending requests. This is a callback of the event loop."""
         while not self._socket.closed:
             try:
                 request = self._socket.recv_multipart(zmq.NOBLOCK)

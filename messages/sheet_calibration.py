@@ -32,7 +32,7 @@ class Fitted(Part):
 
 
 class LeftOutRow(Part):
-    """A measured row that was excluded as an outlier; `line` is its line in the file, from 1."""
+    """A measured push that was excluded as an outlier; `line` is its line in the file, from 1."""
 
     line: Annotated[int, Field(ge=1)]
     residual_ratio: float = Field(description="measured force divided by fitted force, minus one")

@@ -243,7 +243,7 @@ def decode(frames: Sequence[Any], expected: Topic | type[Message]) -> tuple[Mess
 
 
 def count_bytes(frames: Sequence[Any]) -> int:
-    """Return the total size of all frames, bytes."""
+    """Return the total size (bytes) of all frames."""
     return sum(map(len, frames))
 
 
