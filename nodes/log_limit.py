@@ -25,7 +25,7 @@ Key = tuple[tuple[str, str], ...]
 
 @dataclass(slots=True)
 class Repeats:
-    """Number of occurrences of a log record, and the time at which it was last logged, s."""
+    """Number of occurrences of a log record, and the time (s) at which it was last logged."""
 
     count: int = 0
     logged_s: float = float("-inf")

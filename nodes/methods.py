@@ -64,12 +64,11 @@ def estimate_median(values: Sequence[float]) -> Interval:
 class Trial:
     """Measurement of one method at one case: `run` is timed, `error` evaluates its result.
 
-    error: function from the result of `run` to the error in the family's unit, with an interval if
-    the error is estimated from random samples.
-    in_range: whether the method's valid range includes the case.
-    in_scene: whether the scene's working range includes the case.
-    size: size of the solved problem ({"skin_nodes": 1210}), reported with the case.
-    extra_metrics: function from the result of `run` to further figures, with units in their names.
+    error: function from the result of `run` to the error in the unit of the method family, with an
+    interval if the error is estimated from random samples. in_range: whether the method's valid
+    range includes the case. in_scene: whether the scene's working range includes the case. size:
+    size of the solved problem ({"skin_nodes": 1210}), reported with the case. extra_metrics:
+    function from the result of `run` to further figures, with units in their names.
     reference_uncertainty: uncertainty of the reference by figure: "error" or an extra metric.
     """
 
@@ -95,7 +94,8 @@ class Family:
     trials: function that yields the trials of all methods over a scene's working range; each must
         be run before the next one is requested.
     tolerance: function that returns the scene's tolerance for the error, in `unit`.
-    sweep_key: key of the case over which errors are plotted separately; None: no such plot.
+    sweep_key: key of a property of the cases; a separate plot shows the errors against this
+        property. None: no such plot.
     prepare: function that computes and caches the data for `trials`; it reports its progress.
     """
 

@@ -202,7 +202,7 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """Method that is called periodically; rate_parameter: node parameter with the rate, Hz."""
+    """Method that is called periodically; rate_parameter: node parameter with the rate (Hz)."""
 
     method: str
     rate_parameter: str
@@ -338,7 +338,7 @@ class Node:
         """Connect the ports to topics.
 
         topics: topic names by port, where they differ from the port's name: {"arm": "arm_left"}.
-        epoch: number that identifies one start of the node; default: the time of the start, ns.
+        epoch: number that identifies one start of the node; default: the time (ns) of the start.
         Raises TypeError if the message type of a topic differs from that of its port.
         """
         self.parameters = parameters

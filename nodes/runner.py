@@ -1,8 +1,8 @@
 """Run nodes live: connect their ports, run their timers and publish their status.
 
 The launcher writes a `ProcessConfig` to a file and starts a process with it, which runs one or
-several nodes in one event loop.  Nodes of one process exchange messages without serialization.  If
-one of them fails, the process ends.  A test can call `run_node` in its own loop.
+several nodes in one event loop. Nodes of one process exchange messages without serialization. If
+one of them fails, the process ends. A test can call `run_node` in its own event loop.
 """
 
 from __future__ import annotations

@@ -12,13 +12,13 @@ from contextlib import contextmanager
 def handle_signals(
     handler: Callable[[], object], *numbers: int, ignore_afterwards: bool = False
 ) -> Iterator[None]:
-    """Call `handler` in the running loop for each of these signals, until the context ends.
+    """Call `handler` in the running event loop for each of these signals, until the context ends.
 
     ignore_afterwards: whether to ignore the signals afterwards instead of restoring their actions,
         for a process that ends after its clean-up.
 
-    When the loop removes its handler of SIGINT, it installs Python's default, which raises an
-    exception.  The signals are therefore blocked until the former actions are restored.
+    When the event loop removes its handler of SIGINT, it installs Python's default, which raises an
+    exception. The signals are therefore blocked until the former actions are restored.
     """
     loop = asyncio.get_running_loop()
     former = {number: signal.getsignal(number) for number in numbers}

@@ -164,7 +164,7 @@ def test_the_simulated_body_follows_the_same_indentation(case: Case) -> None:
         )
     with pytest.raises(ValueError, match="the displacement has 5 vertices, but the skin has"):
         true.displaced(vertices, triangles, displacement[:5])
-    with pytest.raises(ValueError, match="no triangle of the skin has an area"):
+    with pytest.raises(ValueError, match="all triangles of the skin have zero area"):
         true.displaced(vertices + 1.0, triangles[:0], displacement)
 
 

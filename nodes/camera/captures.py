@@ -48,15 +48,15 @@ def _import_introspected(name: str, version: str) -> Any:
 
 
 def _monotonic_ms(real_time_ns: int) -> float:
-    """Convert a system time (ns since 1970) to a time of the monotonic clock, ms."""
+    """Convert a system time (ns since 1970) to a time (ms) of the monotonic clock."""
     return (real_time_ns - time.time_ns() + time.monotonic_ns()) * 1e-6
 
 
 class CapturedDevice(ABC):
     """The base class of captures, which start their device when it is first used.
 
-    stamp_ms: timestamp of the grabbed frame on the monotonic clock, ms; 0 if it is unknown.
-    wanted: requested format by OpenCV property.
+    stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if it is unknown. wanted:
+    requested format by OpenCV property.
     """
 
     def __init__(self, device: str) -> None:
@@ -293,7 +293,7 @@ class RealSenseCapture(CapturedDevice):
         return True
 
     def _find_stamp_ms(self, frame: Any) -> float:
-        """Return the middle of the exposure as a time of the monotonic clock, ms; 0 if unknown."""
+        """Return the middle of the exposure as a time (ms) of the monotonic clock; 0 if unknown."""
         rs = self._rs
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return 0.0

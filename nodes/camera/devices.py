@@ -30,9 +30,8 @@ def open_reader(
 ) -> Reader:
     """Open a source of images for a scene's camera.
 
-    now: function that returns the current time, ns.
-    requested: sensor regions that a camera must deliver; None: full sensors.
-    Raises DeviceError if the source cannot be opened.
+    now: function that returns the current time (ns). requested: sensor regions that a camera must
+    deliver; None: full sensors. Raises DeviceError if the source cannot be opened.
     """
     if isinstance(source, OpenCvSource):
         return CameraReader(source, camera, now, requested)

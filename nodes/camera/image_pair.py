@@ -30,7 +30,7 @@ class DeviceError(FlexsheetError, RuntimeError):
 
 
 class Region(NamedTuple):
-    """A part of a sensor: column and row of its first pixel (from zero), width and height, px."""
+    """A part of a sensor: column and row of its first pixel (from zero), width and height (px)."""
 
     column: Annotated[int, Field(ge=0)]
     row: Annotated[int, Field(ge=0)]

@@ -44,7 +44,7 @@ RATE_FRAMES = 61
 
 @dataclass(frozen=True, slots=True)
 class CapturedFrame:
-    """An image of one camera with two estimates of its mid-exposure time, ns.
+    """An image of one camera with two estimates (ns) of its mid-exposure time.
 
     by_arrival_ns: computed from the time of arrival. by_stamp_ns: computed from the driver's
     timestamp; None without a timestamp.

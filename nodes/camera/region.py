@@ -24,7 +24,7 @@ NEAREST_M = 1e-3
 
 
 class ExplicitRegions(LimitedModel):
-    """The sensor regions in a launch file: [column, row, width, height] of each view, px."""
+    """The sensor regions in a launch file: [column, row, width, height] (px) of each view."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

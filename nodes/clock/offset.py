@@ -80,7 +80,7 @@ def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float)
 def fit_drift(samples: list[Sample]) -> tuple[float, float]:
     """Fit a line to the offsets of the samples, and return its value and slope.
 
-    The value is that of the line at the newest sample, minus the offset of this sample, ns. The
+    The value (ns) is that of the line at the newest sample, minus the offset of this sample. The
     least squares are weighted by the inverse square of the bounds, which favours pings that did not
     wait in a queue. Both results are 0 if the samples span less than `FIT_SPAN_NS`.
     """

@@ -1,7 +1,8 @@
-"""Compute the boxes by which the console page draws the links of the arms, and their poses.
+"""Compute the boxes that represent the arm links on the console page, and the links' poses.
 
-The lengths come from the model of the arm in the scene. The thicknesses are approximate. The origin
-of the frame of a link is on the joint axis of the link.
+The lengths come from the model of the arm in the scene. The thicknesses are approximate. A box is
+fixed in the frame of its link, whose origin is on the axis of the joint that moves the link. The
+frame of the last link is the flange frame.
 """
 
 from __future__ import annotations

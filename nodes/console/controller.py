@@ -1,4 +1,4 @@
-"""Execute the requests of the console page's viewers in the console node's asyncio loop.
+"""Execute the requests of the console page's viewers in the console node's event loop.
 
 The "eye view" is the image that a user sees: a camera in the simulator traces the projected frame
 from the position of the user's eye.
@@ -109,7 +109,7 @@ class SceneController:
         self._due_s = now_s + SETTLE_S
 
     def apply_sliders(self, now_s: float) -> bool:
-        """Publish the changed scene if the sliders rest, and return whether it was published.
+        """If the sliders have stopped moving, publish the changed scene and return True.
 
         Raise SceneChoiceError for invalid slider positions.
         """

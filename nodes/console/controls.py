@@ -21,7 +21,7 @@ def make_callback(request: Request, name: str, *values: Any) -> Callable[[Any], 
 def on_value(handle: Any, changed: Callable[[Any], None]) -> None:
     """Call `changed` with each value that a viewer sets, but not with values that the page sets."""
 
-    # A coroutine runs on viser's loop, so that values arrive in order.
+    # A coroutine runs in viser's event loop, so that values arrive in order.
     async def on_update(event: Any) -> None:
         if event.client_id is not None:
             changed(event.target.value)

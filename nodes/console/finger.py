@@ -68,7 +68,7 @@ class FingerIntent:
             )
 
     def target_m(self, picker: SurfacePicker) -> Floats:
-        """Return the requested position (3,) of the fingertip on an object, world frame, m."""
+        """Return the requested world position (3,), in m, of the fingertip on an object."""
         origin, direction = np.array(self.position.origin_m), np.array(self.position.direction)
         return picker.pick(origin, direction, -HOVER_M if self.lifted else self.depth_m)
 

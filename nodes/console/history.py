@@ -28,7 +28,7 @@ class History:
             self._samples.popleft()
 
     def columns(self) -> tuple[Floats, ...]:
-        """Return the times (n,) of the samples, s, relative to the latest sample, and all series.
+        """Return the times (n,), in s relative to the latest sample, and all series.
 
         The series (n,) are in ms and contain NaN for missing values.
         """
@@ -40,7 +40,7 @@ class History:
         return (times, *values.T)
 
     def latest_and_max(self) -> dict[str, tuple[float, float]]:
-        """Return the latest sample and the maximum of each series, ms, or NaN without samples."""
+        """Return the latest sample and the maximum (ms) of each series, or NaN without samples."""
         found = {}
         for name, values in zip(SERIES, self.columns()[1:], strict=True):
             valid = values[np.isfinite(values)]

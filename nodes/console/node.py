@@ -171,7 +171,7 @@ class Console(Node):
         next(out for out in self.outputs.values() if out.topic.message is kind).publish(message)
 
     def _request(self, name: str, *values: Any) -> None:
-        """Pass a viewer's request to the node's loop. Any thread may call this method."""
+        """Pass a viewer's request to the node's event loop. Any thread may call this method."""
         self._loop.call_soon_threadsafe(self._call, self.operator.handle_request, name, *values)
 
     def _call(self, function: Any, *values: Any) -> None:

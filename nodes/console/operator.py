@@ -60,7 +60,7 @@ NO_RECORDER = (
 
 
 class Operator:
-    """The mediator between the page and the running graph, in the console node's asyncio loop."""
+    """The mediator between the page and the running graph, in the console node's event loop."""
 
     def __init__(
         self,

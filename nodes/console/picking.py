@@ -62,7 +62,7 @@ class SurfacePicker:
         return self._within(apply(self._world_from_object, inside))
 
     def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
-        """Return the next point (3,) of the finger on a path to the target, m.
+        """Return the next point (3,), in m, of the finger on a path to the target.
 
         The step is at most `max_step_m` long and reaches no deeper into the object than `depth_m`
         or than the current finger. If a step around the object makes no progress, the step is

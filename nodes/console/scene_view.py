@@ -70,7 +70,7 @@ VIEWPOINTS: dict[str, tuple[Any, Any] | None] = {
     "near": ((0.13, 0.1, 0.6), (0.0, 0.0, 0.0)),
     EYE_VIEW: None,
 }
-"""The camera position and target of each view, world frame, m, or None for the user's eyes."""
+"""The camera position and target (m, world frame) of each view, or None for the user's eyes."""
 
 Drag = Callable[[Floats, Floats], None]
 """A callback that receives the origin (3,), m, and the direction (3,) of a ray, world frame, from
@@ -368,7 +368,7 @@ class SceneView:
         )
 
     def _make_touchable(self, handle: Any) -> None:
-        # Coroutines run on the server's own loop, which keeps the order of the mouse events.
+        # Coroutines run in the server's own event loop, which keeps the order of the mouse events.
         async def dragged(event: Any) -> None:
             if event.phase == "end":
                 self._released()
@@ -385,7 +385,7 @@ class SceneView:
 
 
 def lift_sheet(points: Floats, lift_m: float) -> Floats:
-    """Move the points (n, 3) of the sheet towards the user along its mean normal, m."""
+    """Move the points (n, 3), in m, of the sheet towards the user along its mean normal."""
     first, last = points[0], points[-1]
     right, left = points[COLUMNS - 1], points[-COLUMNS]
     normal = np.cross(right - left, last - first)

@@ -35,7 +35,7 @@ def compute_sheet_points(
     fingertip: Floats | None,
     finger_radius_m: float,
 ) -> Floats | None:
-    """Compute the vertices (ROWS * COLUMNS, 3) of the drawn sheet, world frame, m.
+    """Compute the world positions (ROWS * COLUMNS, 3), in m, of the drawn sheet's vertices.
 
     Rows follow each other upwards, and columns to the right. The poses (4, 4) are those of the
     sheet's edges. fingertip (3,): world frame, m, or None. Return None if the distance of the edges

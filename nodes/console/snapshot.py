@@ -25,11 +25,11 @@ RAY_POSITIONS = (-0.55, 0.0, 0.55)
 
 @dataclass(frozen=True, slots=True)
 class SceneSnapshot:
-    """The contents of the 3D view at one time, in the world frame, m. Unknown values are None.
+    """The contents of the 3D view at one time, in the world frame.
 
-    links: poses (7, 4, 4) of each arm's links, by side. edges: pose (4, 4)
-    of each clamped edge, by side. sheet (n, 3): points of the sheet. skin (s, 3): deformed
-    vertices. finger (3,): fingertip. finger_valid: whether the fingertip is tracked.
+    Lengths are in m; unknown values are None. links: poses (7, 4, 4) of each arm's links, by side.
+    edges: pose (4, 4) of each clamped edge, by side. sheet (n, 3): points of the sheet. skin (s,
+    3): deformed vertices. finger (3,): fingertip. finger_valid: whether the fingertip is tracked.
     """
 
     links: dict[str, Floats]

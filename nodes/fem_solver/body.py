@@ -67,7 +67,7 @@ def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
 
 
 def find_front_point(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
-    """Return the surface point (3,) nearest to the user, m, mesh frame.
+    """Return the surface point (3,), in m, mesh frame, that is nearest to the user.
 
     rest (s, 3): undeformed skin nodes, m.
     """

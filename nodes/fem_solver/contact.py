@@ -149,8 +149,8 @@ class NormalContact:
 class Drag:
     """The tangential contact forces between skin and finger.
 
-    nodes (k,): indices of the loaded contact nodes. forces (k, 2): forces along the two tangents of
-    each of these nodes, N. force_n (3,): total tangential force on the finger, N.
+    nodes (k,): indices of the loaded contact nodes. forces (k, 2): forces (N) along the two
+    tangents of each of these nodes. force_n (3,): total tangential force on the finger, N.
     """
 
     nodes: Ints
@@ -231,7 +231,7 @@ class SphereContact:
     def penetration(
         self, points: Floats, normals: Floats, centre: Floats, direction: Floats
     ) -> Floats:
-        """Return the penetration (q,) of skin points into the rigid finger, m.
+        """Return the penetration (q,), in m, of skin points into the rigid finger.
 
         The penetration is negative outside the finger. points, normals (q, 3): skin points and
         their outward normals. centre (3,): centre of the sphere. direction (3,): outward surface
@@ -368,7 +368,7 @@ def _search_step(
 ) -> float:
     """Return the largest fraction (1, 1/2, 1/4...) of a step that decreases the contact energy.
 
-    forces, target (k,): nodal forces at the start and at the end of the full step, N. problem:
+    forces, target (k,): nodal forces (N) at the start and at the end of the full step. problem:
     compliance, compliance at the contact points, penalty and depths, as in `solve_penalty_contact`.
     """
     compliance, compliance_at_points, penalty, depths = problem

@@ -35,7 +35,7 @@ class SchedulerError(precompute_table.WorkersError):
     def __init__(self, address: str, what: str, remedy: str) -> None:
         super().__init__(
             f'scheduler "{address}": {what}; {remedy}, or set scheduler to null to use the '
-            "processors of this machine"
+            "processors of this computer"
         )
 
 

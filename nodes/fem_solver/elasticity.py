@@ -29,7 +29,7 @@ class SolidMeshError(FlexsheetError, ValueError):
 
 
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
-    """Return Lame's constants lambda and mu, Pa.
+    """Return Lame's constants lambda and mu, in Pa.
 
     Raise ValueError unless Young's modulus is positive and Poisson's ratio is above
     -1 and at most 0.4999.

@@ -2,7 +2,7 @@
 
 This is the reference method, against which the faster ones are measured. The finger is a rigid
 sphere. A penalty pressure acts on contact points of the skin (the surface of the body). It first
-grows with the square of the penetration, so that forces have a continuous slope, and then linearly.
+grows with the square of the penetration, so forces have a continuous slope, and then linearly.
 Under a pressure equal to Young's modulus the penetration is about a hundredth of the radius.
 Newton's method with a line search minimises the sum of elastic and contact energy. An inverted
 element has infinite energy, so it is never accepted.
@@ -75,8 +75,8 @@ class EquilibriumState:
 class _StickState:
     """The contact points that stick to the finger.
 
-    points (k,): indices of the contact points. offsets (k, 3): positions on the finger at which the
-    points stick, relative to its centre, m. normals (k, 3): unit normals of the sphere at the
+    points (k,): indices of the contact points. offsets (k, 3): positions (m) on the finger at which
+    the points stick, relative to its centre. normals (k, 3): unit normals of the sphere at the
     points.
     """
 

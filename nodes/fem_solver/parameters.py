@@ -57,7 +57,7 @@ class FemSolverParameters(NodeParameters):
     scheduler: str | None = Field(
         default=None,
         description="Address of a dask.distributed scheduler, such as tcp://host:8786, whose "
-        "workers compute the nonlinear table. null: processes of this machine compute it.",
+        "workers compute the nonlinear table. null: processes of this computer compute it.",
     )
     prediction_horizon_s: NonNegative = Field(
         default=0.0,

@@ -113,7 +113,7 @@ class ResponseBudget:
         )
 
     def require_memory(self, skin_spacing_m: float) -> None:
-        """Raise MemoryError if the machine has too little free memory."""
+        """Raise MemoryError if the computer has too little free memory."""
         require_memory(
             self.working_bytes + self.table_bytes,
             f"the precomputation of {self.loads} loads on {self.skin_nodes} skin nodes",
@@ -277,7 +277,7 @@ def make_tangents(normals: Floats) -> Floats:
 
 
 def require_memory(required_bytes: int, what: str, remedy: str) -> None:
-    """Raise MemoryError if the machine has less free memory than required.
+    """Raise MemoryError if the computer has less free memory than required.
 
     what: computation that needs the memory, for the error text. remedy: advice for the error text.
     """
@@ -287,7 +287,7 @@ def require_memory(required_bytes: int, what: str, remedy: str) -> None:
     if required_bytes > free:
         raise MemoryError(
             f"{what} needs {required_bytes / 2**30:.1f} GiB of memory, but only "
-            f"{free / 2**30:.1f} GiB are free on this machine; {remedy}"
+            f"{free / 2**30:.1f} GiB are free on this computer; {remedy}"
         )
 
 

@@ -2,7 +2,7 @@
 
 Snapshots (`snapshots`) are solutions for pushes at single points. They are independent of each
 other and take most of the time. They are solved by an executor of `concurrent.futures`: processes
-of this machine or the workers of a cluster (`dask_executor`). Each snapshot is stored when it is
+of this computer or the workers of a cluster (`dask_executor`). Each snapshot is stored when it is
 solved.
 """
 
@@ -101,7 +101,7 @@ class TableBudget:
 
 @contextmanager
 def local_processes(count: int) -> Iterator[Executor]:
-    """Yield an executor with `count` processes of this machine.
+    """Yield an executor with `count` processes of this computer.
 
     If an exception leaves the context, the processes stop without finishing their jobs.
     """
@@ -181,8 +181,8 @@ def compute_table(
     """Load the cached table, or compute and store it.
 
     model: linear response of the same body. workers: number of workers of the executor on this
-    machine. on_quick: function that receives a coarse table, which is ready much earlier than the
-    complete one; None to omit the coarse table. Raise MemoryError if this machine has too little
+    computer. on_quick: function that receives a coarse table, which is ready much earlier than the
+    complete one; None to omit the coarse table. Raise MemoryError if this computer has too little
     memory. Raise LostWorkersError if the executor loses its workers.
     """
     entry = make_table_cache(spec)

@@ -2,8 +2,8 @@
 
 A snapshot is the solution for pushes at one surface point (sample point) to several depths, for a
 neo-Hookean material. It is solved for a Young's modulus of 1 Pa, because the modulus only scales
-the forces. A job contains all inputs of a snapshot as arrays, so that another process or machine
-can solve it.
+the forces. A job contains all inputs of a snapshot as arrays, so another process or computer can
+solve it.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Snapshot:
     """The solution of a snapshot job.
 
     rest (s, 3): undeformed skin nodes, m. faces (f, 6): six-node triangles of the skin. depths_m
-    (k,): push depths. moved (k, s, 3): skin displacement at these depths, m. force_n (k, 3): force
+    (k,): push depths. moved (k, s, 3): skin displacement (m) at these depths. force_n (k, 3): force
     on the finger for a Young's modulus of 1 Pa. reached: number of converged depths. Entries at
     deeper depths repeat the last converged solution.
     """
@@ -272,9 +272,10 @@ def make_snapshot_job(
 def make_fine_job(
     spec: MeshSpec, sample: SamplePoint, *, poisson_ratio: float, finger_radius_m: float
 ) -> SnapshotJob | None:
-    """Return the job for a push on a fine mesh, which corrects the forces of a table.
+    """Return the job for a push on a fine mesh.
 
-    Return None unless the body is a cylinder on a strip support.
+    The solution of this job corrects the forces of a precomputed table. Return None unless the body
+    is a cylinder on a strip support.
     """
     spacing_m = FINE_RATIO * _spacing_m(spec, finger_radius_m)
     near_m = FINE_NEAR_RATIO * finger_radius_m

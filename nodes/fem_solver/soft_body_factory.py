@@ -163,7 +163,7 @@ class SoftBodyFactory:
 
     @contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
-        """Yield the executor of snapshots, and the number of its workers on this machine."""
+        """Yield the executor of snapshots, and the number of its workers on this computer."""
         if self.scheduler is not None:
             from flexsheet.nodes.fem_solver.dask_executor import (
                 connect_workers,  # late: it is slow to import

@@ -63,7 +63,7 @@ class Table:
     """The responses to pushes at m contact nodes to L depths, for a Young's modulus of 1 Pa.
 
     depths_m (L,): push depths, of which the first is 0. fields (m, L - 1, 3 s) float32:
-    displacement of the s skin nodes at all depths except 0, m. force_n (m, L, 3): force on the
+    displacement (m) of the s skin nodes at all depths except 0. force_n (m, L, 3): force on the
     finger. reach_m (m,): maximum depth with a valid solution at each contact node.
     """
 
@@ -329,9 +329,9 @@ class TableSoftBody:
     ) -> None:
         """Precompute the force curves of all contact nodes.
 
-        bounds (b, 3): positions of skin nodes that must not be touched, m. name: name of the method
-        in messages. push_depth_m: depth at which the force curve ends. linear_depth_m: depth at
-        which the stiffness is evaluated.
+        bounds (b, 3): positions (m) of skin nodes that must not be touched. name: name of the
+        method in messages. push_depth_m: depth at which the force curve ends. linear_depth_m: depth
+        at which the stiffness is evaluated.
         """
         self.name = name
         from scipy.linalg.blas import sgemv

@@ -12,8 +12,8 @@ offset s:
 
 Here y_j is the filtered depth of measurement j, and y'_j is its change per period. The filter is an
 alpha-beta filter: it estimates the depth and its rate, so it does not lag behind a depth that
-changes at a constant rate. The state changes over one period by an exact linear map. The loop is
-stable if all eigenvalues of this map are inside the unit circle.
+changes at a constant rate. The state changes over one period by an exact linear map. The control
+loop is stable if all eigenvalues of this map are inside the unit circle.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import scipy
 from flexsheet.nodes.arrays import Floats
 
 MIN_DECAY_PER_S = 0.5
-"""The minimum decay rate of the slowest mode at which the loop counts as stable."""
+"""The minimum decay rate of the slowest mode at which the control loop counts as stable."""
 
 GAIN_MARGIN = 1.5
 DELAY_MARGIN_S = 0.02
@@ -178,7 +178,7 @@ def compute_critical_slope(
     towards_finger: bool,
     max_slope: float = MAX_SLOPE,
 ) -> float:
-    """Return the smallest magnitude of slope at which the loop is unstable, at most `max_slope`.
+    """Return the smallest slope magnitude with an unstable control loop, at most `max_slope`.
 
     towards_finger: whether the slopes are negative, which moves the sheet to the finger.
 

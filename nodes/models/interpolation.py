@@ -1,6 +1,6 @@
 """Interpolate between two values, and between the points of predicted paths.
 
-The points of a predicted path have the times 0, step, 2 step, ... after its start.
+The points of a predicted path are at the times 0, step, 2 step, ... after its start.
 """
 
 from __future__ import annotations

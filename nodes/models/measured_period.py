@@ -27,7 +27,7 @@ class MeasuredPeriod:
         self._last_ns = 0
 
     def add(self, source_ns: int) -> float:
-        """Add a message, and return the period, s.
+        """Add a message, and return the period (s).
 
         source_ns: source timestamp of the message, which is the time of its camera exposure.
         """

@@ -28,7 +28,7 @@ The remaining acceleration is used to follow the target.
 
 
 def closing_speed(distance: Floats | float, deceleration: Floats | float, step_s: float) -> Floats:
-    """Return the maximum speeds (n,) at which a point can still stop within distances (n,) >= 0, m.
+    """Return the maximum speeds (n,) at which a point can stop within distances (n,) >= 0 (m).
 
     In each step, the point moves by speed * step_s, and then its speed decreases by deceleration *
     step_s. Therefore w^2/(2 a) + w dt/2 = distance, with speed w, deceleration a and step dt. A

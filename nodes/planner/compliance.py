@@ -73,8 +73,8 @@ skin is a cue (Bergmann Tiest & Kappers 2009).  0.22: if neither work nor termin
 (Tan et al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
-"""The maximum advance of the sheet per depth of the push.  With 0.5, the sheet feels 1.5 times as
-stiff.  The bounds for a stable loop with the hand are usually lower."""
+"""The maximum advance of the sheet per depth of the push. With 0.5, the sheet feels 1.5 times as
+stiff. The bounds for a stable control loop of sheet and hand are usually lower."""
 
 SLOPE_TOLERANCE = 0.03
 """The amount by which a slope may exceed its bound, since the bounds contain larger margins."""
@@ -123,7 +123,7 @@ class ObjectCurve:
 
     @classmethod
     def from_rows(cls, rows: Floats) -> ObjectCurve:
-        """Make the curve from rows (n, 2) of depth, m, and force, N."""
+        """Make the curve from an array (n, 2) with the columns depth (m) and force (N)."""
         return cls(np.ascontiguousarray(rows[:, 0]), np.ascontiguousarray(rows[:, 1]))
 
     @classmethod
@@ -170,9 +170,9 @@ def make_stretch_limits(
 ) -> StretchLimits:
     """Return the limits of the stretch within the usable fraction of the scene's limits.
 
-    bounds: bounds on the offset's slope for a stable loop with the hand.
-    The edge force is limited for a sheet that nothing pushes.  `render_force` limits the additional
-    force of a push.
+    bounds: bounds on the offset's slope for a stable control loop of sheet and hand. The edge force
+    is limited for a sheet that nothing pushes. `render_force` limits the additional force of a
+    push.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -214,7 +214,7 @@ class RenderedForce:
 
     @property
     def normal_offset_m(self) -> Floats:
-        """Return the distance (n,) of the sheet behind the object's tangent plane, m."""
+        """Return the distance (n,), in m, of the sheet behind the object's tangent plane."""
         return self.depths_m - self.indentation_m
 
     @property
@@ -331,10 +331,10 @@ def _saturate(indentation: Floats, maximum: float) -> Floats:
 class Compliance:
     """The offset of the sheet as a function of the depth in one object, at a constant stretch.
 
-    note: text about forces that the sheet cannot render; empty if it can render all forces.
-    centre: rendered forces of a push at the sheet's centre.
-    _nodes: |x| and |y| of the positions on the sheet at which the offset was computed, m.
-    _indentation, _growth: indentation at these positions over the depth, and its derivative.
+    note: text about forces that the sheet cannot render; empty if it can render all forces. centre:
+    rendered forces of a push at the sheet's centre. _nodes: |x| and |y| (m) of the positions on the
+    sheet at which the offset was computed. _indentation, _growth: indentation at these positions
+    over the depth, and its derivative.
     """
 
     stretch_ratio: float

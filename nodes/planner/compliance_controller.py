@@ -43,7 +43,8 @@ class ComplianceController:
         "constant_stretch" uses the minimum stretch.
     hysteresis_ratio: fraction of the energy of loading that the rubber loses in a cycle; None: the
         value in the scene.
-    bounds: bounds on the offset's slope for a stable loop with the hand; None if there is no hand.
+    bounds: bounds on the offset's slope for a stable control loop of sheet and hand; None if there
+        is no hand.
     delay_s: time from a measured depth until the sheet has moved.
     bandwidth_rad_per_s: bandwidth of the depth's filter; None without bounds.
     """

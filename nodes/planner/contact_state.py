@@ -42,8 +42,11 @@ MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
 """The maximum plausible distance of a finger from the object's origin, and its maximum speed."""
 
 MAX_TILT_RAD = 1.4
-"""The maximum tilt of the sheet in any scene.  Two normals within this tilt are never opposite, so
-that the shortest rotation between them is unique."""
+"""The maximum tilt of the sheet in any scene.
+
+Two normals within this tilt are never opposite, so the shortest rotation between them is
+unique.
+"""
 
 MIN_LIFT_M = 2e-4
 """The minimum height of the object's rim around the contact above which the contact is reported as

@@ -1,4 +1,7 @@
-"""Compute and cache the bounds on the offset's slope for a stable loop with the hand."""
+"""Compute and cache bounds on the slope d(sheet offset) / d(finger depth).
+
+Within these bounds, the closed control loop of sheet and hand is stable.
+"""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class HysteresisCorrection:
         self._depth_m, self._direction = 0.0, 1.0
 
     def update(self, depth_m: float) -> float:
-        """Add a depth of the finger, m, and return the ratio of force to elastic force.
+        """Add a depth (m) of the finger, and return the ratio of force to elastic force.
 
         Each contact begins with loading. A repeated depth does not change the ratio.
         """

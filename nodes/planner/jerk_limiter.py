@@ -43,8 +43,8 @@ class JerkBounds:
 class JerkLimitedState:
     """The motion of the sheet with the state of the jerk limiter.
 
-    mean_velocity, acceleration: means (7,) over the last step of linear motion, rotation and
-        stretch ratio.
+    mean_velocity, acceleration: values (7,) for translation (3), rotation (3) and stretch ratio
+    (1), averaged over the last time step.
     """
 
     sheet: SheetMotion

@@ -33,8 +33,8 @@ class OscillationWatchdog:
     """A watchdog that stops the motion of the sheet's offset if this motion drives an oscillation.
 
     The sheet delivers energy to the finger if the integral of the offset over the depth is positive
-    in a cycle.  Voluntary motion against the sheet loses energy to the sheet.  The watchdog is
-    therefore triggered only by an unstable loop.
+    in a cycle. Voluntary motion against the sheet loses energy to the sheet. The watchdog is
+    therefore triggered only by an unstable control loop.
 
     weight: factor on the offset's motion, from 1 (follows the finger) to 0 (at rest).
     triggers: number of oscillations that were stopped.

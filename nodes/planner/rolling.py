@@ -34,11 +34,10 @@ RIM_RADIUS_M = 0.03
 class SheetContact:
     """A contact of the sheet with the object.
 
-    point, normal: surface point (3,) m and unit normal (3,).
-    shape_operator: derivative (3, 3) of the normal along the surface, 1/m.
-    axes: (3, 3); its columns are the axes of the sheet, the third column is the normal.
-    position_sheet_m: (x, y) of the contact on the sheet.
-    lift_m: distance between the sheet's plane and the point; 0 unless the object is concave there.
+    point, normal: surface point (3,) m and unit normal (3,). shape_operator: derivative (3, 3), in
+    1/m, of the normal along the surface. axes: (3, 3); its columns are the axes of the sheet, the
+    third column is the normal. position_sheet_m: (x, y) of the contact on the sheet. lift_m:
+    distance between the sheet's plane and the point; 0 unless the object is concave there.
     """
 
     point: Floats
@@ -118,8 +117,8 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
 def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     """Return the twist (6,) of the rolling sheet's centre while the contact moves at `rate` (3,).
 
-    The twist is linear velocity, m/s, and angular velocity, rad/s.  Without spin, the angular
-    velocity is n x dn/dt with the normal n.  Without slip, the sheet's point in contact is at rest.
+    The twist is linear velocity (m/s) and angular velocity (rad/s). Without spin, the angular
+    velocity is n x dn/dt with the normal n. Without slip, the sheet's point in contact is at rest.
     """
     tangential = rate - contact.normal * (rate @ contact.normal)
     angular = cross(contact.normal, contact.shape_operator @ tangential)

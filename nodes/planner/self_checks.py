@@ -83,7 +83,10 @@ class MeasuredForceCheck:
         self._monitor = ResidualMonitor(1, threshold=MAX_FORCE_RATIO)
 
     def add_push(self, push: PlannedPush) -> None:
-        """Add a planned push, and check the forces that were measured at least QUIET_S earlier."""
+        """Add a planned push, and compare older measured forces with the sheet model.
+
+        The compared forces were measured at least QUIET_S before this push takes effect.
+        """
         self._pushes.append(push)
         limit_ns = push.valid_at_ns - round(1e9 * QUIET_S)
         while self._waiting and self._waiting[0][0] <= limit_ns:

@@ -1,4 +1,4 @@
-"""Compute the sheet's offset from measured depths, so that the loop with the hand is stable."""
+"""Compute the sheet's offset from depths so that the control loop with the hand is stable."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ OffsetAtDepth = Callable[[float], float]
 class StabilizedOffset:
     """A filter that computes the sheet's offset behind the object's tangent plane.
 
-    The measured depth is filtered by the filter of `hand_loop`.  It is not predicted over the whole
-    delay, because this would shift the least stable frequency of the loop into the range of hand
-    oscillation.  The offset never exceeds the depth, so that the sheet stays in contact with a
+    The measured depth is filtered by the filter of `hand_loop`. It is not predicted over the whole
+    delay, because this would shift the least stable frequency of the control loop into the range of
+    hand oscillation. The offset never exceeds the depth, so the sheet stays in contact with a
     finger that moves away.
     """
 
@@ -37,9 +37,8 @@ class StabilizedOffset:
     ) -> tuple[float, float]:
         """Return the offset (m) and its rate (m/s) after a measurement of the depth.
 
-        offset_at_depth: function from the depth to the offset, m.
-        step_s: time since the last measurement.
-        bandwidth_rad_per_s: bandwidth of the depth's filter; infinite for no filter.
+        offset_at_depth: function from the depth (m) to the offset (m). step_s: time since the last
+        measurement. bandwidth_rad_per_s: bandwidth of the depth's filter; infinite for no filter.
         delay_s: time from a measurement until the sheet has moved.
         """
         if measured_depth_m <= 0.0:

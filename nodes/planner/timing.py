@@ -62,7 +62,7 @@ class ActuationDelayEstimator:
         self._delays_s: dict[Side, float] = {}
 
     def on_fingertip(self, age_s: float) -> None:
-        """Add the age of a usable fingertip at the time of its publication, s."""
+        """Add the age (s) of a usable fingertip at the time of its publication."""
         before_s = age_s if self._age_s is None else self._age_s
         self._age_s = before_s + AGE_WEIGHT * (age_s - before_s)
 

@@ -170,7 +170,7 @@ class SheetTrajectoryPlanner:
         moved_m: float,
         speed_m_per_s: float,
     ) -> float:
-        """Update the offset behind the tangent plane, and return the rate of the offset, m/s.
+        """Update the offset behind the tangent plane, and return the rate (m/s) of the offset.
 
         moved_m, speed_m_per_s: predicted motion of the finger along the object's normal.
         """

@@ -7,7 +7,7 @@ screen. A' is the point of the line V-C' at the depth of A. If the point is draw
 sees it at A.
 
 The actual screen is one plane, or the four triangles between the pushed point and the sheet's
-corners. All points are in the world frame, m. Points are invalid and not moved if
+corners. All points are in the world frame, in m. Points are invalid and not moved if
 
 - the eye or the projector sees the screen edge-on, within `GRAZING_SINE`, or from the other side;
 - the point is not in front of the eye, or its C is behind the eye or the projector.
@@ -119,7 +119,7 @@ def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
 
 
 def pixel_from_screen(lens: Lens, world_from_projector: Floats) -> Floats:
-    """Return the homography (3, 3) from (x, y, 1) on the plane z = 0, m, to projector pixels.
+    """Return the homography (3, 3) from (x, y, 1), in m, on the plane z = 0 to projector pixels.
 
     The projector is modelled as a pinhole, without lens distortion. world_from_projector (4, 4):
     pose.

@@ -51,7 +51,7 @@ class DisplayLatencyEstimator:
         return self._last_swap_ns + max(swaps, 1) * self._period_ns + self._light_ns
 
     def record_drawn(self, begun_ns: int, drawn_ns: int) -> int:
-        """Record the drawing time of a frame without a window, and return its display time, ns.
+        """Record the drawing time of a frame without a window, and return its display time (ns).
 
         begun_ns, drawn_ns: start and end of drawing.
         """
@@ -60,7 +60,7 @@ class DisplayLatencyEstimator:
         return drawn_ns + self._light_ns
 
     def record_shown(self, begun_ns: int, drawn_ns: int, swapped_ns: int) -> int:
-        """Record a frame that a window has shown, and return its display time, ns.
+        """Record a frame that a window has shown, and return its display time (ns).
 
         begun_ns, drawn_ns: start and end of drawing. swapped_ns: time of the swap.
         """

@@ -74,7 +74,7 @@ class EyePredictor:
         return eye.model_copy(update={"centre_world_m": eye.centre_world_m + shift})
 
     def _velocity(self) -> Floats:
-        """Return the velocity (3,) of the eyes, m/s, or zero if it is unknown or implausible."""
+        """Return the velocity (3,), in m/s, of the eyes; zero if it is unknown or implausible."""
         if len(self._positions) < MIN_MESSAGES:
             return np.zeros(3)
         newest_ns = self._positions[-1][0]

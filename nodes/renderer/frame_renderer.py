@@ -94,7 +94,7 @@ class FrameRenderer:
         )
 
     def render(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
-        """Draw a frame, and return its message and the exposure time of its data, ns.
+        """Draw a frame, and return its message and the exposure time (ns) of its data.
 
         begun_ns: start of drawing. with_pixels: whether the message contains the image. If there is
         a window, the message has no display time until `on_shown` is called.
@@ -189,8 +189,8 @@ class FrameRenderer:
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
         """Deform the object as predicted for the display time `light_ns`.
 
-        Without a recent response of the solver, use the last response unchanged. Return the
-        exposure time of the data and the time for which the deformation was predicted, ns.
+        Without a recent response of the solver, use the last response unchanged. Return two times
+        (ns): the exposure time of the data, and the time for which the deformation was predicted.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age.seconds

@@ -295,7 +295,7 @@ class Canvas:
     def shifted_points(self, view: EyeView) -> Floats:
         """Return the corrected positions of the vertices as the shader computes them.
 
-        The result (n, 4) contains positions, m, and validity, 0 or 1. Tests compare it with a
+        The result (n, 4) contains positions (m) and validity (0 or 1). Tests compare it with a
         reference. Raise RuntimeError before the first call of `set_mesh`.
         """
         if self._object is None:

@@ -221,8 +221,8 @@ class DeformationTransfer:
         """Compute the interpolation weights.
 
         skin_vertices (s, 3): vertices at rest, world frame, m. skin_triangles (t, 3):
-        counter-clockwise as seen from outside. Raise ValueError if no triangle has an area, or if a
-        coordinate is not finite.
+        counter-clockwise as seen from outside. Raise ValueError if all triangles have zero area, or
+        if a coordinate is not finite.
         """
         self.vertices = len(skin_vertices)
         self._weights = transfer_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
@@ -235,7 +235,7 @@ class DeformationTransfer:
         self._moves = np.empty((self.vertices, 6), np.float32)
 
     def apply(self, displacement: Singles | None) -> Singles:
-        """Return positions, m, and normals (n, 6) of the deformed drawn surface.
+        """Return positions (m) and normals, (n, 6), of the deformed drawn surface.
 
         displacement (s, 3): displacement of the skin's vertices, m; None for the surface at rest.
         The length of the normals is arbitrary. Raise ValueError for a wrong shape of the array, or
@@ -267,8 +267,8 @@ def transfer_matrix(
     """Return the matrix (n, s), float32, that interpolates skin values at points (n, 3).
 
     Each row contains the barycentric weights of the nearest point of the skin. skin_vertices (s,
-    3), skin_triangles (t, 3): skin. Triangles without area are ignored. Raise ValueError if no
-    triangle has an area, or if a vertex is not finite.
+    3), skin_triangles (t, 3): skin. Triangles without area are ignored. Raise ValueError if all
+    triangles have zero area, or if a vertex is not finite.
     """
     if not np.isfinite(skin_vertices).all():
         raise ValueError("skin.vertices_world_m is not finite; check the soft-body solver")
@@ -276,7 +276,7 @@ def transfer_matrix(
         ~find_degenerate(skin_vertices, skin_triangles.astype(np.int64))
     ]
     if len(skin_triangles) == 0:
-        raise ValueError("skin.triangles: no triangle has an area; check the soft-body solver")
+        raise ValueError("skin.triangles: all triangles have zero area; check the soft-body solver")
     corners = skin_vertices[skin_triangles]
     samples, owners = _samples(corners)
     candidates = min(CANDIDATES, len(samples))

@@ -46,7 +46,7 @@ def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
 
 
 def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Floats:
-    """Return the positions (2, 3) of the left and the right eye, world frame, m.
+    """Return the world positions (2, 3), in m, of the left and the right eye.
 
     The positions are equal in mono mode. across: unit vector (3,) from the left to the right eye;
     None for the x axis.
@@ -61,8 +61,8 @@ def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Flo
 def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
     """Return the eyes for which a frame is drawn.
 
-    number: number of the frame. shows_both: whether the output alternates between the eyes, so that
-    each frame needs both images. Otherwise, odd frames are for the left eye in the mode
+    number: number of the frame. shows_both: whether the output alternates between the eyes, so each
+    frame needs both images. Otherwise, odd frames are for the left eye in the mode
     frame_sequential, and even frames for the right eye.
     """
     if mode != "frame_sequential" or shows_both:
@@ -73,11 +73,11 @@ def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
 def select_drawn_eyes(
     pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: bool
 ) -> Floats:
-    """Select from both eye positions (2, 3) those (1 or 2, 3) for which a frame is drawn.
+    """Return the eye positions (1 or 2, 3) for which a frame is drawn.
 
-    which: eyes of the frame. swap_eyes: whether a frame for one eye contains the image of the other
-    eye, for shutter glasses that open in the opposite order. A frame for both eyes ignores
-    `swap_eyes`.
+    pair (2, 3): positions of the left and right eye. which: eye or eyes to which the projector
+    shows the frame. swap_eyes: whether shutter glasses open in the opposite order, so a frame for
+    one eye is drawn for the other eye. A frame for both eyes ignores `swap_eyes`.
     """
     if which != "both":
         row = int((which == "right") != swap_eyes)

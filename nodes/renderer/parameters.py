@@ -32,7 +32,7 @@ class RendererParameters(NodeParameters):
         ge=0,
         le=4,
         description="Number of monitor refreshes per shown frame. 0: do not wait for the refresh, "
-        "so that images may tear.",
+        "so images may tear.",
     )
     prediction_horizon_s: NonNegative = Field(
         default=0.016,

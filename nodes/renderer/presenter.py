@@ -32,7 +32,7 @@ _NO_WINDOW: Any = None
 GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
 
 Shown = Callable[[Any, int], None]
-"""A function that the presenter's thread calls with the tag and the swap time, ns, of each image.
+"""A function that the presenter's thread calls with the tag and the swap time (ns) of each image.
 The time is 0 for an image that a newer image replaced before it was shown."""
 
 

@@ -168,7 +168,7 @@ class TwoPassProjector:
     def _has_triangles(self, triangles: NDArray[np.int32]) -> bool:
         """Return whether the buffers contain these triangles (t, 3).
 
-        Equal grids usually share one array, so that contents are rarely compared.
+        Equal grids usually share one array, so contents are rarely compared.
         """
         drawn = None if self._drawn is None else self._drawn.triangles
         return drawn is triangles or (drawn is not None and np.array_equal(drawn, triangles))

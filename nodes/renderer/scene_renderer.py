@@ -200,8 +200,7 @@ class SceneRenderer:
         """Return the drawing style for a display message.
 
         If the message requests marks, they are at the finger and at the contact point of the
-        target. finger_tip (3,): position at the display time, world frame, m; None if it is
-        unknown.
+        target. finger_tip (3,): world position (m) at the display time; None if it is unknown.
         """
         marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
         return DrawStyle(
@@ -231,13 +230,13 @@ class SceneRenderer:
     def usable(self, sheet: SheetPose, centre: Floats | None = None) -> bool:
         """Return whether the eyes see the sheet's front and the projector illuminates its back.
 
-        centre (3,): midpoint of the eyes, world frame, m; None for the eyes of the scene.
+        centre (3,): world position (m) of the midpoint of the eyes; None for the eyes of the scene.
         """
         eye = self.scene.eyes.centre_world_m if centre is None else centre
         return is_plane_usable(sheet.plane, eye, self._world_from_projector[:3, 3])
 
     def eyes(self, display: Display) -> Floats:
-        """Return the positions (2, 3) of the scene's eyes, world frame, m.
+        """Return the world positions (2, 3), in m, of the scene's eyes.
 
         The positions are equal in mono mode.
         """

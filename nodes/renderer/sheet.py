@@ -39,7 +39,7 @@ class SheetPose:
 
     @property
     def edge_distance_m(self) -> float:
-        """Return the distance between the centres of the clamped edges, m."""
+        """Return the distance (m) between the centres of the clamped edges."""
         left_bottom, right_bottom, right_top, left_top = self.corners
         return float(np.linalg.norm(right_bottom + right_top - left_bottom - left_top)) / 2.0
 

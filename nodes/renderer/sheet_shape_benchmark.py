@@ -29,8 +29,8 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 )
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats], Floats]
-"""A function that returns points (n, 3) of the reference sheet, world frame, m. Its arguments are
-the scene, the poses (4, 4) of the sheet's left and right edges, and the fingertip (3,), m."""
+"""A function that returns world points (n, 3), in m, of the reference sheet. Its arguments are the
+scene, the poses (4, 4) of the sheet's left and right edges, and the fingertip (3,), m."""
 
 WITHOUT_SHAPES = ("four_triangles",)
 METHODS = (*WITHOUT_SHAPES, "reduced_order", "membrane")
@@ -121,7 +121,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
 def height_error_mm(mesh: SheetMesh, *, truth: Floats) -> float:
     """Return the rms error of the height (world z) of a mesh, in mm.
 
-    truth (n, 3): points of the reference sheet, m.
+    truth (n, 3): points (m) of the reference sheet.
     """
     heights = LinearNDInterpolator(mesh.vertices[:, :2], mesh.vertices[:, 2])(truth[:, :2])
     errors = (heights - truth[:, 2])[np.isfinite(heights)]

@@ -42,7 +42,7 @@ class SkinExtrapolator:
         self._history.append((at_ns, body))
 
     def extrapolate(self, at_ns: int, clock_id: str) -> tuple[SoftBody | None, int]:
-        """Return the response extrapolated to the time `at_ns` of a clock, and its time, ns.
+        """Return the response extrapolated to the time `at_ns` of a clock, and its time (ns).
 
         Return the newest response unchanged if it has another clock, if it is later than `at_ns`,
         or if no earlier response is suitable. Return None and 0 before the first response.
@@ -63,7 +63,7 @@ class SkinExtrapolator:
         return body, newest_ns + round(ahead_s * 1e9)
 
     def _before(self, newest_ns: int) -> tuple[SoftBody, float] | None:
-        """Return a suitable older response, and the time from it to the newest response, s."""
+        """Return a suitable older response, and the time (s) from it to the newest response."""
         older = [((newest_ns - at_ns) * 1e-9, body) for at_ns, body in list(self._history)[:-1]]
         for base_s, body in older:
             if MIN_BASE_S <= base_s <= MAX_BASE_S:

@@ -129,7 +129,7 @@ FREQUENCY_RAD_PER_S = 2.0 * np.pi * FREQUENCY_HZ
 
 
 def _integrate_slow(dt: float) -> Floats:
-    """Return the matrix (3, 3) that advances position, velocity and acceleration by dt, s.
+    """Return the matrix (3, 3) that advances position, velocity and acceleration by dt (s).
 
     The acceleration decays with the rate ACCELERATION_DECAY_PER_S.
     """
@@ -143,7 +143,7 @@ def _integrate_slow(dt: float) -> Floats:
 
 
 def compute_transition(dt: float) -> Floats:
-    """Compute the matrix (models, 5, 5) that advances the state of each model by dt, s."""
+    """Compute the matrix (models, 5, 5) that advances the state of each model by dt (s)."""
     natural = FREQUENCY_RAD_PER_S
     decay = np.minimum(np.pi * MAX_OSCILLATOR_WIDTH_HZ, 0.5 * natural)
     swing = np.sqrt(natural**2 - decay**2)
@@ -160,7 +160,7 @@ def compute_transition(dt: float) -> Floats:
 
 
 def compute_process_noise(dt: float) -> Floats:
-    """Compute the covariance (models, 5, 5) that the process noise of dt, s, adds to each state."""
+    """Compute the covariance (models, 5, 5) that the process noise of dt (s) adds to each state."""
     acceleration, jerk = np.zeros((3, 3)), np.zeros((3, 3))
     for node, weight in zip(*np.polynomial.legendre.leggauss(4), strict=True):
         slow = _integrate_slow(0.5 * dt * (1.0 + node))
@@ -486,10 +486,10 @@ def _prediction_errors(
     at_ns, point: time and position (3,) m of the new point, along the axes of the states.
     innovations: (models, 3) m, errors of the predictions from the newest state.
 
-    The first result contains the errors (scored horizons, 3, models) m.  At the first horizon they
-    are the innovations.  At every other horizon they are the errors of the newest state that is at
-    least as old as the horizon, or of the oldest state.  The second result contains the ages of the
-    states that were used, ms.
+    The first result contains the errors (scored horizons, 3, models) m. At the first horizon they
+    are the innovations. At every other horizon they are the errors of the newest state that is at
+    least as old as the horizon, or of the oldest state. The second result contains the ages (ms) of
+    the states that were used.
     """
     errors = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS)))
     errors[0] = innovations.T
@@ -541,5 +541,5 @@ TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
     "one_euro": OneEuroTracking,
     "adaptive": AdaptiveBank,
 }
-"""The functions that make the filter of each tracking method from the finger's maximum speed, m/s.
+"""The functions that make the filter of each tracking method from the finger's maximum speed (m/s).
 """

@@ -76,7 +76,7 @@ def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Ima
 
 
 def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
-    """Return the Cramer-Rao bound on the standard deviation of a disc's centre, px per axis.
+    """Return the Cramer-Rao bound on the standard deviation (px per axis) of a disc's centre.
 
     All parameters of the disc are unknown.  The derivatives are central differences.  The rounding
     of grey levels and the dependence of the noise on the parameters are neglected.
@@ -177,7 +177,7 @@ def _marker_trial(
         return refine([image] * len(blobs), blobs, appearance, sensor)
 
     def error_px(_: list[Marker]) -> Interval:
-        """Return the root mean square error per axis, px.
+        """Return the root mean square error (px) per axis.
 
         If not exactly one marker is found in an image, its error is the size of the image.
         """
@@ -200,7 +200,7 @@ def _marker_trial(
 
 
 def _marker_tolerance_px(scene: Scene) -> float:
-    """Return the standard deviation of a marker's centre, px, that the scene permits.
+    """Return the standard deviation (px) of a marker's centre that the scene permits.
 
     This deviation causes an error of scene.tolerances.fingertip_m at the centre of the screen.
     """

@@ -111,7 +111,7 @@ class Track:
     at_ns: int
 
     def predict(self, at_ns: int) -> tuple[Floats, float]:
-        """Predict the marker's position (3,) m at `at_ns`, and its error scale per axis, m."""
+        """Predict the marker's position (3,) m at `at_ns`, and its error scale (m) per axis."""
         since_s = (at_ns - self.at_ns) * 1e-9
         sigma_m = POSITION_SIGMA_M + 0.5 * ACCELERATION_SIGMA_M_PER_S2 * since_s**2
         return self.point + since_s * self.velocity, min(sigma_m, MAX_POSITION_SIGMA_M)

@@ -565,7 +565,7 @@ def _triangulate(
 
 
 def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
-    """Estimate the variance of a centre, px^2, that partial occlusion of the marker causes.
+    """Estimate the variance (px^2) of a centre that partial occlusion of the marker causes.
 
     An obstacle that covers a strip of a disc shifts its centre by half the strip's width, and
     reduces the radius by the same amount.  The variance is therefore the squared difference of the

@@ -83,7 +83,7 @@ def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
 
 
 def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
-    """Return the largest semi-axis difference of measured and computed ellipse, px.
+    """Return the largest semi-axis difference (px) of measured and computed ellipse.
 
     normal: normal (3,) of the disc in this camera's axes.
     """
@@ -96,7 +96,7 @@ def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
 
 
 def _centre_offset_px(view: DiscView, normal: Floats, radius_m: float) -> Floats:
-    """Return the centre of a disc's image minus the image of the disc's centre (2,), px.
+    """Return the centre of a disc's image minus the image of the disc's centre: (2,), in px.
 
     normal: (3,) of the disc in the left camera's axes.
     The dual conic of the disc gives the centre of its image.  The lens distortion is linearised.

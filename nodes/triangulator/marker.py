@@ -98,7 +98,7 @@ class Blob:
 
     @property
     def blur(self) -> float:
-        """Return the standard deviation of the edge blur, px, estimated from the spread."""
+        """Return the standard deviation (px) of the edge blur, estimated from the spread."""
         return min(max(0.5 * self.radius * math.sqrt(max(self.spread - 0.85, 0.0)), 0.6), 3.0)
 
     @property
@@ -304,7 +304,7 @@ class SystematicError:
     moving: float
 
     def covariance(self, motion: tuple[float, float]) -> Floats:
-        """Return the covariance (2, 2) px^2 of the error for a marker's motion (x, y), px."""
+        """Return the covariance (2, 2), in px^2, of the error for a motion (x, y), in px."""
         variance = self.still_px**2 + (self.moving * math.hypot(*motion)) ** 2
         return np.array([[variance, 0.0], [0.0, variance]])
 

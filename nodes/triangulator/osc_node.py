@@ -76,12 +76,13 @@ class OscInputParameters(NodeParameters):
     )
     eye: OscStream | None = Field(
         default=OscStream(address="/flexsheet/eye"),
-        description="midpoint between the eyes. The x axis of its quaternion points from the left "
-        "to the right eye; null: the topic eye is not published",
+        description="OSC address of the pose at the midpoint between the eyes. The x axis of its "
+        "orientation points from the left to the right eye. null: the topic eye is not published",
     )
     fingertip: OscStream | None = Field(
         default=None,
-        description="point of the finger's pad; null: the topic fingertip is not published",
+        description="OSC address of the position of the finger's pad. null: the topic fingertip is "
+        "not published",
     )
     fingertip_noise_m: Positive = Field(
         default=0.001, description="standard deviation of the fingertip's positions, m"
@@ -120,10 +121,10 @@ class OscInputParameters(NodeParameters):
 
 
 class OscInput(Node):
-    """A node that publishes the eyes and the fingertip that a tracking program sends by OSC.
+    """A node that publishes the positions of eyes and fingertip that it receives by OSC.
 
-    If no messages arrive, the node publishes invalid eyes and fingertips. The renderer then uses
-    the eyes of the scene.
+    A tracking program sends the positions. If no messages arrive, the node publishes invalid eyes
+    and fingertips. The renderer then uses the eyes of the scene.
     """
 
     opens_devices: ClassVar[bool] = True

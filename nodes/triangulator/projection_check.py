@@ -88,7 +88,7 @@ class ProjectionCheck:
 
     @property
     def expected_world_m(self) -> Floats:
-        """Return the newest expected world positions (n, 3) of the marks, m."""
+        """Return the newest expected world positions (n, 3), in m, of the marks."""
         return self._frames[-1][1] if self._frames else np.zeros((0, 3))
 
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:

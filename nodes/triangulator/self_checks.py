@@ -118,7 +118,7 @@ class CameraCheck:
         return replace(detection, markers=markers, clutter=clutter)
 
     def on_finger(self, point: Floats, reprojection_px: float, at_ns: int) -> None:
-        """Add the position (3,) m of the finger pad and its marker's reprojection error, px."""
+        """Add the position (3,) m of the finger pad and its marker's reprojection error (px)."""
         self._reprojection.add(np.array([reprojection_px]), at_ns)
         if self._touch_point is None:
             return

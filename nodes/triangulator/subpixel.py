@@ -58,7 +58,7 @@ which the pixels contain no information, such as the level of a saturated marker
 
 MIN_SHAPE = np.array([0.5, 0.3])
 MAX_SHAPE = np.array([40.0, 8.0])
-"""Bounds on radius and blur, px."""
+"""Bounds (px) on radius and blur."""
 
 MAX_ELONGATION = 0.6
 START_ELONGATION = 0.45

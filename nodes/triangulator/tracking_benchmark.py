@@ -16,7 +16,7 @@ from flexsheet.nodes.triangulator.filters import Estimate, Filter
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 
 TruePath = Callable[[float], Floats]
-"""A function that returns the true fingertip (3,) m in the world at a given time, s."""
+"""A function that returns the true fingertip (3,) m in the world at a given time (s)."""
 
 MARKER_NOISE_PX = 0.01
 """The standard deviation of a marker's centre by the subpixel fit at a distance of half a metre
@@ -49,7 +49,7 @@ class TruePathCase:
 
     @property
     def speed_m_per_s(self) -> float:
-        """Return the 0.9 quantile of the finger's speed, m/s."""
+        """Return the 0.9 quantile (m/s) of the finger's speed."""
         times = np.arange(WARM_UP_S, self.duration_s, SPEED_STEP_S)
         points = np.array([self.path(float(time)) for time in times])
         distances = np.linalg.norm(np.diff(points, axis=0), axis=1)

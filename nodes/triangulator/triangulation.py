@@ -1,8 +1,8 @@
 """Triangulate a marker from two images, and compute the covariance of its position.
 
 A triangulation method takes undistorted normalized coordinates (n, 2) of both views and the
-transform `right_from_left`.  It returns points (n, 3) in the left camera's frame, m.  For parallel
-rays these contain infinite or NaN elements, which the caller must reject.
+transform `right_from_left`. It returns points (n, 3), in m, in the left camera's frame. For
+parallel rays these contain infinite or NaN elements, which the caller must reject.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ class ClosestApproach:
     def between(
         self, left: tuple[float, float], right: tuple[float, float]
     ) -> tuple[Floats, float] | None:
-        """Return the midpoint (3,) of the shortest segment between two rays, and its length, m.
+        """Return midpoint (3,), in m, and length (m) of the shortest segment between two rays.
 
         left, right: undistorted normalized coordinates (x, y) of the rays.
         Return None if the rays are parallel, or if the segment is behind a camera.
@@ -249,7 +249,7 @@ def _distort(
 
 @dataclass(frozen=True, slots=True)
 class TriangulatedPoint:
-    """A triangulated marker: position (3,) m, covariance (3, 3) m^2, rms reprojection error, px.
+    """A triangulated marker: position (3,) m, covariance (3, 3) m^2, rms reprojection error (px).
 
     The covariance follows to first order from the covariances of the centres in both images.  For
     nearly parallel rays it increases with the fourth power of the depth.
@@ -261,7 +261,7 @@ class TriangulatedPoint:
 
     @property
     def deviation_m(self) -> float:
-        """Return the square root of the sum of the variances along x, y and z, m."""
+        """Return the square root (m) of the sum of the variances along x, y and z."""
         return float(np.sqrt(np.trace(self.covariance)))
 
 

@@ -63,7 +63,7 @@ CONTROLLER_CYCLE_S = 0.0071
 
 JITTER_STREAM = 1
 """The second element of the random seed for the jitter of controller cycles, which makes the jitter
-independent of the noise of measured joints."""
+independent of the noise of measured joint angles."""
 
 
 def check_loopback(address: str) -> str:
@@ -192,8 +192,8 @@ def decelerate(
 ) -> Floats:
     """Return the joint velocities (..., 6), rad/s, after braking for a duration.
 
-    All joints are slowed by the same factor, so that the arm stays on its path.
-    acceleration_rad_per_s2: maximum decelerations (6,).
+    All joints are slowed by the same factor, so the arm stays on its path. acceleration_rad_per_s2:
+    maximum decelerations (6,).
     """
     stopping_s = (np.abs(velocity_rad_per_s) / acceleration_rad_per_s2).max(axis=-1, keepdims=True)
     left = np.maximum(stopping_s - duration_s, 0.0) / np.maximum(stopping_s, 1e-12)
@@ -249,10 +249,11 @@ class Servo:
 class Controller:
     """A simulated controller of one arm, which checks command blocks and answers with its status.
 
-    The controller rejects an invalid command (magic number, version, CRC, mode, sequence number)
-    by a Modbus exception. In four cases it enters the fault state, in which it brakes and stops:
-    joints out of range, joints not finite, a jump of the set-point, and no command for `watchdog_s`
-    while moving. An `idle` command clears a fault and may restart the sequence numbers.
+    The controller rejects an invalid command (magic number, version, CRC, mode, sequence number) by
+    a Modbus exception. In four cases it enters the fault state, in which it brakes and stops: joint
+    angles out of range, joint angles not finite, a jump of the set-point, and no command for
+    `watchdog_s` while moving. An `idle` command clears a fault and may restart the sequence
+    numbers.
 
     noise_rad: standard deviation of the measured joints.
     cycle_s: duration of a controller cycle. A set-point takes effect when the next cycle begins; 0:
@@ -426,7 +427,7 @@ class ArmServer:
 
     @property
     def port(self) -> int:
-        """Return the port on which the server listens, even if port 0 (any) was requested."""
+        """Return the port on which the server listens, also if any free port was requested."""
         listener: Any = None if self._server is None else self._server.transport
         if listener is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")

@@ -28,7 +28,7 @@ class Trajectory(Protocol):
     """The interface of a position as a function of simulation time."""
 
     def at(self, time_s: float) -> Floats:
-        """Return the position (3,) in the world frame, or relative to the fingertip, m."""
+        """Return the position (3,), in m, in the world frame, or relative to the fingertip."""
         ...
 
 
@@ -146,7 +146,7 @@ class Clutter:
 
 
 def second_marker(offset_m: Point) -> Clutter:
-    """Make a second marker at a fixed offset (3,) from the fingertip, m."""
+    """Make a second marker at a fixed offset (3,), in m, from the fingertip."""
     return Clutter(markers=(SecondMarker(FixedPoint(offset_m), carried=True),))
 
 

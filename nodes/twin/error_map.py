@@ -76,7 +76,7 @@ def _lit(picture: Image) -> Bools:
 
 
 def _places(picture: Image) -> tuple[Floats, Bools]:
-    """Return the encoded position, m, and the validity of each pixel, both (rows, columns)."""
+    """Return the encoded position (m) and the validity of each pixel, both (rows, columns)."""
     red, green, blue = np.moveaxis(picture.astype(np.float64) / 127.5 - 1.0, -1, 0)
     phase = np.arctan2(green, red) / (2.0 * np.pi)
     coarse = ((0.5 * (blue + 1.0) - 0.2) / 0.8 - 0.5) * RANGE_M

@@ -180,7 +180,7 @@ class TwinEyeNode(Node):
         return self.parameters.viewpoint if frame.eye == "both" else frame.eye
 
     def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
-        """Return the true world position (3,) of the measuring camera at `at_s`, m.
+        """Return the true world position (3,), in m, of the measuring camera at `at_s`.
 
         The position is that of the tracked eyes, or else of the scene's eyes, plus the offset in
         the apparatus.

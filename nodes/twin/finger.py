@@ -2,8 +2,8 @@
 
 A path message and a random seed determine the motion. The finger follows the path with two kinds of
 unsteadiness: wander (slow) and tremor (fast). As the position can be computed for any time, the
-ground truth of each image is exact. Positions are in the world frame, m. Times are in seconds since
-the path was given, unless stated otherwise.
+ground truth of each image is exact. Positions are in the world frame, in m. Times are in seconds
+since the path was given, unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from flexsheet.nodes.arrays import Floats
 Real = TypeVar("Real", float, Floats)
 
 ROUNDING_S = 0.04
-"""Half of the duration over which corners of a polyline are rounded, s."""
+"""Half of the duration (s) over which corners of a polyline are rounded."""
 
 EASE_SPEED_M_PER_S = 0.4
 """The peak speed of the reach from the present position to the first point of a path."""
@@ -87,7 +87,7 @@ class Path(Protocol):
         ...
 
     def speeds(self) -> Floats:
-        """Return upper bounds (n - 1,) on the speed between successive points, m/s."""
+        """Return upper bounds (n - 1,), in m/s, on the speed between successive points."""
         ...
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
@@ -105,7 +105,7 @@ class RoundedLines:
     velocity. Densely sampled smooth motions are unsuitable: rounding would displace them by
     ROUNDING_S^2 / 6 times their acceleration.
 
-    integral: (n, 3) integral of the position from time 0 to each point, m s.
+    integral: (n, 3) integral (m s) of the position from time 0 to each point.
     """
 
     times_s: Floats
@@ -129,7 +129,7 @@ class RoundedLines:
         return -ROUNDING_S
 
     def speeds(self) -> Floats:
-        """Return the speeds (n - 1,) on the straight lines, m/s, which bound the rounded motion."""
+        """Return the speeds (n - 1,), in m/s, on the lines, which bound the rounded motion."""
         ways = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.asarray(ways / np.diff(self.times_s))
 
@@ -189,7 +189,7 @@ class SmoothPath:
         return 0.0
 
     def speeds(self) -> Floats:
-        """Return upper bounds (n - 1,) on the speed between successive samples, m/s.
+        """Return upper bounds (n - 1,), in m/s, on the speed between successive samples.
 
         Between two samples the velocity is a quadratic Bezier curve, which stays within the
         triangle of its control points: both end velocities, and 3 times the mean velocity minus
@@ -286,7 +286,7 @@ class FingerMotion:
     amplitudes_before_m, amplitudes_m: (wander, tremor) before the reach and on the path. Amplitudes
         during the reach are interpolated.
     age_s: time argument of the unsteadiness when the path was given. Later motions continue this
-        time, so that the unsteadiness has no jumps.
+        time, so the unsteadiness has no jumps.
     """
 
     path: Path
@@ -382,7 +382,7 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Return the position and velocity (3,) without unsteadiness, and its two amplitudes, m."""
+        """Return position and velocity (3,) without unsteadiness, and its two amplitudes (m)."""
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))
             return position, velocity, self.amplitudes_m
@@ -418,7 +418,7 @@ class FingerMotion:
 
 
 def find_tremor_m(finger: FingerTruth | None, path_tremor_m: float) -> float:
-    """Return the tremor amplitude on a path, m.
+    """Return the tremor amplitude (m) on a path.
 
     The tremor of the apparatus, if any, replaces the amplitude of a path with tremor.
     """
@@ -443,7 +443,7 @@ def _reach(
     s: fraction of the duration, 0 at `start` and 1 at the first point of the path.
 
     The effect of the initial velocity decays by the quintic Hermite function s (1-s)^3 (1+3s), so
-    that position and velocity are continuous.
+    position and velocity are continuous.
     """
     share, slope = minimum_jerk_profile(s)
     carried = s * (1.0 - s) ** 3 * (1.0 + 3.0 * s)

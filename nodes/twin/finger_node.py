@@ -66,7 +66,8 @@ class TwinFingerParameters(SimulatorParameters):
     )
     cache_dir: Path | None = Field(
         default=None,
-        description="folder that caches the table of the sheet's force on a coupled finger; null: "
+        description="folder that caches the table of the sheet's force on the finger of a "
+        "simulated hand that feels the sheet (coupled); null: "
         "the user's cache folder",
     )
 
@@ -279,7 +280,7 @@ class TwinFingerNode(Node):
         )
 
     def _track(self, exposed_ns: int) -> Callable[[float], Floats]:
-        """Return a function from the time since mid-exposure, s, to the fingertip position (3,)."""
+        """Return a function from the time (s) since mid-exposure to the fingertip position (3,)."""
         if self.coupled is None:
             return lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position
         seen = self.truth(exposed_ns)
@@ -309,7 +310,7 @@ class TwinFingerNode(Node):
 
     @property
     def _max_late_ns(self) -> int:
-        """Return the maximum delay of an exposure's start without missing the frame, ns.
+        """Return the maximum delay (ns) of an exposure's start without missing the frame.
 
         An exposure may overlap the read-out of the previous frame.
         """

@@ -32,13 +32,13 @@ REVERSAL_RATIO = 0.1
 distance from its new value falls to 1/e."""
 
 MIN_FORCE_N = 1e-3
-"""The minimum elastic force whose changes can reverse the hysteresis, N."""
+"""The minimum elastic force (N) whose changes can reverse the hysteresis."""
 
 CREEP_LOSS_RATIO = math.pi**2 / (4.0 * math.log(10.0))
 """The fraction of the energy that a load cycle loses by creep, divided by the creep per decade."""
 
 MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
-"""The time in which the force of a push rises to the evaluated force, s, and the ratio of the
+"""The time (s) in which the force of a push rises to the evaluated force, and the ratio of the
 maximum force, at which the finger reverses, to the evaluated force."""
 
 
@@ -73,7 +73,7 @@ class ForceHistory:
         return cls(sheet.hysteresis_ratio, sheet.creep_ratio_per_decade)
 
     def update(self, time_s: float, elastic_n: float) -> float:
-        """Add the elastic force at `time_s`, and return the force with hysteresis and creep, N.
+        """Add the elastic force at `time_s`, and return the force (N) with hysteresis and creep.
 
         The elastic force is assumed to change linearly between calls. The first force is assumed to
         have acted for `REFERENCE_S`. Raises ValueError if the time decreases.
@@ -108,7 +108,7 @@ class ForceHistory:
 
 
 def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> Floats:
-    """Return forces (n,) with hysteresis and creep for elastic forces (n,) at times (n,), N."""
+    """Return forces (n,), in N, with hysteresis and creep for elastic forces (n,) at times (n,)."""
     return np.array(
         [history.update(float(t), float(f)) for t, f in zip(times_s, elastic_n, strict=True)]
     )

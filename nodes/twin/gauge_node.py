@@ -62,7 +62,7 @@ class TrueSheetForce:
         ]
 
     def compute_n(self, time_s: float, tip: Floats, left: Floats, right: Floats) -> float:
-        """Return the normal force, N, for a fingertip and poses of the flanges (last arm links).
+        """Return the normal force (N) for a fingertip and poses of the flanges (last arm links).
 
         tip: position (3,), m. left, right: poses (4, 4). time_s must not decrease between calls.
         """

@@ -8,7 +8,7 @@ The gestures follow published measurements of human motion:
   5.77 distance / duration^2.
 - Unhurried reaches have peak speeds of 0.2-0.35 m/s (REACH+, which plans for them). Hurried elbow
   flexions of 27-45 degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav. 14:341), so
-  that the braking half takes 50-80 ms.
+  the braking half takes 50-80 ms.
 - People explore a surface at 77-86 mm/s on average (Smith, Gosselin and Houde 2002, Exp. Brain Res.
   147:209).
 - In typing, the interval between taps is 150-500 ms (Angelaki and Soechting 1993, Exp. Brain Res.

@@ -28,10 +28,10 @@ from flexsheet.nodes.twin.sheet_reaction import SheetReaction
 from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface, make_edge_plane
 
 VoluntaryPath = Callable[[float], tuple[Floats, Floats]]
-"""A function from a time, s, to the voluntary position (3,), m, and velocity (3,), m/s."""
+"""A function from a time (s) to the voluntary position (3,), m, and velocity (3,), m/s."""
 
 Edges = Callable[[float], tuple[Floats, Floats]]
-"""A function from a time, s, to the poses (4, 4) of the sheet's left and right edge."""
+"""A function from a time (s) to the poses (4, 4) of the sheet's left and right edge."""
 
 STEP_S = 0.0005
 """The maximum time step of the normal motion: a tenth of a radian of the fastest oscillation."""
@@ -40,10 +40,10 @@ INTERVAL_S = 0.004
 """The maximum interval over which the voluntary path and the sheet are interpolated."""
 
 NEAR_M = 0.005
-"""The maximum distance of the finger from the sheet, m, at which a force is computed."""
+"""The maximum distance (m) of the finger from the sheet at which a force is computed."""
 
 MAX_EXTRAPOLATION_S = 0.02
-"""The maximum time over which poses of the edges are extrapolated at constant velocity, s."""
+"""The maximum time (s) over which poses of the edges are extrapolated at constant velocity."""
 
 MAX_PREDICTION_S = 0.1
 
@@ -140,7 +140,7 @@ class EdgeTrack:
         self._samples: list[tuple[float, Floats]] = []
 
     def add(self, time_s: float, left: Floats, right: Floats) -> None:
-        """Add the poses (4, 4) of the edges at `time_s`, s.
+        """Add the poses (4, 4) of the edges at `time_s`.
 
         Poses that are not newer than the last poses are ignored.
         """

@@ -28,7 +28,7 @@ CELLS = 8
 """The number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
 
 SOLVE_PERIOD_NS = 500_000_000
-"""The minimum time between two solutions of the sheet's shape, ns."""
+"""The minimum time (ns) between two solutions of the sheet's shape."""
 
 MAX_FINGER_MOTION_M = 5e-4
 """The maximum motion of a pushing finger since the last solution of the sheet's shape. After a

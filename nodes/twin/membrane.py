@@ -1,12 +1,11 @@
 """Solve the simulated sheet: a finite-element membrane between two clamps, pushed by a finger.
 
-The material is incompressible neo-Hookean rubber in plane stress. Its energy per volume is
-W = mu/2 (I1 - 3), where I1 is the first strain invariant and mu = E/3 the shear modulus.
-A membrane has no bending stiffness and would buckle into ever finer wrinkles. Where W would give
-compression, the energy of a tension field replaces it (Pipkin, IMA J. Appl. Math. 36, 1986): the
-stress is uniaxial along the wrinkles, zero across them, and zero where the sheet is slack. This
-relaxed energy is convex in the strain, so that Newton's method with a line search finds its
-minimum.
+The material is incompressible neo-Hookean rubber in plane stress. Its energy per volume is W = mu/2
+(I1 - 3), where I1 is the first strain invariant and mu = E/3 the shear modulus. A membrane has no
+bending stiffness and would buckle into ever finer wrinkles. Where W would give compression, the
+energy of a tension field replaces it (Pipkin, IMA J. Appl. Math. 36, 1986): the stress is uniaxial
+along the wrinkles, zero across them, and zero where the sheet is slack. This relaxed energy is
+convex in the strain, so Newton's method with a line search finds its minimum.
 
 The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points). They differ from the
 elements of the renderer, which this module serves to test. The mesh is finer around the finger.
@@ -116,7 +115,7 @@ class DeformedSheet:
 
 
 def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
-    """Return coordinates (cells + 1,) from 0 to `length_m`, m, which are densest at `focus_m`.
+    """Return coordinates (cells + 1,), in m, from 0 to `length_m`, densest at `focus_m`.
 
     The coordinates are uniform if the focus is None.
     """
@@ -197,7 +196,7 @@ class _Mesh:
         row = indices[np.repeat(self.dofs, 27, axis=1)].ravel()
         column = indices[np.tile(self.dofs, (1, 27))].ravel()
         self._is_free = (row >= 0) & (column >= 0)
-        # The sparsity pattern of the stiffness matrix is the same in all iterations, so that it is
+        # The sparsity pattern of the stiffness matrix is the same in all iterations, so it is
         # computed once. Element entries are summed into it.
         size = len(self.free)
         keys = column[self._is_free].astype(np.int64) * size + row[self._is_free]
@@ -380,7 +379,7 @@ class _Finger:
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
         """Return the gradient (nodes, 3) of `energy`, N, and a stiffness (nodes, 3, 3), N/m.
 
-        The stiffness omits the effect of the sphere's curvature, so that the stiffness is never
+        The stiffness omits the effect of the sphere's curvature, so the stiffness is never
         negative.
         """
         depth, outward = self._depth(positions)
@@ -394,7 +393,7 @@ class _Finger:
     def release(self, positions: Floats, share: float) -> bool:
         """Release the nodes whose friction force exceeds the Coulomb limit, so that they slip.
 
-        Return whether forces changed, so that a new equilibrium must be solved. The friction force
+        Return whether forces changed; if so, a new equilibrium must be solved. The friction force
         of a slipping node keeps its direction and becomes the coefficient times the normal force.
         share: fraction (0 to 1) of the change of the friction forces that is applied.
         """
@@ -430,9 +429,9 @@ def solve(
 ) -> DeformedSheet:
     """Solve the equilibrium of the sheet between its edges, pushed by a fingertip.
 
-    finger_tip: the point (3,) of the fingertip sphere that is farthest from the user, m. There is
-    no contact if the point is None, in front of the sheet, or beside the sheet. The other arguments
-    and the errors are those of `solve_path`.
+    finger_tip: the point (3,), in m, of the fingertip sphere that is farthest from the user. There
+    is no contact if the point is None, in front of the sheet, or beside the sheet. The other
+    arguments and the errors are those of `solve_path`.
     """
     return solve_path(
         rubber,
@@ -537,8 +536,8 @@ def solve_path(
                 rounds += 1
                 if rounds > MAX_FRICTION_ROUNDS:
                     raise NotConvergedError(
-                        f"the friction forces on the simulated membrane still change after {rounds}"
-                        f" equilibria (friction coefficient {friction_coefficient})"
+                        "the friction forces on the simulated membrane have not converged after "
+                        f"{rounds} iterations (friction coefficient {friction_coefficient})"
                     )
                 positions, count = _relax(mesh, positions, finger)
                 iterations += count

@@ -55,7 +55,7 @@ FRICTION_STREAM = 11
 """The second element of the random seed of the static friction."""
 
 FIRST_STEP_RAD = 0.01
-"""The maximum difference of each joint between the first set-point and the measured joints."""
+"""The maximum difference of each joint between the first set-point and the measurement."""
 
 STEP_CYCLES = 2.0
 """The maximum step between set-points, in cycles that the step takes at full speed."""
@@ -159,7 +159,7 @@ class MxtController:
         return self._waiting is not None
 
     def until_cycle_s(self) -> float:
-        """Return the time until the next cycle begins, s."""
+        """Return the time (s) until the next cycle begins."""
         return self._next_cycle_s - self._into_cycle_s
 
     def advance(self, duration_s: float) -> None:
@@ -232,7 +232,8 @@ class MxtController:
     def _stay(self, sender: Address) -> None:
         """Process a packet that only requests the state.
 
-        The arm stops. The next set-point must agree with the measured joints, as at the start.
+        The arm stops. The next set-point must agree with the measured joint angles, as at the
+        start.
         """
         self._master = sender
         if self._moved:
@@ -336,7 +337,7 @@ class MxtServer:
 
     @property
     def port(self) -> int:
-        """Return the port on which the server listens, even if port 0 (any) was requested."""
+        """Return the port on which the server listens, also if any free port was requested."""
         if self._transport is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")
         return int(self._transport.get_extra_info("sockname")[1])

@@ -62,8 +62,8 @@ class SurfaceMap:
     """A map from surface positions on a scene's object to world points.
 
     The distances `along` and `arc` are measured on geodesics, which are computed on a grid. Points
-    between are interpolated by bicubic splines and projected onto the surface, so that a mapped
-    path is as smooth as the surface.
+    between are interpolated by bicubic splines and projected onto the surface, so a mapped path is
+    as smooth as the surface.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -109,7 +109,7 @@ class SurfaceMap:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return the maximum stroke in one direction, m, and whether an end limits the stroke.
+        """Return the maximum stroke (m) in one direction, and whether an end limits the stroke.
 
         The other limit is the tilt of the normal from the user, whose cosine is `most`. The length
         is measured from the front along the geodesic that begins in direction `heading` (3,).
@@ -279,7 +279,7 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
     3. Translate: the median x, y is placed in front of the centre of the object.
     4. Project: z becomes the height above the surface. The deepest 30 % of the samples push into
        the surface, limited smoothly to a sixth of `push_depth_m`. y becomes arc length on the
-       surface, so that a vertical motion strokes the surface.
+       surface, so a vertical motion strokes the surface.
     5. Slow down, if necessary, by one factor, to 0.8 of the scene's finger speed.
 
     The samples are limited to the scene's finger volume and joined by a spline, which preserves the

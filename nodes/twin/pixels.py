@@ -109,7 +109,7 @@ class Sensor:
     noisy_backgrounds: int = 8
 
     def noise(self, levels: Singles) -> Singles:
-        """Return the standard deviation of photon and read noise for grey levels (any shape)."""
+        """Return the standard deviation of photon and read noise for an array of grey levels."""
         variance = levels * np.float32(1.0 / self.photons_per_level) + np.float32(
             self.read_noise**2
         )
@@ -630,7 +630,7 @@ def rasterize_ball(
 
 
 def quantize(levels: Singles) -> Image:
-    """Round grey levels (any shape) to integers and limit them to 0..255."""
+    """Round an array of grey levels to integers, and limit them to 0..255."""
     return np.minimum(np.maximum(np.rint(levels), 0.0), 255.0).astype(np.uint8)
 
 

@@ -199,7 +199,7 @@ class LitSheet:
         local = apply(sheet_from_world, points.reshape(-1, 3)).reshape(points.shape)
         half = 0.5 * np.array([self._scene.sheet.width_m, self._scene.sheet.height_m])
         if bend is not None:
-            # The bend is small, so that a ray meets it close to where it meets the plane.
+            # The bend is small, so a ray meets it close to where it meets the plane.
             along = directions @ sheet_from_world[:3, :3].T
             flat, slopes = local[..., :2], along[..., :2] / along[..., 2:]
             for _ in range(2):

@@ -64,7 +64,7 @@ class SheetPull:
     def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
         """Compute the tension of the true sheet with the membrane model.
 
-        Return None if both arms are rigid, so that nothing is displaced.
+        Return None if both arms are rigid, because nothing is displaced then.
         """
         arms = apparatus.arms
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
@@ -86,7 +86,7 @@ class SheetPull:
         )
 
     def force_n(self, distance_m: float) -> float:
-        """Return the tension, N, of a sheet whose edges would be at `distance_m` with rigid arms.
+        """Return the tension (N) of a sheet whose edges would be at `distance_m` with rigid arms.
 
         The compliant flanges move until the sheet and the arms are in equilibrium.
         """

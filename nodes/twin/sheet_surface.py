@@ -76,7 +76,7 @@ class SagTable:
     def evaluate(
         self, distances_m: Floats, leans: Floats, x_m: Floats, y_m: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the sag along the normal (n,), m, and its derivatives along x and y (n,).
+        """Return the sag (n,), in m, along the normal, and its derivatives along x and y (n,).
 
         distances_m: distances (n,) between the edges. leans: vertical components (n,) of the sheet
         normals. x_m, y_m: positions (n,) relative to the sheet's centre.

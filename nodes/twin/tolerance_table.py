@@ -2,8 +2,7 @@
 
 An apparatus holds the true parameters of the simulated hardware, as deviations from the parameters
 in the scene, which the nodes assume. The option `--apparatus seed:N` generates a random apparatus
-from this table. Each row has its own stream of random numbers, so that a new row changes no other
-value.
+from this table. Each row has its own stream of random numbers, so a new row changes no other value.
 Seeds 0 to 99 are for development; no method may be tuned on any other seed. A calibrated apparatus
 describes a laboratory that has calibrated its devices. Its deviations are the residual errors of
 the calibrations.

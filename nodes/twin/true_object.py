@@ -85,8 +85,8 @@ class TrueBody:
         skin_vertices: (skin vertices, 3) at rest, m.
         displacement: (skin vertices, 3), m, interpolated linearly in skin_triangles (triangles, 3).
 
-        Raises ValueError if displacement and skin have different shapes, or if no triangle of the
-        skin has an area.
+        Raises ValueError if displacement and skin have different shapes, or if all triangles of the
+        skin have zero area.
         """
         if displacement.shape != skin_vertices.shape:
             raise ValueError(
@@ -125,11 +125,11 @@ def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices
     """Find the point of a mesh that is nearest to each of the points (points, 3).
 
     Return the triangle corners (points, 3) and barycentric weights (points, 3) of the nearest
-    points. Raises ValueError if no triangle has an area.
+    points. Raises ValueError if all triangles have zero area.
     """
     triangles = triangles[~find_degenerate(vertices, triangles)]
     if not len(triangles):
-        raise ValueError("no triangle of the skin has an area; give the skin of a valid mesh")
+        raise ValueError("all triangles of the skin have zero area; give the skin of a valid mesh")
     # Sort the triangles' corners by vertex, so that the triangles of one vertex are adjacent.
     order = np.argsort(triangles.ravel(), kind="stable")
     corner = triangles.ravel()[order]

@@ -45,7 +45,7 @@ class SimulatorParameters(NodeParameters):
 
 
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
-    """Return the true time at which the projector shows a frame, minus the assumed time, s.
+    """Return the true time (s) at which the projector shows a frame, minus the assumed time.
 
     The renderer's assumed latency is stored in the frame; without a displayed frame, it is the
     nominal latency. The result is 0 without an apparatus.

@@ -47,7 +47,7 @@ class HeadSway:
         return cls(eyes.sway_m, SineSum.drawn(band_hz, np.random.default_rng(seed)))
 
     def at(self, time_s: float) -> Floats:
-        """Return the displacement (3,) of the eyes at `time_s`, m."""
+        """Return the displacement (3,), in m, of the eyes at `time_s`."""
         return np.asarray(self.sway_m * self.noise.at(time_s)[0])
 
 
@@ -61,7 +61,7 @@ class Viewer:
         self._eyes, self._sway, self._random = true_scene.eyes, sway, random
 
     def locate_eye(self, side: Side, time_s: float) -> Floats:
-        """Return the world position (3,) of an eye at `time_s`, m."""
+        """Return the world position (3,), in m, of an eye at `time_s`."""
         aside_m = (0.5 if side == "right" else -0.5) * self._eyes.interocular_m
         moved = np.zeros(3) if self._sway is None else self._sway.at(time_s)
         return np.asarray(self._eyes.centre_world_m + aside_m * np.eye(3)[0] + moved)

@@ -152,10 +152,10 @@ def _stations(length_m: float, sizes: _Sizes) -> Floats:
 
 
 def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
-    """Return the angles (n,) of points on an arc from `start` to `stop` (excluded), rad.
+    """Return the angles (n,), in rad, of points on an arc from `start` to `stop` (excluded).
 
     The distances of the points are the required sizes. radius: radius of the arc, m. depth: depth
-    of the arc below the curved side, m.
+    (m) of the arc below the curved side.
     """
     fine = np.linspace(start, stop, 2001)
     return _sample_by_density(
@@ -254,9 +254,11 @@ def _circle(radius: float | Floats, angles: Floats) -> Floats:
 
 
 def _triangles(points: Floats, where: Floats) -> Ints:
-    """Return counter-clockwise triangles (t, 3) of points (n, 2).
+    """Triangulate points; return counter-clockwise triangles (t, 3) of indices.
 
-    where (n, 2): positions of the points for the Delaunay triangulation.
+    points (n, 2): true positions. where (n, 2): positions at which the Delaunay triangulation
+    determines which points to connect; they may differ from `points`. Triangles without area are
+    omitted.
     """
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 

@@ -188,8 +188,8 @@ def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
     """Return the tetrahedra (k, 4) with a core vertex, after the removal of pinches.
 
     Vertices where the boundary touches itself are removed from `core` (n,), in place. distance
-    (n,): signed distance of the vertices from the surface, m. Raise UnfitMeshError if the object is
-    too thin.
+    (n,): signed distance (m) of the vertices from the surface. Raise UnfitMeshError if the object
+    is too thin.
     """
     before = int(core.sum())
     while True:

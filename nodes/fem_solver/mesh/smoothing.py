@@ -59,7 +59,7 @@ def smooth_mesh(
     springs: tuple[float, ...],
     anchor: float,
 ) -> Floats:
-    """Improve the shape of tetrahedra and return the new positions (n, 3) of their corners, m.
+    """Improve the shape of tetrahedra and return the new positions (n, 3), in m, of their corners.
 
     corners (n, 3), m, tetrahedra (e, 4): mesh with positive volumes. hull: indices of the corners
     that move to the surface. surface: function that finds the nearest surface points. springs:

@@ -156,7 +156,7 @@ class SmoothMeshShape:
         self._table, self._counts = self._support_table(1.1 * cover)
 
     def deviation_m(self) -> float:
-        """Return the maximum distance between the mesh and the smooth surface, m.
+        """Return the maximum distance (m) between the mesh and the smooth surface.
 
         It is evaluated at vertices, edge midpoints and triangle centres. Raises MeshError if it
         exceeds `MAX_DEVIATION_RATIO` times `smoothing_m`.
@@ -294,8 +294,8 @@ class SmoothMeshShape:
     ) -> tuple[Indices, Indices]:
         """Choose further starting points for the search for a nearer surface point.
 
-        lists: indices of the candidate jets (local quadratic fits) of each query.
-        feet (n, 3), distance (n,): nearest points found so far, m, and their distances, m.
+        lists: indices of the candidate jets (local quadratic fits) of each query. feet (n, 3),
+        distance (n,): nearest points found so far, and their distances, in m.
 
         Return k pairs: indices of the queries (k,) and of the jets (k,) at which to start. A jet is
             chosen if the nearest point on its quadratic is close to the jet and not much farther
@@ -348,7 +348,7 @@ class SmoothMeshShape:
         return _on_surface_only(feet)
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return how far the object rises above its tangent plane at a surface point, m.
+        """Return the height (m) of the object above its tangent plane at a surface point.
 
         This implements `Shape.rise_m`. The height is evaluated only at the centres of the jets.
         """
@@ -378,7 +378,7 @@ class SmoothMeshShape:
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
         """List, for each jet, the jets whose weight is not zero in its neighbourhood.
 
-        cover (j,): radius of the neighbourhood of each jet, m.
+        cover (j,): radius (m) of the neighbourhood of each jet.
 
         Return a table (j, k) of jet indices, and the number (j,) of valid entries in each row. Rows
         are padded with the index of a far-away jet without influence, which this method appends to

@@ -207,7 +207,8 @@ class EllipsoidShape(Convex):
         """Return whether each query (n, 3) has several equally near surface points.
 
         Such queries are in the plane through the centre, perpendicular to the shortest axis. They
-        are inside an ellipse that ends at the centres of curvature of the two other axes.
+        are inside the ellipse whose vertices are the centres of curvature at the ends of the other
+        axes.
         """
         axes = np.array(self.semi_axes_m)
         shortest = np.flatnonzero(axes <= axes.min() * (1.0 + 1e-9))
@@ -318,7 +319,7 @@ class RoundedBoxShape(Convex):
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Return the half extents (3,) of the core, m."""
+        """Return the half extents (3,), in m, of the core."""
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(

@@ -1,11 +1,11 @@
 """Define the interface of shapes: nearest surface points with normals and curvature.
 
-Points are arrays (3,) or (n, 3) in the frame of the object, m. Results have the same leading shape.
-A query is a point for which the nearest surface point is searched. Normals point out of the object.
-The curvature is given as the shape operator W, a symmetric matrix (3, 3). For a small displacement
-dp along the surface, the unit normal n changes by dn = W dp, and W n = 0. The two other eigenvalues
-of W are the principal curvatures, positive where the object is convex (do Carmo, Differential
-Geometry of Curves and Surfaces, ch. 3).
+Points are arrays (3,) or (n, 3), in m, in the frame of the object. Results have the same leading
+shape. A query is a point for which the nearest surface point is searched. Normals point out of the
+object. The curvature is given as the shape operator W, a symmetric matrix (3, 3). For a small
+displacement dp along the surface, the unit normal n changes by dn = W dp, and W n = 0. The two
+other eigenvalues of W are the principal curvatures, positive where the object is convex (do Carmo,
+Differential Geometry of Curves and Surfaces, ch. 3).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Nearest:
     shape_operator: shape operator (..., 3, 3) at `point`, 1/m.
     on_edge: whether `point` is on the rim of the touchable surface and the query is past that rim,
         or `point` is on an edge of a mesh. A sheet can be tangent there but cannot roll over it.
-    undecided: whether another surface point is equally near, so that the previous point or `FRONT`
+    undecided: whether another surface point is equally near, so the previous point or `FRONT`
         determined the choice.
     """
 
@@ -79,7 +79,7 @@ class Shape(Protocol):
         ...
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return how far the object rises above its tangent plane at a surface point (3,), m.
+        """Return the height (m) by which the object rises above its tangent plane at a point (3,).
 
         normal (3,): unit normal at the point. radius_m: maximum considered distance from the point,
             measured along the plane.

@@ -228,8 +228,7 @@ def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
 
 
 def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
-    """Return the edges (e, 2) of a closed mesh, and the angles (e,) between adjacent triangles,
-    rad.
+    """Return the edges (e, 2) of a closed mesh, and the angles (e,), in rad, at these edges.
 
     The angle is that between the normals of the two triangles.
     """

@@ -148,7 +148,7 @@ def _slack_position_factor(x: float, y: float) -> float:
 def _push_tension(
     rubber: Rubber, stretch_ratio: float, depths: Floats, relative: tuple[float, float]
 ) -> tuple[Floats, float]:
-    """Return the additional force (n,) on each clamp due to a push, N, and E t W, N.
+    """Return the additional force (n,), in N, on each clamp due to a push, and E t W, in N.
 
     depths (n,), m. relative: relative coordinates (x, y) of the push.
     """
@@ -240,9 +240,9 @@ class ScaledSheetModel:
 
 @dataclass(frozen=True, slots=True)
 class MembraneSheetModel:
-    """The most accurate model: finite elements of the membrane, which need seconds.
+    """The most accurate model, a finite-element model of the membrane.
 
-    cells: number of elements along each side of the sheet.
+    One evaluation takes seconds. cells: number of elements along each side of the sheet.
     """
 
     rubber: Rubber

@@ -60,10 +60,10 @@ class NoEquilibriumError(FlexsheetError, ArithmeticError):
 class PushPath:
     """The equilibria of the sheet at depths (n,), m, of one push.
 
-    forces_n (n,): normal force of the sheet on the finger.
-    edge_forces_n (n,): mean force on the clamps along the line between them.
-    positions (n, rows, columns, 3): positions of the mesh nodes in the sheet's frame, m.
-    rest_m (rows, columns, 2): positions of these nodes in the slack sheet, relative to its centre.
+    forces_n (n,): normal force of the sheet on the finger. edge_forces_n (n,): mean force on the
+    clamps along the line between them. positions (n, rows, columns, 3): positions (m) of the mesh
+    nodes in the sheet's frame. rest_m (rows, columns, 2): positions of these nodes in the slack
+    sheet, relative to its centre.
     """
 
     depths_m: Floats
@@ -223,7 +223,7 @@ class _Grid:
         return float(self.volume @ relaxed_energy(large, small, self.c1, self.c2)[0])
 
     def gradient(self, positions: Floats) -> Floats:
-        """Return the gradient (3 nodes,) of the elastic energy: the nodal forces, N."""
+        """Return the gradient (3 nodes,) of the elastic energy: the nodal forces (N)."""
         deformed, c = self.strain(positions)
         stress, _ = stress_and_tangent(c, self.c1, self.c2, tangent=False)
         volume = self.volume[:, None, None]
@@ -245,11 +245,10 @@ class _Grid:
     def system(
         self, positions: Floats, added: Floats, free: Bools, damping: float
     ) -> tuple[Floats, scipy.sparse.csc_array]:
-        """Return the energy gradient (3 nodes,), N, and the stiffness matrix of the free
-        coordinates, N/m.
+        """Return the energy gradient (3 nodes,), N, and the stiffness (N/m) of free coordinates.
 
         added (nodes, 3, 3): stiffness of the contact, N/m. free (3 nodes,): whether each coordinate
-            may move. damping: value that is added to the diagonal, N/m.
+            may move. damping: value (N/m) that is added to the diagonal.
         """
         deformed, c = self.strain(positions)
         stress, tangent = stress_and_tangent(c, self.c1, self.c2, tangent=True)
@@ -401,7 +400,7 @@ def _predict_state(
 ) -> Floats:
     """Predict the next equilibrium by scaling the indentation to the new depth, or first as a cone.
 
-    push: current depth and its increase in this step, m.
+    push: current depth and its increase in this step (m).
     """
     depth, advance = push
     grown = state.copy()
