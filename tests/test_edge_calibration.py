@@ -140,7 +140,9 @@ def test_too_few_poses_and_confused_arms_are_refused() -> None:
         replace(pose, left_rad=other.left_rad)
         for pose, other in zip(poses, [*poses[1:], poses[0]], strict=True)
     ]
-    with pytest.raises(EdgeFitError, match="check which mark, arm and joints belong together"):
+    with pytest.raises(
+        EdgeFitError, match="check which mark, arm and joint angles belong together"
+    ):
         fit_edges(confused, SCENE)
 
 

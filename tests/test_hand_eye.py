@@ -238,7 +238,9 @@ def test_inconsistent_poses_are_an_error() -> None:
             zip(detections, [*detections[5:], *detections[:5]], strict=True)
         )
     ]
-    with pytest.raises(HandEyeError, match=r"contradict .*check that the joints are measured"):
+    with pytest.raises(
+        HandEyeError, match=r"contradict .*check that the joint angles are measured"
+    ):
         calibrate_base(shuffled, RIG)
 
 

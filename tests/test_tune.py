@@ -395,7 +395,7 @@ def test_an_unknown_family_is_named_with_the_nearest() -> None:
     outcome = run(SCENES / "cylinder.yaml", "--family", "corection")
     assert isinstance(outcome.exception, CommandError)
     assert 'did you mean "correction"?' in str(outcome.exception)
-    assert 'unknown family "kinematics"' in str(
+    assert 'unknown method family "kinematics"' in str(
         run(SCENES / "sphere.yaml", "--family", "kinematics").exception
     )
 

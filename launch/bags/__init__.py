@@ -1,1 +1,1 @@
-"""Play, replay, report and export bags, which are files of recorded topics."""
+"""Play back bags (files of recorded topics), rerun nodes on them, report on and export them."""

@@ -103,8 +103,8 @@ def export(
 ) -> ExportResult:
     """Write a bag as an MCAP file with the schemas of Foxglove.
 
-    topics: names of topics to export; None: all topics.
-    progress: function that is called with the exported and the total duration, s.
+    topics: names of topics to export; None: all topics. progress: function that is called with the
+    exported and the total duration (s).
 
     Topics whose message type has changed since the recording cannot be read. The result contains
     their names. Raises ExportError and BagError.

@@ -42,7 +42,7 @@ def export_ros2(
     output: folder to create, with metadata.yaml and an MCAP file. If its name ends with .mcap, only
         the MCAP file is written, which contains the same metadata.
     topics: names of flexsheet topics to convert; None: all topics.
-    progress: function that is called with the converted and the total duration, s.
+    progress: function that is called with the converted and the total duration (s).
 
     Raises ExportError, Ros2Error and BagError.
     """

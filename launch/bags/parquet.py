@@ -331,8 +331,8 @@ def write_parquet(
     """Write one Parquet file per topic of a bag into a new folder.
 
     topics: names of topics; None: all topics. images: whether the tables contain images. progress:
-        function that is called with the converted and the total duration, s. A slash in the topic's
-        name becomes a dot in the file's name.
+        function that is called with the converted and the total duration (s). A slash in the
+        topic's name becomes a dot in the file's name.
 
     Raises ExportError and BagError.
     """

@@ -17,7 +17,7 @@ from flexsheet.messages.clock_table import shift_stamps
 from flexsheet.messages.topics import Delivery, find_topic
 
 Progress = Callable[[float, float], None]
-"""A function that is called with the played and the total duration, s."""
+"""A function that is called with the played and the total duration (s)."""
 
 
 NEVER_PLAYED = {

@@ -48,7 +48,7 @@ def read_fields(
 ) -> list[FieldSeries]:
     """Read fields named "TOPIC.FIELD" or "TOPIC.FIELD.FIELD" from a bag.
 
-    progress: function that is called with the read and the total duration, s.
+    progress: function that is called with the read and the total duration (s).
 
     Raises BadInputError if the bag does not contain a topic or field, or a field is not a number.
     """

@@ -182,8 +182,9 @@ def read_detections(
 ) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
     """Detect the board in the images in a folder.
 
-    Return the detections, and the poses without a detected board as (name, reason). size: required
-    (width, height) of the images, px. Raises ArmPosesError and CalibrationError.
+    Return the detections, and (name, reason) of the poses in whose images the board was not
+    detected. size: required (width, height), in px, of the images. Raises ArmPosesError and
+    CalibrationError.
     """
     rows = read_pose_table(folder)
     if rows[0].images is None:
@@ -217,7 +218,7 @@ def _make_detection(name: str, joints_rad: Floats, pair: BoardPair, board: Board
 
 
 def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
-    """Project the board of a row that gives the board's pose into both images, without noise."""
+    """Project a board whose pose the CSV row states into both images, without noise."""
     assert row.left_from_board is not None
     points = board_points(board)
     views = []
@@ -225,7 +226,8 @@ def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
         in_eye = apply(eye_from_left @ row.left_from_board, points)
         if in_eye[:, 2].min() <= 0.0:
             raise ArmPosesError(
-                f"{row.name}: the board would be behind a camera; check the joints of this row"
+                f"{row.name}: the board would be behind a camera; check the joint angles of this "
+                "row of joints.csv"
             )
         views.append(CornerView(points, project(in_eye, lens.matrix, lens.distortion)))
     return BoardDetection(row.name, row.joints_rad, views[0], views[1])
@@ -319,7 +321,7 @@ def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
 
 
 class SimulatedArm:
-    """A simulated arm without a sheet: true pose of its base, and true errors of its joints.
+    """A simulated arm without a sheet: true pose of its base, and true errors of its angles.
 
     Without an apparatus (true hardware parameters), the base deviates at random from the scene's,
     and each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, its base pose and

@@ -48,8 +48,8 @@ class RigFit:
     """A fitted stereo rig and its residuals.
 
     rig: parameters (22,). poses: poses of the board (pairs, 6), rotation vector and position in the
-    left camera's frame. residuals: for each pair, detected minus projected corners (n, 2) of the
-    left and of the right image, px. sigma_px: standard deviation of one corner coordinate.
+    left camera's frame. residuals: for each pair, detected minus projected corners (n, 2), in px,
+    of the left and of the right image. sigma_px: standard deviation of one corner coordinate.
     covariance: covariance matrix (22, 22) of the rig's parameters.
     """
 
@@ -60,11 +60,11 @@ class RigFit:
     covariance: Floats
 
     def pair_rms_px(self) -> Floats:
-        """Return the rms corner residuals (pairs, 2) of the left and right views, px."""
+        """Return the rms corner residuals (pairs, 2), in px, of the left and right views."""
         return np.array([[rms_distance(view) for view in views] for views in self.residuals])
 
     def rms_px(self) -> float:
-        """Return the rms distance between detected and projected corners of both views, px."""
+        """Return the rms distance (px) between detected and projected corners of both views."""
         return rms_distance(np.concatenate([view for views in self.residuals for view in views]))
 
 

@@ -26,10 +26,10 @@ COLUMNS, ROWS = 4, 3
 MIN_CELL_CORNERS = 2
 UPRIGHT_RAD = np.radians(12.0)
 STILL_PX = 0.5
-"""The maximum motion of the corners between images of a board that counts as resting, px."""
+"""The maximum motion (px) of the corners between images of a board that counts as resting."""
 
 NEW_POSE_PX = 12.0
-"""The minimum distance of the corners between a new board pose and every accepted one, px."""
+"""The minimum distance (px) of the corners between a new board pose and every accepted one."""
 
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
@@ -198,7 +198,7 @@ def classify_tilt(pose: Floats, middle: Floats) -> str:
     """Classify the tilt of a board pose (6,) in the left camera's frame as one of TILTS.
 
     Only the direction of the board's normal counts, so rotation within the board's plane has no
-    effect. middle: centre of the board (3,) in its own frame, m.
+    effect. middle: centre (3,), in m, of the board in its own frame.
     """
     transform = pose_transform(pose)
     centre = transform[:3, :3] @ middle + transform[:3, 3]
@@ -215,7 +215,7 @@ def classify_tilt(pose: Floats, middle: Floats) -> str:
 
 
 def _measure_shift(pair: BoardPair, other: BoardPair) -> float:
-    """Return the median displacement of common corners, px; infinite if there are none."""
+    """Return the median displacement (px) of common corners; infinite if there are none."""
     _, here, there = np.intersect1d(
         pair.left.ids, other.left.ids, assume_unique=True, return_indices=True
     )

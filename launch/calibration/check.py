@@ -69,7 +69,7 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class BoardMeasurement:
-    """The errors of a board that was measured with a stereo camera, m and px.
+    """The errors (m and px) of a board that was measured with a stereo camera.
 
     squares_m: errors of the distances between neighbouring corners. diagonals_m: errors of the
     lengths of the diagonals. rigid_fit_m: distances of the corners from the fitted board. The
@@ -84,7 +84,7 @@ class BoardMeasurement:
 
 
 def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
-    """Triangulate pixels (n, 2) linearly into points (n, 3) in the left camera's frame, m."""
+    """Triangulate pixels (n, 2) linearly into points (n, 3), in m, in the left camera's frame."""
     normalized = [
         cv2.undistortPoints(pixels[:, None], matrix, distortion)[:, 0].T
         for pixels, matrix, distortion in zip(
@@ -134,7 +134,7 @@ def measure_board(rig: StereoRig, pair: BoardPair, board: Board) -> BoardMeasure
 
 
 def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: Floats) -> Floats:
-    """Return distances (2n,) between detected corners and projected points, left then right, px."""
+    """Return distances (2n,), in px, of detected corners from projected points, left then right."""
     distances = []
     stands = (np.eye(4), rig.right_from_left)
     for pixels, matrix, distortion, stand in zip(
@@ -185,8 +185,8 @@ def check_stereo(
     """Measure a board of known size with a calibration, in images that were not used to calibrate.
 
     Returns the values of `summarize`, and used_to_calibrate: the left images that were used to
-    calibrate after all, so that their errors are underestimated. Raises CalibrationError for images
-    of another size, and if no pair shows the board.
+    calibrate after all, so their errors are underestimated. Raises CalibrationError for images of
+    another size, and if no pair shows the board.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     if size != (calibration.width_px, calibration.height_px):

@@ -360,8 +360,8 @@ def list_doubts(
 ) -> list[str]:
     """List reasons why a laboratory may exceed a tolerance; empty if none is expected.
 
-    figures: results of the verification. tracking: error of the sheet in the stroke as the devices
-    report it, and its tolerance, mm.
+    figures: results of the verification. tracking: error (mm) of the sheet in the stroke as the
+    devices report it, and its tolerance.
     """
     doubts = []
     for name, record in steps.items():

@@ -40,12 +40,12 @@ MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 15
 """The bounds of half the side of the refinement window, in pixels of the enlarged image."""
 
 MAX_REFINEMENT_PX = 1.0
-"""The maximum shift of a ChArUco corner by the refinement, px. A larger shift indicates that the
+"""The maximum shift (px) of a ChArUco corner by the refinement. A larger shift indicates that the
 refinement found another edge."""
 
 CHESSBOARD_SMOOTHING_PX = 1.0
 CHARUCO_SMOOTHING_PX = 0.7
-"""The standard deviation of the smoothing of ChArUco images, px; markers are close to the corners.
+"""The standard deviation (px) of the smoothing of ChArUco images; markers are close to the corners.
 """
 
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
@@ -90,7 +90,7 @@ def ignore_progress(done: int, total: int, what: str) -> None:
 
 
 def board_points(board: Board) -> Floats:
-    """Return the corners (rows*columns, 3) in the board's frame, m, counted along columns first."""
+    """Return corners (rows*columns, 3), in m, in the board's frame, counted along columns first."""
     points = np.zeros((board.rows * board.columns, 3))
     grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2)
     points[:, :2] = grid * board.square_m
@@ -197,7 +197,7 @@ class CornerFinder:
 
 
 def _measure_spacing(pixels: Floats) -> Floats:
-    """Return the distance (n,) of each corner (n, 2) from the nearest other corner, px."""
+    """Return the distance (n,), in px, of each corner (n, 2) from the nearest other corner."""
     distances = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
     np.fill_diagonal(distances, np.inf)
     return np.asarray(distances.min(axis=1))

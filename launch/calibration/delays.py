@@ -1,8 +1,9 @@
 """Measure the delays of arms and camera.
 
 The servo lag is the time by which an arm follows its commands. Each arm bridge measures it from
-commanded and measured joints. The bridge starts with the lag in the launch file, and its self-check
-reports a deviation from that value. Therefore the measured lag is written into the launch file.
+commanded and measured joint angles. The bridge starts with the lag in the launch file, and its
+self-check reports a deviation from that value. Therefore the measured lag is written into the
+launch file.
 
 The stamp offset is the time by which exposures are later than their timestamps. The camera sees
 the marks on both clamps while the arms move the sheet. Their motion is compared with the motion
@@ -55,7 +56,7 @@ BLOCK_S, MIN_BLOCKS = 2.0, 4
 minimum number of these parts."""
 
 STAMP_MODEL_STD_S = 1.5e-4
-"""The standard deviation of the stamp offset that backlash and elasticity of the arms cause, s.
+"""The standard deviation (s) of the stamp offset that backlash and elasticity of the arms cause.
 
 The error was 0.1 ms rms in the simulated laboratories 0 to 9.
 """
@@ -154,9 +155,9 @@ def estimate_stamp_offset(
 ) -> MeasuredLag | None:
     """Estimate exposure time minus timestamp from images of the marks at the clamps' centres.
 
-    pairs: image pairs with their timestamps, ns. edges: motion of each seen clamp from
-    measured joints. Return None if the marks are visible or move for less than MIN_BLOCKS
-    parts of the recording.
+    pairs: image pairs with their timestamps (ns). edges: motion of each seen clamp from measured
+    joint angles. Return None if the marks are visible or move for less than MIN_BLOCKS parts of the
+    recording.
     """
     seen: list[list[tuple[int, Floats]]] = [[] for _ in edges]
     for at_ns, pair in pairs:
@@ -249,7 +250,7 @@ def swing_sheet(
 ) -> tuple[tuple[SampledMotion, ...], tuple[SampledMotion, ...]]:
     """Simulate arms that move the sheet periodically along its y axis, after one second at rest.
 
-    Return the true motion of both clamps, and that from measured joints.
+    Return the true motion of both clamps, and that from measured joint angles.
     """
     start = SheetTrajectoryPlanner(scene, PlannerParameters().trajectory_settings()).motion
     sheet = SimulatedSheet(scene, apparatus, start, lag_known=False)
@@ -272,7 +273,7 @@ def swing_sheet(
 def _draw_exposures(
     scene: Scene, apparatus: Apparatus, end_ns: int, seed: int
 ) -> Iterable[tuple[int, int]]:
-    """Yield timestamps and true times of simulated exposures, ns."""
+    """Yield timestamps and true times (ns) of simulated exposures."""
     truth, random = apparatus.camera, np.random.default_rng((seed, 1))
     for stamp_s in np.arange(
         0.2, 1e-9 * end_ns - 0.2, 1.0 / (truth.rate_hz or scene.camera.rate_hz)

@@ -9,7 +9,7 @@ are the pose errors b of the base and e of the edge (rotation vector and transla
 matrix), the joint offsets d and the compliance c of the flange. The marks do not determine each
 unknown, but their sum, which is sufficient in the measured working range. Therefore each unknown
 has a normal prior, and the maximum of the posterior is taken. The finger is measured by the same
-camera, so that errors of the camera's pose and lenses cancel.
+camera, so errors of the camera's pose and lenses cancel.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ OUTLIER_SIGMAS = 3.0
 
 MIN_POSES = 8
 MAX_RESIDUAL_M = 1e-3
-"""The maximum root mean square of the residuals; a larger one indicates wrong marks or joints."""
+"""The maximum root mean square of the residuals; a larger one indicates wrong marks or angles."""
 
 
 class EdgeFitError(FlexsheetError, ValueError):
@@ -80,7 +80,7 @@ class EdgeMark:
 
 @dataclass(frozen=True, slots=True)
 class HeldPose:
-    """A pose of the sheet at rest, with the reported joint angles (6,) of both arms, rad."""
+    """A pose of the sheet at rest, with the reported joint angles (6,), in rad, of both arms."""
 
     left_rad: Floats
     right_rad: Floats
@@ -217,7 +217,7 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
     if not residual_rms_m <= MAX_RESIDUAL_M:
         raise EdgeFitError(
             f"the marks are {1e3 * residual_rms_m:.2f} mm (rms) from the fitted edge, maximum "
-            f"{1e3 * MAX_RESIDUAL_M:g} mm; check which mark, arm and joints belong together"
+            f"{1e3 * MAX_RESIDUAL_M:g} mm; check which mark, arm and joint angles belong together"
         )
     marks = off.size
     covariance = np.linalg.inv(found.jac.T @ found.jac)

@@ -41,7 +41,7 @@ SIDES: tuple[Side, Side] = ("left", "right")
 POINTS = ("bead", "cross")
 COLUMNS = ("eye", *(f"{point}_{axis}_mm" for point in POINTS for axis in "xyz"))
 """The columns of the CSV file with one row per alignment: the open eye (left or right), and the
-measured world positions of bead and cross, mm."""
+measured world positions (mm) of bead and cross."""
 
 MIN_ALIGNMENTS = 6
 OUTLIER_RATIO = 2.0
@@ -82,7 +82,7 @@ class EyesError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The measured world positions (3,) of a bead and a cross that coincide for one eye, m."""
+    """The measured world positions (3,), in m, of a bead and a cross that coincide for one eye."""
 
     eye: Side
     bead_m: Floats
@@ -158,7 +158,7 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
         )
 
     def offsets(eye: Floats) -> Floats:
-        """Return the shortest vectors (n, 3) from the lines of sight to the crosses, m."""
+        """Return the shortest vectors (n, 3), in m, from the lines of sight to the crosses."""
         directions, far = beads - eye, crosses - eye
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         return np.asarray(far - np.einsum("ni,ni->n", far, directions)[:, None] * directions)

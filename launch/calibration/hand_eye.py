@@ -76,7 +76,8 @@ MIN_SCALE = 0.01
 MAX_READMISSIONS = 5
 
 MAX_PLAUSIBLE_ARM_M, MAX_PLAUSIBLE_ARM_RAD = 0.01, 0.05
-"""The maximum plausible standard deviations of an arm; larger ones mean wrongly assigned joints."""
+"""The maximum plausible standard deviations of the flange's position (m) and orientation (rad).
+Larger values mean that joint angles are assigned to the wrong joints."""
 
 MAX_OUTLIER_RATIO = 1.0 / 3.0
 """The maximum fraction of outlier poses; more indicate another mistake, such as a wrong board."""
@@ -87,8 +88,8 @@ MIN_ARM_RAD, MIN_ARM_M = 1e-6, 1e-6
 MAX_ARM_RAD, MAX_ARM_M = 0.1, 0.1
 
 ADVICE = (
-    "check that the joints are measured at the exposure, that the board is fixed to the flange, "
-    "and that stereo calibration and board are correct"
+    "check that the joint angles are measured at the exposure, that the board is fixed to the "
+    "flange, and that stereo calibration and board are correct"
 )
 
 INITIAL_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
@@ -149,9 +150,9 @@ class BoardDetection:
 class PoseResidual:
     """The residual of one pose of the arm.
 
-    shift_m, rotation_rad: difference between the flange poses from the images and from the joints.
-    rms_px: rms distance of the corners from their projections with the pose from the joints.
-    reason: why the pose was excluded; empty for an inlier.
+    shift_m, rotation_rad: difference between the flange poses from the images and from the joint
+    angles. rms_px: rms distance of the corners from their projections with the pose from the joint
+    angles. reason: why the pose was excluded; empty for an inlier.
     """
 
     name: str
@@ -355,7 +356,7 @@ def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
 def _linearize_pixels(
     detection: BoardDetection, rig: LensRig, left_from_flange: Floats, flange_from_board: Floats
 ) -> tuple[Floats, Floats]:
-    """Return residuals (m,) of the corners, px, and derivatives (m, 6) by a flange motion."""
+    """Return residuals (m,), in px, of the corners, and derivatives (m, 6) by a flange motion."""
     residuals, slopes = [], []
     for view, lens, eye_from_left in (
         (detection.left, rig.left, np.eye(4)),
@@ -475,7 +476,7 @@ def _find_rough_inliers(discrepancies: Floats) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class _NoiseModel:
-    """The standard deviations of corner coordinates, px, and the flange's pose error, rad and m."""
+    """The standard deviations of corner coordinates (px) and of the flange's pose (rad and m)."""
 
     corner_px: float
     arm_rad: float

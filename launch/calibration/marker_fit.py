@@ -6,9 +6,9 @@ offset in the finger's frame. b is an error that all touches in one orientation 
 centre of a tilted marker is biased. A touched plane, such as the sheet, only determines the
 component along its normal.
 
-This is a linear model with random effects e and b. Their variances are estimated with the offset
-by restricted maximum likelihood and prior distributions, so that the covariance of the offset
-follows from the residuals (Searle, Casella and McCulloch 1992, chapter 6).
+This is a linear model with random effects e and b. Their variances are estimated with the offset by
+restricted maximum likelihood and prior distributions, so the covariance of the offset follows from
+the residuals (Searle, Casella and McCulloch 1992, chapter 6).
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class MarkerFit:
-    """A fitted offset of the marker (3,) in the finger's frame, m, and its covariance (3, 3), m².
+    """A fitted marker offset (3,), in m, in the finger's frame, and its covariance (3, 3), in m².
 
     point_offset_m: mean of the estimated errors of the touched points, world. residuals_m: residual
     distances (touches,). points, orientations: numbers of different points and orientations.
@@ -96,12 +96,12 @@ class MarkerFit:
 
     @property
     def standard_deviations_m(self) -> Floats:
-        """Return the standard deviations (3,) of the offset's components, m."""
+        """Return the standard deviations (3,), in m, of the offset's components."""
         return np.sqrt(np.diag(self.covariance_m2))
 
     @property
     def residual_rms_m(self) -> float:
-        """Return the root mean square of the residuals, m."""
+        """Return the root mean square (m) of the residuals."""
         return float(np.sqrt(np.mean(self.residuals_m**2)))
 
 

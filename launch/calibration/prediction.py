@@ -4,7 +4,7 @@ The scene contains the calibrated parameters of the devices. The prediction is a
 simulation: it samples apparatuses, which are sets of possible true parameters of the devices. Their
 deviations from the scene have the covariances of the calibrations. Parameters that no calibration
 measures deviate by the standard deviations below. All errors of sheet, image, force and fingertip
-are computed from the same samples, so that errors with a common cause are counted once. The true
+are computed from the same samples, so errors with a common cause are counted once. The true
 parameters of simulated devices are not read.
 """
 
@@ -45,7 +45,7 @@ Random = np.random.Generator
 DRAWS = 12
 DRAW_SEED = 20_000
 PIXEL_M = 0.0025
-"""The size of a pixel of the predicted images, m. Their error is averaged over about 100 mm²."""
+"""The size (m) of a pixel of the predicted images. Their error is averaged over about 100 mm²."""
 
 CELLS = 16
 """The number of mesh intervals per side of the sheet in a prediction."""
@@ -253,7 +253,7 @@ def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: R
     """Draw random true parameters of an arm.
 
     covariance: covariance (19, 19) of `fit_edges`; None returns the arm unchanged. seen_m: error
-    (3,) of the measured position of its clamp, m.
+    (3,) of the measured position of its clamp.
     """
     if covariance is None:
         return arm
@@ -313,7 +313,7 @@ def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Rando
 
 
 def draw_marker(scene: Scene, given: NodeCalibrations, random: Random) -> tuple[float, ...]:
-    """Draw a random true position (3,) of the marker in the simulator's finger frame, m."""
+    """Draw a random true position (3,), in m, of the marker in the simulator's finger frame."""
     world_m = given.find_marker_offset_m(scene)
     if (marker := given.marker) is not None:
         covariance_m2 = (

@@ -43,7 +43,7 @@ img { max-width: 100%; } figcaption { color: #444; }
 def compute_epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
     """Compute how far corners in the right image are from the epipolar lines of the left corners.
 
-    Return the right pixels (n, 2) of all common corners and their distances (n,), px, in
+    Return the right pixels (n, 2) of all common corners and their distances (n,), in px, in
     undistorted coordinates of the right camera. The distances are signed.
     """
     rig = StereoRig.from_fit(calibrated.fit.rig)

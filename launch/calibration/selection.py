@@ -147,7 +147,7 @@ def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
 
 
 def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
-    """Return the larger of both views' median distances between common corners, px."""
+    """Return the larger of both views' median distances (px) between common corners."""
     medians = []
     for here, there in ((pair.left, other.left), (pair.right, other.right)):
         _, a, b = np.intersect1d(here.ids, there.ids, assume_unique=True, return_indices=True)

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 QUIET_S, QUIET_M = 0.15, 0.0005
 """The time before and after a measured force, and maximum change of the depth in this time.
 
-Gauges lag, so that forces during a motion cannot be used.
+Gauges lag, so forces during a motion cannot be used.
 """
 
 MAX_GAP_S = 0.05
@@ -144,8 +144,9 @@ def _gap_s(motion: SampledMotion, at_ns: int) -> float:
 
 
 def _locate(tip: Floats, left: Floats, right: Floats) -> tuple[float, tuple[float, float], float]:
-    """Return the depth of a fingertip behind the plane of the sheet, its position (x, y) on the
-    sheet, and the distance of the edges, m.
+    """Return depth and position of a fingertip, and the distance of the edges, all in m.
+
+    The depth is measured behind the plane of the sheet. The position (x, y) is on the sheet.
     """
     across = right[:3, 3] - left[:3, 3]
     distance_m = float(np.linalg.norm(across))

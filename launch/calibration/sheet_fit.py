@@ -32,15 +32,15 @@ MODEL_ERROR_RATIO = 0.03
 """
 
 OUTLIER_SIGMAS = 5.0
-"""The residual above which a row is an outlier, in standard deviations. The fit is repeated without
-outliers."""
+"""The residual above which a measured push is an outlier, in standard deviations. The fit is
+repeated without outliers."""
 
 MAX_RELATIVE_DEVIATION = 0.5
 """The maximum relative standard deviation of a parameter that counts as determined."""
 
 
 class SheetModelFitError(FlexsheetError, ValueError):
-    """Raised for measured rows that do not determine the parameters of the model."""
+    """Raised for measured pushes that do not determine the parameters of the model."""
 
     code = "sheet-model-fit"
     remedy = "Add pushes at other stretches and depths."
@@ -85,7 +85,7 @@ class SheetModelFit:
 
 
 MIN_HYSTERESIS_ROWS = 3
-"""The minimum number of rows with loading, and with unloading, to estimate the hysteresis."""
+"""The minimum number of pushes with loading, and with unloading, to estimate the hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +104,9 @@ class Hysteresis:
 
 
 def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> Hysteresis | None:
-    """Estimate the hysteresis from the residuals of the rows with loading and with unloading.
+    """Estimate the hysteresis from the residuals of the pushes with loading and with unloading.
 
-    pushes: measured pushes. Returns None for fewer than three used rows of either kind. Raises
+    pushes: measured pushes. Returns None for fewer than three used pushes of either kind. Raises
     SheetModelFitError if unloading needs more force than loading.
     """
     elastic_n, _ = _predict(fit.law, pushes, fit.nominal_width_m)
@@ -170,7 +170,8 @@ def fit_sheet_model(
     names = NAMES if with_mooney else NAMES[:3]
     if len(pushes) < 2 * len(names):
         raise SheetModelFitError(
-            f"{len(pushes)} rows; fitting {', '.join(names)} requires {2 * len(names)}; add rows"
+            f"{len(pushes)} measured pushes; fitting {', '.join(names)} requires "
+            f"{2 * len(names)}; measure more"
         )
     start = np.array([np.log(nominal.young_modulus_pa * nominal.thickness_m), 0.0, 0.0, 0.1])
     low = np.array([start[0] - 7.0, -0.1, -2.0, 0.0])
@@ -257,7 +258,7 @@ def fit_sheet_model(
 def _predict(
     law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float
 ) -> tuple[Floats, Floats]:
-    """Compute the contact forces (n,) and the edge forces (n,) of pushes, N."""
+    """Compute the contact forces (n,) and the edge forces (n,), in N, of pushes."""
     forces, edges = np.empty(len(pushes)), np.empty(len(pushes))
     groups: dict[tuple[float, tuple[float, float], float], list[int]] = {}
     for number, push in enumerate(pushes):
@@ -309,7 +310,7 @@ def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m:
 def tabulate_pushes(
     law: ScaledSheetModel, pushes: Sequence[MeasuredPush], used: Bools, nominal_width_m: float
 ) -> TabulatedSheetModel:
-    """Tabulate the measured corrections of the model, from the used rows.
+    """Tabulate the measured corrections of the model, from the used pushes.
 
     Every combination of stretch, x and y must occur; points are identified by their distance from
     the sheet's centre. Depths may differ. Corrections are interpolated at depths that all

@@ -75,7 +75,7 @@ def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
 def _parse_row(
     where: str, cells: Mapping[str, str], sheet: SheetSpec, problems: list[Problem]
 ) -> dict[str, float]:
-    """Return the values of a row by column; append errors in the row to `problems`."""
+    """Return the values of a CSV row by column; append errors in the row to `problems`."""
     values: dict[str, float] = {}
     for name, text in cells.items():
         if not text and name in OPTIONAL:
@@ -151,11 +151,12 @@ def simulate_rows(
     apparatus: Apparatus | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[MeasuredPush]:
-    """Simulate pushes over the scene's stretches and depths, with the noise of a force gauge.
+    """Simulate measured pushes over the scene's stretches and depths.
 
-    places: whether to push at points all over the sheet, not only at its centre. apparatus: true
-    parameters of arms and sheet; None: the scene's parameters. Rubber with hysteresis gives one row
-    for loading and one for unloading.
+    places: whether to push at points all over the sheet, not only at its centre. noise_n: standard
+    deviation (N) of the noise of the force gauge; that of the edge force is ten times as large.
+    apparatus: true parameters of arms and sheet; None: the scene's parameters. Each depth gives one
+    push; rubber with hysteresis gives one for loading and one for unloading.
     """
     rng = np.random.default_rng(seed)
     sheet = SimulatedSheet(scene, apparatus or nominal_apparatus(scene))
@@ -188,7 +189,7 @@ def simulate_rows(
 
 
 def _simulated_cases(scene: Scene, places: bool) -> Iterator[tuple[float, tuple[float, float]]]:
-    """Yield each simulated combination of a stretch ratio and a pushed point (x, y), m."""
+    """Yield each simulated combination of a stretch ratio and a pushed point (x, y), in m."""
     sheet = scene.sheet
     stretches = np.linspace(
         max(sheet.min_stretch_ratio, 1.005), sheet.max_stretch_ratio, SIMULATED_STRETCHES

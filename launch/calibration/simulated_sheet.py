@@ -52,7 +52,7 @@ def simulate_push(
     *,
     cells: int = CELLS,
 ) -> tuple[float, float]:
-    """Return the normal force of a push and the mean force on a clamped edge, N.
+    """Return the normal force (N) of a push and the mean force (N) on a clamped edge.
 
     point_m: pushed point on the sheet (x, y from its centre).
     """
@@ -107,8 +107,8 @@ class SimulatedSheet:
     """A sheet between simulated arms with the true parameters of an apparatus.
 
     The commanded poses of the edges are computed with the arm parameters of the scene. The true
-    edges deviate from them by the errors of bases, joints and clamps, and by the compliance of the
-    arms.
+    edges deviate from them by the errors of bases, joint angles and clamps, and by the compliance
+    of the arms.
     """
 
     def __init__(self, scene: Scene, apparatus: Apparatus) -> None:
@@ -124,7 +124,7 @@ class SimulatedSheet:
         point_m: tuple[float, float],
         radius_m: float,
     ) -> list[tuple[tuple[float, float], float]]:
-        """Return the normal forces while loading and unloading, and the clamp force, per depth, N.
+        """Return per depth the normal forces (loading, unloading) and the clamp force, in N.
 
         distance_m: commanded distance of the edges. depths_m: ascending. radius_m: radius of the
         pushing ball, to which touched rubber sticks.
@@ -158,14 +158,14 @@ def simulate_force(
     point_m: tuple[float, float],
     finger_radius_m: float,
 ) -> float:
-    """Simulate a push as `simulate_push` does, and return only the normal force, N."""
+    """Simulate a push as `simulate_push` does, and return only the normal force (N)."""
     return simulate_push(sheet, stretch_ratio, depth_m, point_m, finger_radius_m)[0]
 
 
 def simulate_points(
     scene: Scene, world_from_left_edge: Floats, world_from_right_edge: Floats, finger_tip: Floats
 ) -> Floats:
-    """Return points (n, 3) of the simulated sheet between two edges under a fingertip, m."""
+    """Return points (n, 3), in m, of the simulated sheet between two edges under a fingertip."""
     pushed = solve_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     return pushed.positions.reshape(-1, 3)
 

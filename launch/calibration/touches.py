@@ -62,7 +62,7 @@ def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
 
 
 def _parse_row(where: str, cells: Mapping[str, str], problems: list[Problem]) -> dict[str, float]:
-    """Return the values of a row by column; append errors in the row to `problems`."""
+    """Return the values of a CSV row by column; append errors in the row to `problems`."""
     values: dict[str, float] = {}
     for name, text in cells.items():
         if not text and name in NORMAL:

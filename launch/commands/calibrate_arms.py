@@ -271,8 +271,8 @@ async def record_poses(
 
     The function returns when the recorder has enough poses.
 
-    on_arm: called with each state of the topics `arms` and the time of its arrival, s. size: of the
-    images, px.
+    on_arm: called with each state of the topics `arms` and the time (s) of its arrival. size: of
+    the images, px.
     """
     import asyncio
     import time

@@ -334,7 +334,7 @@ def _print_result(
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """Return the true image errors at the eye before and after a simulated calibration, mm."""
+    """Return the true image errors (mm) at the eye before and after a simulated calibration."""
     from flexsheet.nodes.twin.projector import errors_at_eye, sheet_poses
 
     eye, planes = scene.eyes.centre_world_m, sheet_poses(7)

@@ -108,7 +108,7 @@ def chart(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure computing time and error of the methods in a family on this computer; draw a chart.
+    """Measure computing time and error of the methods in a method family; draw a chart.
 
     For each method, the command prints the maximum of the median times and of the errors over all
     cases in the method's range. "front" marks a method if no other method is both faster and more

@@ -612,7 +612,7 @@ def stability(
         unstable = [row for row in chosen if not row["stable"]]
         margin = min(row["margin"] for row in chosen)
         cells.append([kind, f"{jitter_ms:.0f}", len(chosen), len(unstable), f"{margin:.2f}"])
-    columns = ["loop", "jitter, ms", "cases", "not stable", "smallest gain margin"]
+    columns = ["control loop", "jitter, ms", "cases", "not stable", "smallest gain margin"]
     print_table(columns, cells)
     error, median = result["boundary_error_percent"], result["boundary_median_percent"]
     if error is not None:

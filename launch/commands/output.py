@@ -33,7 +33,10 @@ class CommandError(FlexsheetError):
 
 
 def check_folder(option: str, file: Path) -> None:
-    """Raise CommandError if the folder of the output file of an option does not exist."""
+    """Raise CommandError if the folder for an output file does not exist.
+
+    option: command-line option that names the file, for the error text.
+    """
     if not file.resolve().parent.is_dir():
         raise CommandError(f"{option} {file}: the folder {file.parent} does not exist; create it")
 

@@ -265,7 +265,7 @@ def make_silence_error(topic: str, duration_s: float) -> CommandError:
 class Arrival:
     """A message that arrives during a measurement.
 
-    received_ns: time of arrival on the clock of this computer, ns.
+    received_ns: time of arrival on the clock of this computer.
     """
 
     header: Header
@@ -324,7 +324,7 @@ def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return statistics of the data age at arrival for each writer, ms."""
+    """Return statistics of the data age (ms) at arrival for each writer."""
     rows = []
     for own in _by_writer(arrivals, lambda one: one.header):
         ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
-"""The exit code if no method of a family meets the tolerance, so that the best one is chosen."""
+"""The exit code if no method of a method family meets the tolerance, so the best one is chosen."""
 
 
 app = make_app()
@@ -68,7 +68,7 @@ def tune(
             min=0,
             max=100,
             help="Number of simulated strokes per configuration that is tested in the graph; 0: "
-            "choose each family separately, without a graph.",
+            "choose the method of each family separately, without a graph.",
         ),
     ] = 3,
     folder: Annotated[
@@ -87,7 +87,7 @@ def tune(
     which takes seconds to minutes. It then predicts the errors of combined methods, and tests the
     fastest promising configuration in a graph. It accepts a configuration that meets all
     tolerances, including those of latency and force. With --family, it chooses only the methods of
-    these families, and each family separately. Nodes use the chosen method if their parameter is
+    these method families, each separately. Nodes use the chosen method if their parameter is
     `auto`. The exit code is 3 if a tolerance is not met.
     """
     logs_on_stderr()

@@ -49,7 +49,7 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 POSITIONS_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
-"""The pushed positions: distance along the object, and arc length around it from its front, m."""
+"""The pushed positions (m): distance along the object, and arc length around it from its front."""
 
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.007, 0.010, 0.013, 0.016)
 """The depths at which the finger rests, up to the scene's push depth, which is always one of them.
@@ -390,7 +390,7 @@ def _sheet_normal(left: Floats, right: Floats) -> Floats:
 
 
 def _indentation_m(tip: Floats, left: Floats, right: Floats) -> float:
-    """Return the depth of the fingertip behind the plane of the unloaded sheet, m; at least 0."""
+    """Return the depth (m), at least 0, of the fingertip behind the plane of the unloaded sheet."""
     middle = 0.5 * (left[:3, 3] + right[:3, 3])
     return max(float((middle - tip) @ _sheet_normal(left, right)), 0.0)
 
@@ -446,7 +446,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
 
 
 def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | None:
-    """Return the mean measured force of a rest, N; None if there is none in its interval.
+    """Return the mean measured force (N) of a rest; None if there is none in its interval.
 
     The interval begins earlier than that of the true force, because gauges are slow.
     """
@@ -465,7 +465,7 @@ def _evaluate_moving(
 
 
 def _summarize_against_reference(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return median and maximum error (%) of each position, over rows with a reference."""
+    """Return median and maximum error (%) of each position, over result rows with a reference."""
     result = []
     for place in dict.fromkeys(row["at"] for row in rows):
         felt, model = (

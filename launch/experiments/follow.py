@@ -253,9 +253,9 @@ class FollowedContact:
     def limit(self, sheets: Sequence[RolledSheet], reachable: list[bool]) -> LimitedMotion:
         """Return the joint angles and the positions of the edge ends, linear in the deviations.
 
-        The three deviations of the contact are along the sheet's x and y on the object, and along
-        its normal, m. For each nominal sheet, appends to `reachable` whether the arms reach it. The
-        values of unreachable sheets are NaN.
+        The three deviations (m) of the contact are along the sheet's x and y on the object, and
+        along its normal. For each nominal sheet, appends to `reachable` whether the arms reach it.
+        The values of unreachable sheets are NaN.
         """
         joints = np.full((len(sheets), 4, 2, 6), np.nan)
         ends = np.full((len(sheets), 4, 2, 2, 3), np.nan)

@@ -1,8 +1,8 @@
 """Evaluate the force that a simulated hand feels: `experiment stability --gestures`.
 
-The gestures are voluntary motions, from which the force of the sheet deflects the finger (coupled
-hand). This force is compared with the force of the object at the finger's true depth. Runs are in
-simulated time.
+The gestures are voluntary motions of a simulated hand that feels the sheet (coupled): the force of
+the sheet deflects the finger from them. This force is compared with the force of the object at the
+finger's true depth. Runs are in simulated time.
 """
 
 from __future__ import annotations
@@ -234,8 +234,8 @@ def hand_gestures_result(
 ) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
     """Simulate gestures with random hands; return the result, and the forces for a chart.
 
-    hands: number of hands of each kind: finger, wrist and arm. curve (m, 2): depths and
-    forces of the object. The forces are indexed by kind of hand and gesture.
+    hands: number of hands of each kind: finger, wrist and arm. curve (m, 2): depths (m) and forces
+    (N) of the object. The forces are indexed by kind of hand and gesture.
     """
     progress("computing the reaction of the sheet (only once)")
     reaction = load_or_compute_reaction(scene, None, cache_dir)
@@ -276,9 +276,10 @@ def run_gestures(
     *,
     apparatus: str | None = None,
 ) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
-    """Perform the gestures in a running graph; return results like `hand_gestures_result`.
+    """Start a graph, perform the gestures in it, and return the result and the felt forces.
 
-    The force is sampled at the exposures only, so that shorter peaks are missed. apparatus: file
+    Both have the format of `hand_gestures_result`. The force is sampled only at the exposures, so
+    shorter peaks are missed. curve (m, 2): depths (m) and forces (N) of the object. apparatus: file
     with the true parameters of the simulated hardware, among them the hand's impedance.
     """
     coupled = [*settings, *make_settings(launch_file, "twin_finger", "hand=coupled")]
@@ -335,7 +336,7 @@ def _make_result(scene: Scene, seed: int | None, rows: list[dict[str, Any]]) -> 
 
 
 def read_touches(bag: Path) -> dict[str, TouchRecording]:
-    """Read the touches of a coupled hand from a bag; return them by the label of the path."""
+    """Return the touches of a simulated hand that feels the sheet (coupled), by path label."""
     fingers: dict[int, TwinFinger] = {}
     phases: dict[int, Phase] = {}
     valid_at: list[int] = []

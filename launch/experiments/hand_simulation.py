@@ -1,4 +1,4 @@
-"""Simulate a hand that is coupled to the sheet, in time steps of a quarter of a millisecond.
+"""Simulate a hand that feels the sheet (coupled), in time steps of a quarter of a millisecond.
 
 The simulation is the reference for the stability bounds of the planner, with which it shares no
 code. The finger is a mass on the spring and damper of the hand, with the finger pad in series. The

@@ -81,8 +81,8 @@ class Series:
     """An image experiment, in which one quantity varies.
 
     key: result column of the varied value. name: format of a case's name with the value. path:
-    function that makes the finger path for a value. sizes: function that measures sizes of the
-    cylinder in an image, m. size_names: symbols of the sizes in the paper. values: default values.
+    function that makes the finger path for a value. sizes: function that measures sizes (m) of the
+    cylinder in an image. size_names: symbols of the sizes in the paper. values: default values.
     """
 
     key: str
@@ -200,7 +200,7 @@ def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, Er
 
 
 def summarize_eyes(left: ErrorMap, right: ErrorMap) -> dict[str, float | None]:
-    """Return the mean error of each eye's image, and of the disparity, mm.
+    """Return the mean error (mm) of each eye's image, and of the disparity.
 
     A mean is None if there are no points. The disparity error is the right eye's error minus the
     left eye's, horizontal and vertical. It is computed at screen positions at which both eyes see
@@ -254,7 +254,7 @@ def make_rows(
 
 
 def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the mean and the maximum size error of each correction, mm."""
+    """Return the mean and the maximum size error (mm) of each correction."""
     return {
         method: {
             "mean_mm": float(np.mean([row["mean_mm"] for row in rows if row["method"] == method])),
@@ -271,7 +271,7 @@ def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, flo
 
 
 def summarize_map(errors: ErrorMap) -> dict[str, float | None]:
-    """Return mean, 95 % quantile and maximum error of all visible points, mm.
+    """Return mean, 95 % quantile and maximum error (mm) of all visible points.
 
     Return None if there are no visible points.
     """

@@ -20,7 +20,7 @@ def estimate_lag_s(
     leader_times_s: Floats | None = None,
     max_lag_s: float = 0.15,
 ) -> float | None:
-    """Estimate the lag of `follower` behind `leader`, s; negative if it is ahead.
+    """Estimate the lag (s) of `follower` behind `leader`; negative if it is ahead.
 
     times_s: (n,), increasing, not necessarily uniform. follower, leader: positions (n,) or (n, k),
     m, at these times. leader_times_s: times (m,) of the leader if its times differ from `times_s`,

@@ -52,7 +52,7 @@ class NodeCalibrations:
         return NodeCalibrations(stereo, sheet, marker, stamp_offset_s)
 
     def find_marker_offset_m(self, scene: Scene) -> Floats:
-        """Return the measured vector (3,) from finger pad to marker, in world axes, m."""
+        """Return the measured vector (3,), in m, from finger pad to marker, in world axes."""
         marker = scene.finger if self.marker is None else self.marker
         turned = world_from_finger(scene.finger.direction_world)
         return np.asarray(turned @ np.array(marker.marker_from_pad_m))

@@ -158,7 +158,7 @@ def _mean_length_mm(vectors_m: Floats | None) -> float | None:
 
 
 def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
-    """Return the root mean square over all visible points, mm; None if nothing is visible."""
+    """Return the root mean square (mm) over all visible points; None if nothing is visible."""
     squares = np.concatenate([np.sum(one**2, axis=2).ravel() for one in maps_m])
     squares = squares[np.isfinite(squares)]
     return 1e3 * float(np.sqrt(squares.mean())) if len(squares) else None
@@ -362,9 +362,10 @@ class OfflineEvaluator:
     def _sheet_error(
         self, arms: ArmPair, surface: SheetSurface, contact: Contact, tip_error: Floats
     ) -> Floats:
-        """Return the object point under the true finger minus the sheet's contact point (3,), m.
+        """Return the error (3,), in m, of the sheet's contact point.
 
-        The arms place the sheet for the measured finger. The result is in the world frame.
+        The error is the object point under the true finger minus the contact point. The arms place
+        the sheet for the measured finger. The result is in the world frame.
         """
         object_from_world = inverse(self._world_from_object)
         foot = self._shape.closest(apply(object_from_world, contact.point + tip_error))
@@ -400,7 +401,7 @@ class OfflineEvaluator:
     def _compare_forces(
         self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the felt forces (k,) and the forces (k,) of the planner's model, N.
+        """Return the felt forces (k,) and the forces (k,), in N, of the planner's model.
 
         Each push contributes two forces: while the finger moves in, and while it moves out.
         """
@@ -566,7 +567,7 @@ class OfflineEvaluator:
         return corrected
 
     def _parallax(self, eye: Floats) -> Floats:
-        """Return the shift of object points on the screen plane if the eye is moved, m.
+        """Return the shift (m) of object points on the screen plane if the eye is moved.
 
         Shape (rows, columns, 2), for the pixels of `_object_points`; NaN where the scene's eye sees
         no object.

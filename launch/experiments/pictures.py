@@ -181,7 +181,7 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
 
 
 def draw_stability(result: dict[str, Any], path: Path) -> None:
-    """Draw the fraction of stable hands over object stiffness and delay, one panel per loop."""
+    """Draw the fraction of stable hands over stiffness and delay, one panel per control loop."""
     rows = [*result["rows"], *result["without_bounds"]]
     kinds = list(dict.fromkeys((row["kind"], row["jitter_ms"]) for row in rows))
     objects = sorted({row["object_pa"] for row in rows})

@@ -45,8 +45,8 @@ class Perception:
 class SimulatedParticipant:
     """A simulated participant that compares two noisy percepts; equal seeds give equal answers.
 
-    The noise of a trial depends only on the seed and the number of the trial, so that an
-    interrupted session continues with the same answers.
+    The noise of a trial depends only on the seed and the number of the trial, so an interrupted
+    session continues with the same answers.
     """
 
     def __init__(self, seed: int, perception: Perception | None = None) -> None:

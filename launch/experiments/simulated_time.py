@@ -4,7 +4,7 @@ The nodes' methods are called at the simulated times at which the nodes would ca
 exposure, when its image arrives, when its target takes effect, and in each arm cycle. Results do
 not depend on the load of the computer and are reproducible. The path check before the first motion,
 the synchronization of the arms, and stops are not simulated; images only on request. The soft body
-applies no force, so that the sheet keeps its stretch.
+applies no force, so the sheet keeps its stretch.
 
 The ground truth comes from the simulator: camera, servos, flange compliance and sheet surface.
 """
@@ -101,10 +101,10 @@ class LoopSettings:
 
     tracking: tracking method. planner: parameters of the planner by name. lag_known: whether the
     bridges know the true servo lag of the arms; otherwise they measure it. computing_s: time from
-    the end of the read-out to the published target. calibrations: calibrations of the nodes, from
-    which the true camera deviates; None: the nodes know camera, marker and exposure times exactly.
-    with_images: whether the triangulator node detects the marker in simulated images; otherwise it
-    measures pixels with noise.
+    the end of the camera's read-out to the published target. calibrations: calibrated parameters
+    that the nodes use, which differ from the true ones; None: the nodes know camera, marker and
+    exposure times exactly. with_images: whether the marker is detected in rendered camera images;
+    otherwise the true pixels of the marker with added noise are used.
     """
 
     tracking: str = "adaptive"
@@ -140,7 +140,7 @@ class MeasuredFinger:
         self._horizons_s = make_horizons_s(PREDICTION_S)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Measure the finger at a timestamp; return its predicted path (n, 3), m.
+        """Measure the finger at a timestamp; return its predicted path (n, 3), in m.
 
         position_world, velocity: true position (m) and velocity (m/s) of the finger at the
         timestamp, (3,). The images are exposed slightly later.
@@ -248,18 +248,18 @@ class SimulatedArm:
         self._now_s = 0.0
 
     def sheet_to(self, other: SimulatedArm) -> SheetMotion:
-        """Return the sheet between both arms, computed from measured joints as a bridge does."""
+        """Return the sheet between both arms, computed from joint angles as a bridge does."""
         edges = [arm._geometry.world_from_edge(arm._servo.joints_rad) for arm in (self, other)]
         return self._geometry.sheet_between(*edges)
 
     @property
     def lag_s(self) -> float:
-        """Return the servo lag that the bridge has measured or was given, s."""
+        """Return the servo lag (s) that the bridge has measured or was given."""
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     @property
     def lag_uncertainty_s(self) -> float | None:
-        """Return the standard deviation of the measured servo lag, s; None before it is known."""
+        """Return the standard deviation (s) of the measured servo lag; None before it is known."""
         return None if self._lag.estimate is None else self._lag.estimate.uncertainty_s
 
     def advance(self, until_s: float) -> Floats:
@@ -383,7 +383,7 @@ class SimulatedLoop:
 
     @property
     def delay_s(self) -> float:
-        """Return the delay, s, that the planner assumes from an exposure to the sheet's motion."""
+        """Return the delay (s) that the planner assumes from an exposure to the sheet's motion."""
         return self._horizon_s
 
     def run_cycles(self, until_s: float) -> None:

@@ -76,7 +76,8 @@ class StabilitySettings:
 
     hands: number of random hands per group of HAND_RANGES, sampled with `seed`. rates_hz: camera
     rates at which the critical slope is measured. object_ratios: factors by which the stiffness of
-    the scene's object is multiplied. delays_s, jitters_s: delays of the loop and their jitter.
+    the scene's object is multiplied. delays_s, jitters_s: delays of the control loop and their
+    jitter.
     """
 
     hands: int = 4
@@ -212,12 +213,12 @@ def measure_map(
     *,
     cache_dir: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """Return a row for each object, hand, delay, jitter and kind of control loop.
+    """Return a table row for each object, hand, delay, jitter and kind of control loop.
 
     The planner knows the mean delay, to which the jitter adds half of its range.
 
-    Kinds: "bounded" is the planner's loop; "unbounded" has no stability bounds and no depth filter;
-    "predicted" is like "unbounded", but predicts the depth over the delay.
+    Kinds: "bounded" is the planner's control loop; "unbounded" has no stability bounds and no depth
+    filter; "predicted" is like "unbounded", but predicts the depth over the delay.
     """
     material = scene.object.material
     if material is None:
@@ -257,7 +258,7 @@ def measure_map(
 def _simulate_pushes(
     fitted: Compliance, hands: Sequence[Hand], loops: Sequence[SampledLoop], jitter_s: float
 ) -> list[dict[str, Any]]:
-    """Return a row for each hand and control loop; stable means stable at every depth."""
+    """Return a table row for each hand and control loop; stable means stable at every depth."""
     indented_m = np.linspace(0.0, 2.0 * fitted.max_depth_m, 400)
     push = SheetPush(fitted.stretch_ratio, fitted.finger_radius_m)
     forces_n = fitted.model.evaluate(push, indented_m).force_n

@@ -80,7 +80,7 @@ ARM_EVENTS: dict[Side, LatencyEvent] = {
 
 @dataclass(frozen=True, slots=True)
 class DrawnFrames:
-    """The contents that the renderer drew, each with the time at the centre of its display, ns.
+    """The contents that the renderer drew, each with the time (ns) at the centre of its display.
 
     fingertip: drawn fingertip position (3,), m. sheet: centre and normal of the sheet (6,).
     deformation_ages: age of the finger measurement that deforms the drawn object (1,), s.
@@ -157,7 +157,7 @@ def stroke_path(scene: Scene, seconds: float) -> FingerPath:
 
 
 def stroke_window_s(seconds: float) -> tuple[float, float]:
-    """Return the start and end of the stroke, s from the start of the finger path."""
+    """Return the start and end of the stroke, in s from the start of the finger path."""
     begin = APPROACH_S + DWELL_S
     return begin, begin + seconds
 
@@ -234,7 +234,7 @@ class StrokeRecording:
     true_surface: SheetSurface | None = None
 
     def arm_delays_s(self) -> Floats:
-        """Return the delays (n,) from exposure to the sent command, for both arms together, s."""
+        """Return the delays (n,), in s, from exposure to the sent command, for both arms."""
         both = [self.delays_s.get(event, NO_VALUES) for event in ARM_EVENTS.values()]
         return np.concatenate(both)
 
@@ -436,7 +436,7 @@ def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Flo
     """Return the contact points D' (n, 3) of a sheet on a cylinder, and their angles (n,).
 
     D' is the point of the sheet's plane nearest to the point of the cylinder axis at x = `x_m`
-    (n,), in the object's frame. The angle is that of the plane's normal about the axis, rad.
+    (n,), in the object's frame. The angle (rad) is that of the plane's normal about the axis.
     """
     normal = planes.normals
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
@@ -445,7 +445,7 @@ def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Flo
 
 
 MIN_CURVATURE_PER_M = 1.0
-"""The minimum principal curvature, 1/m. A flatter surface has many points with nearly one normal.
+"""The minimum principal curvature (1/m). A flatter surface has many points with nearly one normal.
 """
 
 
@@ -533,7 +533,7 @@ def summary(values: Floats, scale: float) -> dict[str, float]:
 
 
 def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
-    """Return median and 99 % quantile, ms, of durations (n,), s; None if there are none."""
+    """Return median and 99 % quantile (ms) of durations (n,), in s; None if there are none."""
     if len(values_s) == 0:
         return {"p50": None, "p99": None}
     return {
@@ -544,7 +544,7 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class StrokeErrors:
-    """The errors of a stroke as functions of time, m and rad.
+    """The errors (m and rad) of a stroke as functions of time.
 
     seconds: (n,), times of the measured errors since the start of the stroke. These are exposures
     with a valid fingertip. true_seconds: (m,), times of the true errors. These are all exposures,
@@ -565,7 +565,7 @@ class StrokeErrors:
 
 
 def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int]:
-    """Return the start and end of a stroke of `seconds`, ns.
+    """Return the start and end time (ns) of a stroke of `seconds`.
 
     Raises ExperimentError if the bag does not contain it.
     """
@@ -664,7 +664,7 @@ def tangential_distance(
 
 
 def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, float | None]:
-    """Return the lags of the displayed image behind reality, ms; None for an unknown lag.
+    """Return the lags (ms) of the displayed image behind reality; None for an unknown lag.
 
     fingertip, sheet: lag of the drawn fingertip, and of the drawn rotation of the sheet about the
     object, estimated by cross-correlation with the true motion. object: median age of the finger

@@ -89,7 +89,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def read_rows(folder: Path, names: Mapping[str, Any]) -> dict[str, Row]:
-    """Return the rows of the finished trials by name; failed trials count as not finished."""
+    """Return the result rows of finished trials by name; failed trials count as not finished."""
     rows = {
         name: _read_json(folder / f"{name}.json") for name in names if _row_exists(folder, name)
     }
@@ -109,7 +109,7 @@ def run_sweep(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Row]:
-    """Run the trials that have no row yet, and return all rows by name, in the trials' order.
+    """Run the trials without a result row; return all result rows by name, in the trials' order.
 
     trials: JSON description of each trial for `trial.run_trial`. workers: number of simultaneous
     trials on this computer; ignored if a scheduler is given. scheduler: address of the scheduler
@@ -180,7 +180,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
 
 
 def execute_trial(trial: Mapping[str, Any]) -> Row:
-    """Run one trial in a separate process, and return its row.
+    """Run one trial in a separate process, and return its result row.
 
     Raises TrialError if the process fails, or if a stop was requested.
     """

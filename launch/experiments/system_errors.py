@@ -79,8 +79,8 @@ FORCE_STEP_S, FORCE_REST_S = 1.0 / 60.0, 1.5
 """
 
 STAGES = ("fingertip", "planner and arms", "geometry of the arms")
-"""The stages whose errors add up to the sheet's error: measured minus true finger; sheet computed
-from the arms' measured joints minus measured finger; true sheet minus that computed sheet."""
+"""The stages whose errors add up to the sheet's error. The errors are: measured minus true finger;
+computed sheet (from measured joint angles) minus measured finger; true minus computed sheet."""
 
 
 def make_stroke(scene: Scene, seconds: float, label: str = STROKE) -> FingerPath:

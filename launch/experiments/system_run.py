@@ -134,7 +134,7 @@ def evaluate_stroke(bag: Path) -> dict[str, Any]:
 
 
 def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats]:
-    """Return the delays from exposures in a window to arm commands, and to displayed images, s.
+    """Return the delays (s) from exposures in a window to arm commands, and to displayed images.
 
     Only the first effect of each exposure counts. The display time includes the true latency of
     the projector beyond the latency that the renderer assumes.

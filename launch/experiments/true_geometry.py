@@ -71,7 +71,7 @@ class ArmPair:
         self._guesses = [arm.mechanics.start_rad for arm in self._believed]
 
     def solve_joints(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-        """Return the commanded joint angles (6,) of both arms, rad, for poses `edges` (4, 4).
+        """Return the commanded joint angles (6,), in rad, of both arms for poses `edges` (4, 4).
 
         The bridges correct their commands by the scene's joint offsets and flange compliances.
         """

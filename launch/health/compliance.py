@@ -50,7 +50,7 @@ SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 
 
 def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
-    """Return rows (n, 2) of depth, m, and the object's force, N, on the side that faces the user.
+    """Return depth (m) and force (N) of the object, (n, 2), on the side that faces the user.
 
     The linear method is used only if the scene chooses it. Otherwise, a missing nonlinear table of
     the object is computed and cached, which takes minutes. cache_dir: None for the user's cache
@@ -82,14 +82,14 @@ def compute_compliance(
     """Compute the sheet offsets by which the planner renders the object's force.
 
     max_depth_m: maximum push depth; None for the depth in the scene. bounds: limits that keep the
-    feedback loop of sheet and hand stable; None for no limits.
+    control loop of sheet and hand stable; None for no limits.
     """
     limits = make_stretch_limits(scene.sheet, law, bounds)
     return fit_compliance(curve, law, limits, scene, max_depth_m=max_depth_m)
 
 
 class LoopRisk(StrEnum):
-    """The risk that the feedback loop of sheet and hand is unstable or renders a wrong force.
+    """The risk that the control loop of sheet and hand is unstable or renders a wrong force.
 
     OSCILLATION: a hand of low damping can oscillate, because the sheet moves away too late.
     DELAY: the delay limits the stable offset of the sheet too much to render the object's force.
@@ -103,7 +103,7 @@ class LoopRisk(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopFinding:
-    """The risk of the feedback loop of sheet and hand, as found by `find_loop_risk`.
+    """The risk of the control loop of sheet and hand, as found by `find_loop_risk`.
 
     delay_s: time from the measurement of a depth until the sheet has moved. error_ratio: largest
     relative error of the rendered force within the stable bounds.
@@ -142,7 +142,7 @@ def find_loop_risk(
     table: OffsetBoundsTable,
     delay_s: float,
 ) -> LoopFinding | None:
-    """Return the risk of the feedback loop of sheet and hand at the given delay.
+    """Return the risk of the control loop of sheet and hand at the given delay.
 
     Return None if there is no risk.
     """
@@ -158,7 +158,7 @@ def find_loop_risk(
 
 
 def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
-    """Return the risk of the feedback loop of sheet and hand in a graph, before the graph starts.
+    """Return the risk of the control loop of sheet and hand in a graph, before the graph starts.
 
     The planner's parameters determine the delay. Only cached data are used, because their
     computation takes up to minutes. Return None if there is no risk, or if the stability bounds or

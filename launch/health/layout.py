@@ -1,9 +1,9 @@
 """Check whether two arms reach a scene's whole working range, and suggest remedies.
 
 The range is sampled over contact points on the object, sheet poses, push depths, stretches and
-motions. "Rolling" tilts the sheet over the object without slip, so that the contact also moves on
-the sheet. The sheet poses follow the planner's rules (`flexsheet.nodes.planner.rolling`). The reach
-of an arm follows the rules of its bridge (`flexsheet.nodes.arm_bridge.reach`).
+motions. "Rolling" tilts the sheet over the object without slip, so the contact also moves on the
+sheet. The sheet poses follow the planner's rules (`flexsheet.nodes.planner.rolling`). The reach of
+an arm follows the rules of its bridge (`flexsheet.nodes.arm_bridge.reach`).
 """
 
 from __future__ import annotations

@@ -68,6 +68,6 @@ SHEET_FORCE = sheet_force_family(
     compute_true_force, lambda scene: force_table.load_or_compute(scene, None)
 )
 SHEET_LAWS = sheet_force_family(compute_true_force, None)
-"""The family of sheet force methods that need no long computation."""
+"""The method family of the sheet force models that need no long computation."""
 SHEET_SHAPE = sheet_shape_family(simulate_points)
 QUICK_SHAPE = sheet_shape_family(simulate_points, solved=False)

@@ -1,6 +1,6 @@
 """Plan measurements of several configurations in randomised blocks, and evaluate them.
 
-A block contains every configuration once, in random order, so that slow changes of the machine
+A block contains every configuration once, in random order, so that slow changes of the computer
 affect all of them alike. One configuration, the control, runs twice in each block; the ratio of its
 two runs shows which differences are noise. Runs in a block are not independent, so confidence
 intervals are found by bootstrap over whole blocks (Kalibera and Jones, ISMM 2013).
@@ -48,7 +48,7 @@ def bootstrap_median(values: Floats) -> Interval | None:
 def compare_paired(values: Floats, control: Floats) -> Interval | None:
     """Return the median ratio of positive values (n,) to the control's values in the same blocks.
 
-    The median is computed from logarithms, so that a ratio and its inverse have the same weight.
+    The median is computed from logarithms, so a ratio and its inverse have the same weight.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = bootstrap_median(np.log(values / control))

@@ -1,6 +1,7 @@
-"""Measure speed and accuracy of the methods of a family for a scene, and draw charts of them.
+"""Measure speed and accuracy of the methods of a method family for a scene, and draw charts.
 
-A family contains interchangeable methods for one task. Results hold for the measuring machine.
+A method family contains interchangeable methods for one task. Results hold for the computer on
+which they were measured.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def find_family(name: str) -> Family:
     """Return the method family with a name. Raises UnknownFamilyError."""
     if name not in FAMILIES:
         hint = did_you_mean(name, list(FAMILIES))
-        raise UnknownFamilyError(f'unknown family "{name}"; {hint}')
+        raise UnknownFamilyError(f'unknown method family "{name}"; {hint}')
     return load_family(FAMILIES[name])
 
 
@@ -84,9 +85,10 @@ def measure_family(
     progress: Callable[[str], None] = lambda text: None,
     select: Callable[[Trial], bool] = lambda trial: True,
 ) -> list[Point]:
-    """Measure all selected trials (a method and a case) of the family, and report the progress.
+    """Measure all selected trials of a method family, and report the progress.
 
-    Each trial is measured before the next is requested, since a family may then release its data.
+    A trial is a combination of a method and a case. Each trial is measured before the next is
+    requested, because the family may then release the data of the trial.
     """
     family.prepare(scene, _make_reporter("computing the reference:", progress))
     points: list[Point] = []
@@ -115,7 +117,7 @@ def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[in
 
 
 def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
-    """Return the result of a measured family as `flexsheet chart FAMILY --json` prints it."""
+    """Return the result of a measured method family, as `flexsheet chart --json` prints it."""
     return {
         "family": family.name,
         "unit": family.unit,
@@ -134,8 +136,8 @@ def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
     """Draw error against time on logarithmic axes, with a line along the Pareto front of each case.
 
-    If the family has a `sweep_key`, a property that varies over the cases, also draw errors and
-    extra metrics over it. A band shows the reference's uncertainty.
+    If the method family has a `sweep_key`, draw errors and extra metrics also against this property
+    of the cases. A band shows the reference's uncertainty.
     """
     from matplotlib.figure import Figure
 

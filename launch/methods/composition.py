@@ -1,4 +1,4 @@
-"""Find the cheapest combination of one method per family that meets all tolerances of the system.
+"""Find the cheapest combination of one method per method family that meets all tolerances.
 
 The error of each system metric is predicted from the measured errors of the stages. Independent
 random errors (spreads) add as squares: marker noise, tracking error at the time of use, and errors

@@ -111,10 +111,10 @@ class Configuration:
 
 
 def choose_cheapest(scene: Scene) -> Methods:
-    """Return the cheapest method of each family whose range contains the scene's working range.
+    """Return for each method family the cheapest method that covers the scene's working range.
 
-    Errors are not considered. If no method of a family has a sufficient range, the method with the
-    largest range is returned.
+    Errors are not considered. If no method of a method family has a sufficient range, the method
+    with the largest range is returned.
     """
     depth_m, tilt_deg = scene.working_range.push_depth_m, np.degrees(scene.working_range.tilt_rad)
     stretch = 0.5 * (scene.sheet.min_stretch_ratio + scene.sheet.max_stretch_ratio)
@@ -141,7 +141,7 @@ def choose_cheapest(scene: Scene) -> Methods:
 
 
 def choose_tuned(scene: Scene) -> Methods:
-    """Return the methods that the scene names, and the nodes' default methods of other families."""
+    """Return for each method family the scene's method, or else the default of the nodes."""
     chosen = scene.methods.model_dump(exclude_none=True)
     return Methods.model_validate(NODE_DEFAULTS.model_dump() | chosen)
 
@@ -171,7 +171,7 @@ def list_configurations(scene: Scene) -> list[Configuration]:
 
 
 def select_configurations(scene: Scene, names: Collection[str]) -> list[Configuration]:
-    """Return the configurations with these names (all without names), always with the control.
+    """Return the configurations with these names, or all for no names, and always the control.
 
     Raises ExperimentError for an unknown name.
     """

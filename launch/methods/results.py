@@ -1,4 +1,4 @@
-"""Describe the machine of a measurement, and convert results to valid JSON."""
+"""Describe the computer on which a measurement ran, and convert results to valid JSON."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def machine_name() -> str:
 
 
 def describe_load() -> str | None:
-    """Return a warning if other processes load the machine so that timings are wrong, else None."""
+    """Return a warning if other processes load the computer too much for timings, else None."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load <= MAX_LOAD_PER_CORE * cores:
         return None

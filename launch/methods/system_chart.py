@@ -53,7 +53,7 @@ FIRST_SEED = 100
 
 ORDER_SEED = 19
 FINGER_SEED = 5200
-"""The random seed of the finger in the first block; charts of single families do not use it."""
+"""The random seed of the finger in the first block; charts of method families do not use it."""
 
 ERRORS = ("sheet_mm", "image_mm", "force_percent", "fingertip_mm")
 LATENCIES = ("exposure_to_arm_ms", "exposure_to_light_ms")
@@ -231,7 +231,7 @@ def run_system_chart(
 
 
 def read_value(row: Row, key: str) -> float:
-    """Return the value at a key of a row, such as "sheet_mm.p95"; NaN if the row lacks it."""
+    """Return the value at a key of a result row, such as "sheet_mm.p95"; NaN if it is missing."""
     found: Any = row
     for part in key.split("."):
         found = None if found is None else found.get(part)
@@ -239,7 +239,7 @@ def read_value(row: Row, key: str) -> float:
 
 
 def list_tolerances(scene: Scene) -> dict[str, float]:
-    """Return the scene's tolerances, by the keys of the values in the row of a trial."""
+    """Return the scene's tolerances, by the keys of the values in the result row of a trial."""
     limits = {f"{metric.value}.p95": limit for metric, limit in metric_tolerances(scene).items()}
     return limits | {
         "exposure_to_arm_ms.p95": 1e3 * scene.tolerances.latency_s,
@@ -273,7 +273,7 @@ def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[
 
 
 def _good(rows: Mapping[str, Row], name: str) -> Row:
-    """Return the row of a trial, or an empty row if the trial failed."""
+    """Return the result row of a trial, or an empty row if the trial failed."""
     row = rows.get(name, {})
     return {} if "error" in row else row
 

@@ -96,7 +96,7 @@ def _draw_front(
 
 
 def _allowed_ms(points: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the scene's maximum latency from exposure to arm command, ms; None if unknown."""
+    """Return the scene's maximum latency (ms) from exposure to arm command; None if unknown."""
     key = "exposure_to_arm_ms.p95"
     for point in points:
         if key in point["spread"] and point["tolerance_ratios"][key]["value"] > 0.0:

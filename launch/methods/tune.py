@@ -1,9 +1,9 @@
-"""Choose the fastest sufficient method of each family for a scene, and write it into the scene.
+"""Choose the fastest sufficient method of each method family, and write it into the scene.
 
-A family contains interchangeable methods for one task. The methods are measured on this machine
-over the scene's working range. A method is sufficient if its stated range contains the working
-range, and its maximum error keeps a margin to the scene's tolerance. If no method is sufficient,
-the one closest to it is chosen and reported.
+A method family contains interchangeable methods for one task. The methods are measured on this
+computer over the scene's working range. A method is sufficient if its stated range contains the
+working range, and its maximum error keeps a margin to the scene's tolerance. If no method is
+sufficient, the one closest to it is chosen and reported.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Setting = str | dict[str, Any]
 
 
 class UnknownTunableError(FlexsheetError, KeyError):
-    """Raised for the name of a family whose method cannot be chosen in a scene."""
+    """Raised for the name of a method family that cannot be tuned in a scene."""
 
     code = "unknown-tunable"
     remedy = "Use one of the names that the error lists (docs/tune.md)."
@@ -63,9 +63,10 @@ class UnknownTunableError(FlexsheetError, KeyError):
 class Tunable:
     """A method family whose method can be chosen in a scene.
 
-    families: locations `module:NAME` of its parts, in the order of measurement. Later parts take
-    minutes to prepare, and are measured only if no earlier method is sufficient. settings: value to
-    write into the scene for each method, by the method's name in the family's chart.
+    families: locations `module:NAME` of the `Family` objects that it consists of, in the order of
+    measurement. Later parts take minutes to prepare, and are measured only if no earlier method is
+    sufficient. settings: value to write into the scene for each method, by the method's name in the
+    chart of the method family.
     """
 
     name: str
@@ -74,7 +75,7 @@ class Tunable:
 
     @property
     def key(self) -> str:
-        """Return the family's key in the scene's `methods`."""
+        """Return the key of the method family in the scene's `methods`."""
         return self.name.replace("-", "_")
 
 
@@ -120,8 +121,8 @@ TUNABLES = (
         },
     ),
 )
-"""The tunable families in the order of tuning. The sheet shape precedes the image correction, whose
-settings depend on it."""
+"""The tunable method families in the order of tuning. The sheet shape precedes the image
+correction, whose settings depend on it."""
 
 TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
@@ -131,11 +132,16 @@ TWO_PASS_NAMES = {
 
 
 def find_tunables(names: Sequence[str]) -> list[Tunable]:
-    """Return the tunable families with these names (all without names), in tuning order."""
+    """Return the tunable method families, in tuning order.
+
+    names: names of the method families; if empty, all are returned. Raises UnknownTunableError.
+    """
     known = [one.name for one in TUNABLES]
     for name in names:
         if name not in known:
-            raise UnknownTunableError(f'unknown family "{name}"; {did_you_mean(name, known)}')
+            raise UnknownTunableError(
+                f'unknown method family "{name}"; {did_you_mean(name, known)}'
+            )
     return [one for one in TUNABLES if not names or one.name in names]
 
 
@@ -171,7 +177,7 @@ class MethodEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The choice of one method of a family, with the evaluations of all its measured methods."""
+    """The choice of one method of a method family, with the evaluations of all measured methods."""
 
     family: str
     key: str
@@ -310,8 +316,8 @@ def tune(
 ) -> list[Choice]:
     """Measure the methods of each family in order, and choose one of each.
 
-    measure: function that replaces the measurement in tests. Passes on the errors of families that
-    do not support the scene's shape, mesh or sheet.
+    measure: function that replaces the measurement in tests. Passes on the errors of method
+    families that do not support the scene's shape, mesh or sheet.
     """
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
@@ -334,7 +340,7 @@ def tune(
 
 
 def find_choice(choices: Sequence[Choice], family: str) -> Choice | None:
-    """Return the choice for a family; None if that family was not tuned."""
+    """Return the choice for a method family; None if it was not tuned."""
     return next((one for one in choices if one.family == family), None)
 
 
@@ -403,8 +409,8 @@ def insert_choices(
 ) -> str:
     """Return the text of a scene file with the choices inserted in its mapping `methods`.
 
-    All other text is unchanged, including the methods of other families. If `methods` is a mapping
-    on one line, it is expanded to several lines.
+    All other text is unchanged, including the methods of other method families. If `methods` is a
+    mapping on one line, it is expanded to several lines.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
@@ -448,7 +454,7 @@ class _Block:
 
     start: first line, including the generated comment above it. end: line after the block. If the
     file has no such block, both are the end of the file. header: the line `methods:`, if it can be
-    reused. parts: key and lines of each family, in order; comments have an empty key.
+    reused. parts: key and lines of each method family, in order; comments have an empty key.
     """
 
     start: int

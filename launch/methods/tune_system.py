@@ -81,7 +81,7 @@ def _is_in_scene(trial: Trial) -> bool:
 def make_stages(
     scene: Scene, choices: Sequence[Choice], measure: MeasureTracking = measure_tracking
 ) -> dict[str, list[StageOption]]:
-    """Return the methods of each tuned family, with the errors that they add to system metrics.
+    """Return the methods of each tuned method family, with the errors that they add to the system.
 
     Tracking is measured with the noise of each marker method. Its error at the exposure counts for
     the fingertip, and its error at the longest prediction horizon for the sheet. The image
@@ -195,7 +195,7 @@ def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> lis
 
 
 def make_methods(scene: Scene, choices: Sequence[Choice]) -> Methods:
-    """Return the chosen methods; for other families the methods of the scene or the defaults."""
+    """Return the chosen methods; for other method families those of the scene or the defaults."""
     chosen = {choice.key: choice.chosen.setting for choice in choices}
     return Methods.model_validate(choose_tuned(scene).model_dump() | chosen)
 
@@ -248,7 +248,7 @@ def run_proposal(
     good = [row for row in rows.values() if "error" not in row]
     if len(good) < len(rows):
         last: Any = next(row for row in rows.values() if "error" in row)
-        raise ExperimentError(f"a run failed; see {folder}; the error: {last['error']}")
+        raise ExperimentError(f"a run failed: {last['error']}; see {folder}")
     speeds = [row for name, row in rows.items() if name in planned.places]
     errors = rows[NOMINAL][configuration.name]
     figures = {

@@ -4,8 +4,8 @@ In a scene file the object may have
 
 appearance: {texture: image, image_file: marble.png}
 
-with a path relative to the scene file. The scene message contains the image itself, so that
-renderers on other hosts need no file.
+with a path relative to the scene file. The scene message contains the image itself, so renderers on
+other hosts need no file.
 """
 
 from __future__ import annotations

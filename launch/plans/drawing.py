@@ -11,7 +11,7 @@ from flexsheet.messages.topics import TOPICS
 Position = tuple[float, float]
 
 WIDTH, HEIGHT = 132, 34
-"""The width and height of the box of a node, px."""
+"""The width and height (px) of the box of a node."""
 
 STYLE = """
   text { font: 13px system-ui, sans-serif; fill: #1f2328; text-anchor: middle }
@@ -53,7 +53,7 @@ class Arrow:
 
 @dataclass(frozen=True)
 class GraphDrawing:
-    """The geometry of the drawing of a graph, px.
+    """The geometry (px) of the drawing of a graph.
 
     hosts: left, top, width and height of each host's frame. boxes, devices: centre of the box of
     each node and device.
@@ -107,7 +107,7 @@ def svg(drawing: GraphDrawing) -> str:
 
 
 MARGIN, COLUMN, ROW, HOST_GAP = 30, 230, 75, 45
-"""The outer margin, the column pitch, the row pitch, and the gap between hosts in a drawing, px."""
+"""Lengths (px) in a drawing: outer margin, column pitch, row pitch, and gap between hosts."""
 
 
 def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
@@ -128,7 +128,7 @@ def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
 
 
 def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """Assign each node a column to the right of all nodes whose topics it reads; ignore loops.
+    """Assign each node a column to the right of all nodes whose topics it reads; ignore cycles.
 
     links: pairs (writer, reader).
     """

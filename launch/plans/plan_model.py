@@ -125,7 +125,9 @@ class ResolvedNode(StrictModel):
     device_address: str | None = Field(
         default=None, description='"host:port" of the device that the node controls'
     )
-    device_files: tuple[str, ...] = Field(default=(), description="paths that the node opens")
+    device_files: tuple[str, ...] = Field(
+        default=(), description="paths of files and devices that the node opens"
+    )
     calibrations: dict[str, str] = Field(
         default={}, description="calibration file by parameter name"
     )
@@ -245,7 +247,7 @@ class ResolvedGraph(StrictModel):
     def processes_on(
         self, host: str | None, *, without: Collection[str] = ()
     ) -> list[ResolvedProcess]:
-        """Return the processes on one host (None: all hosts), in the order of their first nodes.
+        """Return the processes on `host`, or on all hosts if it is None, by their first nodes.
 
         without: names of nodes that are not started.
         """

@@ -173,7 +173,7 @@ class RosParticipant:
     def subscribe(self, topic: RosTopic, on_message: Callable[[bytes], None]) -> None:
         """Subscribe to a topic.
 
-        `on_message` is called in the running loop with each message's CDR bytes.
+        `on_message` is called in the running event loop with each message's CDR bytes.
         """
         from cyclonedds.core import InstanceState as State
         from cyclonedds.core import ReadCondition, SampleState, ViewState

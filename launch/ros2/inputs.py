@@ -72,7 +72,7 @@ class ExternalInputs:
     def convert(
         self, topic: str, decode: Callable[[], Any], now_ns: int, unix_ns: int
     ) -> tuple[Message, int] | None:
-        """Convert a ROS message, and return it with its source timestamp on the local clock, ns.
+        """Convert a ROS message, and return it with its source timestamp (ns) on the local clock.
 
         decode: function that returns the ROS message, or raises an exception for malformed bytes.
             now_ns: current time of the local clock. unix_ns: current time since 1970.
@@ -101,7 +101,7 @@ class ExternalInputs:
         return made, at_ns
 
     def _check_header(self, topic: str, header: Any, now_ns: int, unix_ns: int) -> int:
-        """Check the frame and timestamp of a header. Return the timestamp on the local clock, ns.
+        """Check the frame and timestamp of a header. Return the timestamp (ns) on the local clock.
 
         Raises RejectedError if the frame or the timestamp is invalid.
         """

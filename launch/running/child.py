@@ -26,7 +26,7 @@ AUTOGROUP = Path("/proc/self/autogroup")
 Each node is a separate session, so the niceness of its process alone has little effect."""
 
 AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
-"""The number of attempts to write AUTOGROUP, and the time between two attempts, s.
+"""The number of attempts to write AUTOGROUP, and the time (s) between two attempts.
 
 Without privileges, the kernel accepts only one write per 0.1 s from all processes together.
 """

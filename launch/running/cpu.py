@@ -42,7 +42,7 @@ class CpuWatch:
     """A measurement of waiting and processor times over the last WINDOW_S.
 
     Call `update` once a second. proc: folder of the kernel's counters. now_s: function that returns
-    the time of the monotonic clock, s.
+    the time (s) of the monotonic clock.
     """
 
     def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -57,7 +57,9 @@ class CpuWatch:
         *,
         measure_programs: bool = False,
     ) -> CpuPressure | None:
-        """Return the node that waited the longest fraction of the last WINDOW_S; None if unknown.
+        """Return the CPU pressure on the node that waited longest for the processor.
+
+        The wait is measured over the last WINDOW_S. Return None if no waiting time is known.
 
         watched: process ids by node name, of the nodes whose waiting time is measured.
         named: process ids by node name, of the nodes that are reported by name; None: `watched`.

@@ -38,7 +38,7 @@ class ProcessorTime:
 def compute_starved_s(
     before: ProcessorTime | None, now: ProcessorTime | None, elapsed_s: float
 ) -> float:
-    """Return the time that a process waited for a processor core between two readings, s.
+    """Return the time (s) that a process waited for a processor core between two readings.
 
     The result is at most `elapsed_s`. The kernel adds a wait to its counter only when the wait
     ends. For a process that is ready to run now, all time in which it did not run counts as a wait.

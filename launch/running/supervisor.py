@@ -178,7 +178,7 @@ class Child:
         The silence is the number of the launcher's polls times their period. Clock time is not
         used, because a suspended launcher would receive no heartbeats either. Time in which the
         process waited for a processor core does not count. If only this subtraction prevents the
-        timeout, `on_starved` is called once with the subtracted time, s.
+        timeout, `on_starved` is called once with the subtracted time (s).
         """
         beats, silence_s, waited_s, reported = self._beats, 0.0, 0.0, False
         before = ProcessorTime.read(self.pid)

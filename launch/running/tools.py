@@ -135,7 +135,7 @@ class GraphWriter:
     def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> None:
         """Send a message with the next sequence number.
 
-        source_ns: source timestamp of the data, ns; None for the present time.
+        source_ns: source timestamp of the data; None for the present time.
         """
         self._sequences[topic] = self._sequences.get(topic, 0) + 1
         now_ns = self._clock.now_ns()

@@ -24,7 +24,7 @@ PATH_WIDTH_M = 0.001
 
 
 def make_stamp(at_ns: int) -> Any:
-    """Make a Foxglove timestamp from a time since 1970, ns."""
+    """Make a Foxglove timestamp from a time (ns) since 1970."""
     return fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
 
 

@@ -85,7 +85,7 @@ class Spread:
         return None if np.isnan(found) else float(min(found, self.longest_s))
 
     def quantiles_s(self, fraction: float) -> Floats:
-        """Return a quantile (count,) of the durations in each interval, s.
+        """Return a quantile (count,), in s, of the durations in each interval.
 
         The quantile is NaN for intervals that have no durations.
         """

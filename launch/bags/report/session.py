@@ -71,9 +71,10 @@ FAULTY_AT_END = ("disconnected", "stopping")
 
 MOVING = ("follow", "hold", "relax")
 MAX_END_S = 2.0
-"""The maximum time between the end of an arm's controller and the end of its bridge, in seconds.
+"""The maximum time (s) between the shutdown of an arm's controller and of its bridge.
 
-An arm that is lost in this time, and does not move again, was stopped at the end of the session.
+If an arm is lost at most this time before the shutdown, and does not move again, the loss is
+reported as the end of the session.
 """
 
 
@@ -203,7 +204,7 @@ class Arm:
         self._recent: deque[tuple[int, Floats, Floats]] = deque()
 
     def add(self, arm: ArmState, source_ns: int, index: int) -> None:
-        """Add an arm state to the interval `index`. Its joints were measured at `source_ns`."""
+        """Add an arm state, measured at `source_ns`, to the interval `index`."""
         self.cycle.add(0, arm.cycle_s)
         if arm.edge_force_n is not None:
             self.edge_force.add(index, arm.edge_force_n)
@@ -271,7 +272,7 @@ class Session:
         self._late_before: int | None = None
 
     def joint_speeds_rad_per_s(self, side: str) -> tuple[float, ...]:
-        """Return the maximum joint speeds (6,) of an arm, rad/s.
+        """Return the maximum joint speeds (6,), in rad/s, of an arm.
 
         If no scene was recorded, return the speeds of an RV-1A.
         """
@@ -315,7 +316,7 @@ class Session:
                 self._add_rare(message, header, log_ns)
 
     def seconds(self, at_ns: int) -> float:
-        """Return the time since the start of the bag, s."""
+        """Return the time (s) since the start of the bag."""
         return (at_ns - self.info.start_ns) * 1e-9
 
     def _add_flow(self, topic: str, header: Header, log_ns: int) -> None:

@@ -78,7 +78,7 @@ class FingerRun:
 
     @property
     def stroke_window_ns(self) -> tuple[int, int]:
-        """Return the start and end of the stroke, ns. They are equal if the path is no stroke."""
+        """Return start and end time (ns) of the stroke. They are equal if the path is no stroke."""
         if self.stroke_s is None:
             return self.zero_ns, self.zero_ns
         begin_s, finish_s = stroke_window_s(self.stroke_s)

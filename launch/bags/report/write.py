@@ -21,7 +21,7 @@ def default_output(bag: Path) -> Path:
 
 
 def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]:
-    """Read a bag, write its report page to `output` (None: no page), and return the numbers.
+    """Read a bag, write its report page to `output` unless it is None, and return the numbers.
 
     Raises BagError if the bag cannot be read, if the page cannot be written, or if `output` exists
     and is not a report.
