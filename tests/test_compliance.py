@@ -267,7 +267,7 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
     curve = soft_curve(scale)
     rows = np.column_stack([curve.depths_m, curve.forces_n])
     monkeypatch.setattr(
-        "flexsheet.launch.health.compliance.compute_front_curve", lambda scene: rows
+        "flexsheet.launch.health.compliance.compute_front_curve", lambda scene, **_: rows
     )
     command = ["doctor", "compliance", str(SCENE_FILE)]
     result = CliRunner().invoke(app, [*command, "--json"])

@@ -35,6 +35,15 @@ async def main():
 asyncio.run(main())
 """
 
+GUARD_DEMO_SCRIPT = """
+from pathlib import Path
+import flexsheet
+
+graph = flexsheet.load_graph(Path("guard-demo.yaml"))
+guard = graph.nodes["guard"]
+print(*(port.topic for port in (*guard.inputs, *guard.outputs)), len(graph.nodes) > 5)
+"""
+
 
 def python_block(page: str, mark: str) -> str:
     """Return the only Python block of a page that contains a text."""
@@ -106,15 +115,17 @@ def test_the_library_script_runs(tmp_path: Path) -> None:
     assert len([line for line in script.splitlines() if line.strip()]) <= 12
 
 
-def test_the_launch_file_of_the_node_tutorial_runs(tmp_path: Path) -> None:
-    (launch_file,) = (
+def test_the_launch_files_of_the_node_tutorial_run(tmp_path: Path) -> None:
+    launch_file, for_demo = (
         block.text
         for block in blocks(DOCS / "write-your-own-node.md")
         if block.language == "yaml" and "guard:" in block.text
     )
     (tmp_path / "guard.yaml").write_text(launch_file)
+    (tmp_path / "guard-demo.yaml").write_text(for_demo)
     (tmp_path / "speed_guard.py").write_text(
         python_block("write-your-own-node.md", "class SpeedGuard(")
     )
     (tmp_path / "launch").symlink_to(ROOT / "launch")
     assert run_script(GUARD_SCRIPT, tmp_path).startswith("finger at ")
+    assert run_script(GUARD_DEMO_SCRIPT, tmp_path).split() == ["fingertip", "status", "estop", "True"]

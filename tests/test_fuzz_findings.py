@@ -103,9 +103,9 @@ def test_lists_with_a_false_length_allocate_no_memory() -> None:
 def test_a_header_of_many_small_values_is_rejected_before_it_is_read() -> None:
     """A byte of the message can need 64 bytes of memory, and an image's topic allows 64 MiB."""
     large = bytes(wire.MAX_HEADER_BYTES + 1)
-    with pytest.raises(WireError, match="header of"):
+    with pytest.raises(WireError, match=r"the header has .* at most 1048576"):
         decode([large], TOPICS["frame"])
-    with pytest.raises(WireError, match="header of"):
+    with pytest.raises(WireError, match=r"the header has .* at most 1048576"):
         encode(EStop(engaged=True, reason="x" * wire.MAX_HEADER_BYTES), HEADER)
 
 

@@ -272,7 +272,7 @@ def test_a_finger_path_is_a_gesture_or_a_file(tmp_path: Path) -> None:
     wrong = r'"stopp" is neither a gesture nor a file; did you mean "stop"\?'
     with pytest.raises(ExperimentError, match=wrong):
         gestures.finger_path(launch_file, "stopp")
-    with pytest.raises(ExperimentError, match=r"absent\.csv: cannot be read"):
+    with pytest.raises(ExperimentError, match=r"absent\.csv: the file cannot be read"):
         gestures.finger_path(launch_file, str(tmp_path / "absent.csv"))
 
 

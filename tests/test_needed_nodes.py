@@ -128,7 +128,7 @@ def test_a_rigid_object_is_presented_by_a_constant_stretch() -> None:
 
 def test_missing_parts_are_named() -> None:
     for require, part in ((require_material, "material"), (require_projector, "projector")):
-        with pytest.raises(MissingPartError, match=f"rigid-plane.*{part} is missing"):
+        with pytest.raises(MissingPartError, match=f"rigid-plane.*{part}` is missing"):
             require(rigid())
     values = load_scene(LAUNCH / "scenes" / "plane.yaml").model_dump()
     values["object"]["support"] = None

@@ -288,7 +288,7 @@ def test_a_controller_that_ends_before_its_bridge_is_no_fault(
     counts = {"end": 2} if kind == "end" else {"arm": 1, "fault": 1}
     assert numbers["events"]["counts"] == counts
     found = [one.text for one in find_problems(numbers) if one.section == "timeline"]
-    assert any(text.startswith("Arm fault") for text in found) == (kind == "fault")
+    assert any(text.startswith("An arm had a fault") for text in found) == (kind == "fault")
     assert bool(found) == (kind == "fault")
 
 

@@ -200,7 +200,7 @@ def test_no_state_claims_a_trajectory_for_longer_than_any_lasts() -> None:
     other = OtherArm.from_state(state, 0.6, target_source_ns=OWN_NS, now_ns=now_ns + 2 * 10**8)
     assert other.age_s == pytest.approx(0.2)
     future = OtherArm.from_state(state, -1.0, target_source_ns=OWN_NS, now_ns=OWN_NS)
-    assert future.invalid_reason == "it is stamped 1 s in the future"
+    assert future.invalid_reason == "its timestamp is 1 s in the future"
 
 
 class Servo:

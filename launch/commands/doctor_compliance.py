@@ -14,7 +14,7 @@ from flexsheet.launch.commands.output import (
     print_fields,
     print_json,
     print_table,
-    words,
+    progress_words,
 )
 
 
@@ -54,6 +54,7 @@ def compliance(
     """
     from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.launch.running.precompute import report_time_left
     from flexsheet.messages.sheet_calibration import load_sheet_calibration
     from flexsheet.nodes.planner.compliance import ObjectCurve
     from flexsheet.nodes.planner.sheet_force import make_force_model
@@ -62,8 +63,9 @@ def compliance(
     law = make_force_model(
         scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
     )
-    with words.status("computing the soft body's force curve"):
-        curve = ObjectCurve.from_rows(compute_front_curve(scene))
+    with progress_words() as progress:
+        on_progress = report_time_left("computing the object's force curve (only once)", progress)
+        curve = ObjectCurve.from_rows(compute_front_curve(scene, on_progress=on_progress))
     result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms)
     if as_json:
         print_json(result)

@@ -5,6 +5,7 @@ The planner renders the force by moving the sheet along its normal.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -49,12 +50,17 @@ SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """The push depths in the report, as fractions of the maximum push depth."""
 
 
-def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
+def compute_front_curve(
+    scene: Scene,
+    cache_dir: Path | None = None,
+    *,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Floats:
     """Return depth (m) and force (N) of the object, (n, 2), on the side that faces the user.
 
     The linear method is used only if the scene chooses it. Otherwise, a missing nonlinear table of
     the object is computed and cached, which takes minutes. cache_dir: None for the user's cache
-    folder.
+    folder. on_progress: called with the numbers of finished and of all steps.
     """
     factory = SoftBodyFactory(
         skin_spacing_m=SKIN_SPACING_M,
@@ -65,9 +71,9 @@ def compute_front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
         workers=0,
     )
     method, _ = choose_method(scene, "auto", SKIN_SPACING_M, compute_table=True)
-    best, *_ = factory.bodies(scene, method, lambda done, total, need: None)
+    best, *_ = factory.bodies(scene, method, lambda done, total, need: on_progress(done, total))
     if method != "linear" and best.method.name == "linear":
-        best = factory.build_table(scene, best, lambda done, total, need: None)
+        best = factory.build_table(scene, best, lambda done, total, need: on_progress(done, total))
     return best.at_rest().force_curve
 
 

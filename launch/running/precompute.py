@@ -61,7 +61,7 @@ def precompute_deflection_shapes(
     """
     folder = None if cache_dir is None else Path(cache_dir)
     try:
-        on_progress = _with_time_left(
+        on_progress = report_time_left(
             "computing the deflection shapes of the sheet (only once)", progress
         )
         deflection_cache.load_or_compute(scene, folder, on_progress)
@@ -71,7 +71,7 @@ def precompute_deflection_shapes(
     return deflection_cache.shapes_cache(stored).path(folder)
 
 
-def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
+def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
     """Return a function (done, total) that reports progress and remaining time in steps."""
     from flexsheet.nodes.cache import EtaEstimator
 
@@ -94,7 +94,7 @@ def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progr
     """
     from flexsheet.nodes.planner import force_table
 
-    on_progress = _with_time_left("computing the force table of the sheet (only once)", progress)
+    on_progress = report_time_left("computing the force table of the sheet (only once)", progress)
     force_table.load_or_compute(scene, cache_dir, on_progress)
     return force_table.make_table_cache(scene).path(cache_dir)
 
