@@ -128,4 +128,5 @@ def test_the_launch_files_of_the_node_tutorial_run(tmp_path: Path) -> None:
     )
     (tmp_path / "launch").symlink_to(ROOT / "launch")
     assert run_script(GUARD_SCRIPT, tmp_path).startswith("finger at ")
-    assert run_script(GUARD_DEMO_SCRIPT, tmp_path).split() == ["fingertip", "status", "estop", "True"]
+    printed = run_script(GUARD_DEMO_SCRIPT, tmp_path)
+    assert printed.split() == ["fingertip", "status", "estop", "True"]
