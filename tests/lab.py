@@ -82,6 +82,18 @@ class Network:
         return f"{self._tag}-{name}"
 
     async def __aenter__(self) -> Self:
+        try:
+            await self._connect()
+        except BaseException:
+            self._delete_spaces()
+            raise
+        return self
+
+    def _delete_spaces(self) -> None:
+        for name in self._addresses:
+            _ip("netns", "del", self.space(name))
+
+    async def _connect(self) -> None:
         spaces = [self.space(name) for name in self._addresses]
         for space in spaces:
             _ip("netns", "add", space)
@@ -98,14 +110,12 @@ class Network:
             _ip("-n", space, "link", "set", "eth", "up")
             # As docs/deploy.md has it for real ones.
             _ip("netns", "exec", space, "sysctl", "-q", "-e", "-p", str(SETTINGS))
-        return self
 
     async def __aexit__(self, *_: object) -> None:
         assert self._switch.stdin is not None
         self._switch.stdin.close()
         await self._switch.wait()
-        for name in self._addresses:
-            _ip("netns", "del", self.space(name))
+        self._delete_spaces()
 
     async def cable(self, host: str, **values: Any) -> None:
         """Set delay, loss and cut of a computer's cable; none for a good cable."""

@@ -49,6 +49,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene, require_cylinder
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import SelfCheck, Status, SuspectedCause
+from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.twin.force_history import compute_history_ratios
 from flexsheet.nodes.twin.paths import touchable
 from flexsheet.nodes.twin.tolerance_table import (
@@ -56,6 +57,7 @@ from flexsheet.nodes.twin.tolerance_table import (
     TOLERANCES,
     Profile,
 )
+from tests.indentation_bases import few_dents
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = ROOT / "launch" / "demo.yaml"
@@ -244,8 +246,11 @@ def test_a_late_stamp_moves_the_fingertip_by_speed_times_time(
 
 
 def test_crosses_are_seen_where_they_are_touched_unless_the_eyes_are_elsewhere(
-    scene: Scene, evaluator: OfflineEvaluator
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # A coarse basis, because the full one takes minutes.
+    monkeypatch.setattr(deflection_cache, "load_or_compute", lambda *_: few_dents())
+    evaluator = OfflineEvaluator(scene, NodeCalibrations.of(load_graph(DEMO)))
     nominal = evaluator.compare_crosses(nominal_apparatus(scene))
     assert nominal.errors_m.shape == (15, 2, 2)
     assert nominal.figures()["max_mm"] < 0.2

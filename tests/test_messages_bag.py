@@ -385,7 +385,8 @@ def test_changed_type_is_rejected_by_name_but_its_bytes_stay_readable(
         "find_migration",
         lambda kind, *recorded: None if kind is TwinFinger else find_migration(kind, *recorded),
     )
-    with pytest.raises(BagError, match=r'topic "twin/finger" was recorded when TwinFinger had'):
+    words = r'topic "twin/finger": the recorded .* TwinFinger has other fields'
+    with pytest.raises(BagError, match=words):
         list(BagReader(whole))
     assert len(list(BagReader(whole, ["stereo"]))) == 20
     assert len(list(BagReader(whole).frames())) == 221

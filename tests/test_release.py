@@ -86,7 +86,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     page.write_text(render())
     archive = build(sources, "build_sdist")
     with tarfile.open(archive) as packed:
-        packed.extractall(folder, filter="data")
+        # Python 3.11.3 and older have no filters.
+        packed.extraction_filter = getattr(tarfile, "data_filter", None)
+        packed.extractall(folder)
     return build(folder / archive.name.removesuffix(".tar.gz"), "build_wheel")
 
 
