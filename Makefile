@@ -81,7 +81,7 @@ test: $(DEV_STAMP)
 	@$(BIN)/python -m tests.system_packages --tests
 	@mkdir -p build && : > $(SKIPPED)
 	@status=0; \
-	$(MAKE) --no-print-directory --keep-going --jobs=2 --output-sync=line lint test-parallel \
+	$(MAKE) --no-print-directory --keep-going --jobs=2 --output-sync=none lint test-parallel \
 		|| status=$$?; \
 	export OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= SKIPPED_FILE=$(SKIPPED); set -x; \
 	$(BIN)/pytest -m "alone and not long" --durations=15 $$(grep -l mark.alone tests/test_*.py) \
