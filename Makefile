@@ -70,6 +70,7 @@ cached: $(DEV_STAMP)
 
 # BLAS uses one thread, because more would compete with the processes that tests start.
 test-parallel: cached
+	@mkdir -p build
 	OPENBLAS_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= SKIPPED_FILE=$(SKIPPED) \
 		$(BIN)/pytest -m "not alone and not long" --durations=25 --numprocesses $(WORKERS) \
 		--dist worksteal

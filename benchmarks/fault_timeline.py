@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from typing import Self
 
 from flexsheet.messages.base import Message
-from flexsheet.messages.types import ArmState, Fingertip, SheetTarget
+from flexsheet.messages.types import ArmState, Fingertip, HostStatus, SheetTarget
 from tests.lab import HOSTS, Lab
 
 POLL_S = 0.01
@@ -38,7 +39,8 @@ class FaultTimeline:
     async def __aexit__(self, *_: object) -> None:
         self._lab.listeners.remove(self._on_message)
         self._polling.cancel()
-        await asyncio.gather(self._polling, return_exceptions=True)
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._polling
         self._read_logs()
 
     def describe(self, begun_s: float) -> str:
@@ -51,6 +53,8 @@ class FaultTimeline:
         self.events.append((time.monotonic(), text))
 
     def _on_message(self, topic: str, message: Message) -> None:
+        if isinstance(message, HostStatus):
+            return
         now_s, state = time.monotonic(), ""
         if isinstance(message, ArmState):
             state = f"{message.mode} {message.reason}"
@@ -60,8 +64,6 @@ class FaultTimeline:
             state = f"{message.phase} {message.reason}"
         is_new = now_s - self._arrived_s.get(topic, now_s) > GAP_S
         self._arrived_s[topic] = now_s
-        if topic.startswith("host "):
-            return
         if is_new or state != self._states.get(topic, state):
             self._add(f"{topic}{' resumes' if is_new else ''}: {state}")
         self._states[topic] = state

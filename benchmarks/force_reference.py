@@ -77,6 +77,18 @@ class Push:
     penalty: float
 
 
+def make_mesh(push: Push) -> HexMesh:
+    """Return the mesh of the cylinder that is fine near the pushed position."""
+    return cylinder_hexahedra(
+        radius=push.radius,
+        length=push.length,
+        support_angle_rad=push.support_angle_rad,
+        along=push.along,
+        angle_rad=push.angle_rad,
+        scale=push.scale,
+    )
+
+
 class SphereContact:
     """A penalty contact of a rigid sphere of radius 1 with nine-node faces."""
 
@@ -137,21 +149,14 @@ class SphereContact:
 class FelupeBody:
     """A Neo-Hookean cylinder of felupe with the contact of a rigid sphere.
 
-    isochoric: use a law that separates the change of volume from that of the form.
+    isochoric: use a law that separates the change of volume from the change of shape.
     """
 
     def __init__(self, push: Push, *, isochoric: bool = False) -> None:
         import felupe
         from pypardiso import PyPardisoSolver
 
-        self.mesh = cylinder_hexahedra(
-            radius=push.radius,
-            length=push.length,
-            support_angle_rad=push.support_angle_rad,
-            along=push.along,
-            angle_rad=push.angle_rad,
-            scale=push.scale,
-        )
+        self.mesh = make_mesh(push)
         nu = push.poisson_ratio
         shear, bulk = 0.5 / (1.0 + nu), 1.0 / (3.0 * (1.0 - 2.0 * nu))
         self._law = (

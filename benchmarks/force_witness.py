@@ -5,7 +5,7 @@
 CalculiX solves the push of the reference's first position with its own 20-node hexahedra, contact
 (surface to surface) and equation solver, on two meshes. The force is extrapolated from both with
 the order of convergence of the reference. The neo-Hookean law of CalculiX separates the change of
-volume from that of the form; the law of the reference does not. Therefore felupe solves one mesh
+volume from the change of shape; the law of the reference does not. Therefore felupe solves one mesh
 with both laws, and the ratio of these forces converts the force of CalculiX. Lengths are in finger
 radii, forces in Young's modulus times squared finger radius.
 
@@ -26,6 +26,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from benchmarks.force_reference import (
@@ -35,9 +36,10 @@ from benchmarks.force_reference import (
     SCENE_FILE,
     FelupeBody,
     Push,
+    make_mesh,
     reference_pushes,
 )
-from benchmarks.hexahedra import HexMesh, cylinder_hexahedra
+from benchmarks.hexahedra import HexMesh
 from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_material
@@ -60,41 +62,14 @@ INCREMENT = 0.1
 
 
 class WitnessError(RuntimeError):
-    """Raised if CalculiX is missing or does not converge."""
+    """Raised if a solver is missing or does not converge."""
 
 
-def make_icosphere(subdivisions: int) -> tuple[Floats, Ints]:
+def make_finger(subdivisions: int) -> tuple[Floats, Ints]:
     """Return points (n, 3) and triangles (m, 3) of a sphere with the volume of the unit sphere."""
-    golden = 0.5 * (1.0 + 5.0**0.5)
-    corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
-    points = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners])
-    points /= np.linalg.norm(points, axis=1)[:, None]
-    edge = 1.01 * np.linalg.norm(points[1:] - points[0], axis=1).min()
-    near = np.linalg.norm(points[:, None] - points, axis=2) < edge
-    triples = [
-        (i, j, k)
-        for i in range(12)
-        for j in range(i + 1, 12)
-        for k in range(j + 1, 12)
-        if near[i, j] and near[j, k] and near[i, k]
-    ]
-    outward = [np.linalg.det(points[list(one)]) > 0.0 for one in triples]
-    triangles = np.array(
-        [one if out else one[::-1] for one, out in zip(triples, outward, strict=True)]
-    )
-    for _ in range(subdivisions):
-        edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
-        unique, number = np.unique(edges, axis=0, return_inverse=True)
-        middles = points[unique].mean(axis=1)
-        middles /= np.linalg.norm(middles, axis=1)[:, None]
-        a, b, c = triangles.T
-        ab, bc, ca = (len(points) + number.reshape(-1, 3)).T
-        triangles = np.concatenate(
-            [np.column_stack(one) for one in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-        )
-        points = np.concatenate([points, middles])
-    volume = np.linalg.det(points[triangles]).sum() / 6.0
-    return points * (4.0 * np.pi / 3.0 / volume) ** (1.0 / 3.0), triangles
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions)
+    ball.apply_scale((4.0 * np.pi / 3.0 / ball.volume) ** (1.0 / 3.0))
+    return np.asarray(ball.vertices), np.asarray(ball.faces)
 
 
 def write_deck(mesh: HexMesh, push: Push, centre: Floats, depths: Sequence[float]) -> str:
@@ -110,7 +85,7 @@ def write_deck(mesh: HexMesh, push: Push, centre: Floats, depths: Sequence[float
     touched = [
         number for number, cell in enumerate(cells, 1) if skin.issuperset(cell[4:8].tolist())
     ]
-    sphere, triangles = make_icosphere(SUBDIVISIONS)
+    sphere, triangles = make_finger(SUBDIVISIONS)
     triangles = triangles[(sphere[triangles] @ normal).min(axis=1) < 0.1]
     kept, triangles = np.unique(triangles, return_inverse=True)
     triangles = triangles.reshape(-1, 3)
@@ -168,14 +143,7 @@ def solve_with_calculix(push: Push, depths: Sequence[float]) -> list[float]:
     program = shutil.which("ccx")
     if program is None:
         raise WitnessError("`ccx` is not installed; install the package `calculix-ccx`")
-    mesh = cylinder_hexahedra(
-        radius=push.radius,
-        length=push.length,
-        support_angle_rad=push.support_angle_rad,
-        along=push.along,
-        angle_rad=push.angle_rad,
-        scale=push.scale,
-    )
+    mesh = make_mesh(push)
     normal = np.array([0.0, np.sin(push.angle_rad), np.cos(push.angle_rad)])
     centre = (push.radius + 1.0) * normal + np.array([push.along, 0.0, 0.0])
     with tempfile.TemporaryDirectory() as folder:
@@ -215,6 +183,8 @@ def compare(scene: Scene, depths: Sequence[float]) -> list[dict[str, float]]:
         np.array(list(FelupeBody(replace(first, scale=MESHES[1]), isochoric=law).solve(depths)))
         for law in (False, True)
     ]
+    if min(map(len, laws)) < len(depths):
+        raise WitnessError("felupe did not converge at all depths; reduce MAX_DEPTH")
     rows = []
     for depth, force, step, factor in zip(
         depths, extrapolated, fine / extrapolated - 1.0, laws[0] / laws[1], strict=True

@@ -28,7 +28,7 @@ from benchmarks.hand_motion import (
     sample_wander,
 )
 from benchmarks.tracking_bench import bench_scene
-from benchmarks.tracking_regret import marker_covariance
+from benchmarks.tracking_regret import autocovariance, marker_covariance
 from flexsheet.launch.experiments.robustness import apparatus_text, parse_seeds
 from flexsheet.launch.plans.apparatus import load_apparatus
 from flexsheet.messages.apparatus import Apparatus
@@ -45,13 +45,6 @@ SPECTRUM_S, MEMORY_S = 240.0, 1.6
 """Duration of the sampled motion, and of the measurements that the predictor reads, s."""
 HORIZONS = 4
 """Number of times within a frame period at which the error is evaluated."""
-
-
-def autocovariance(path_mm: Floats, max_lag_s: float) -> Floats:
-    """Return the mean autocovariance (lags,) mm² of the axes of a path (n, 3) at GRID_HZ."""
-    count = round(max_lag_s * GRID_HZ) + 1
-    power = np.abs(np.fft.rfft(path_mm - path_mm.mean(axis=0), axis=0)) ** 2
-    return np.asarray(np.fft.irfft(power, axis=0)[:count].mean(axis=1) / len(path_mm))
 
 
 def sample_hand(truth: Apparatus, random: np.random.Generator) -> Floats:
@@ -71,7 +64,8 @@ def compute_bound_mm(scene: Scene, truth: Apparatus, random: np.random.Generator
     lags_s = [arm.servo_lag_s or 0.0 for arm in (truth.arms.left, truth.arms.right)]
     lag_s = float(np.mean(lags_s))
     first_s = 0.5 * scene.camera.exposure_s + (truth.camera.read_out_s or 0.0) + FIXED_S + lag_s
-    lags = autocovariance(sample_hand(truth, random), MEMORY_S + first_s + 1.0 / rate_hz)
+    max_lag_s = MEMORY_S + first_s + 1.0 / rate_hz
+    lags = autocovariance(sample_hand(truth, random), max_lag_s).mean(axis=1)
     grid_s = np.arange(len(lags)) / GRID_HZ
     ages_s = np.arange(round(MEMORY_S * rate_hz)) / rate_hz
     noise_mm2 = float(np.trace(marker_covariance(NOISE_PX))) / 3.0

@@ -101,7 +101,8 @@ def draw_hands(seed: int) -> Iterator[Hand]:
     """Draw hands with each voluntary motion, tremor band and amplitude."""
     path_s = DURATION_S + 2.0 * HORIZONS_S[-1]
     spectrum = {
-        key: _autocovariance(part) for key, part in _sample_parts(seed, SPECTRUM_S, 1).items()
+        key: autocovariance(part, MAX_TAPS_S + 2.0 * HORIZONS_S[-1])
+        for key, part in _sample_parts(seed, SPECTRUM_S, 1).items()
     }
     parts = _sample_parts(seed, path_s, 0)
     for motion, band, tremor_mm in product(VOLUNTARY, TREMOR_BANDS_HZ, TREMOR_MM):
@@ -134,9 +135,9 @@ def _sample_parts(seed: int, duration_s: float, realization: int) -> dict[str, F
     return parts
 
 
-def _autocovariance(path: Floats) -> Floats:
-    """Estimate the autocovariance by axis (lags, 3) of a path (n, 3), mm^2."""
-    lags = round((MAX_TAPS_S + 2.0 * HORIZONS_S[-1]) * GRID_HZ) + 1
+def autocovariance(path: Floats, max_lag_s: float) -> Floats:
+    """Return the autocovariance by axis (lags, 3), mm^2, of a path (n, 3) in mm at GRID_HZ."""
+    lags = round(max_lag_s * GRID_HZ) + 1
     spectrum = np.abs(np.fft.rfft(path - path.mean(axis=0), axis=0)) ** 2
     return np.asarray(np.fft.irfft(spectrum, axis=0)[:lags] / len(path))
 

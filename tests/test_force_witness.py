@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from benchmarks.force_reference import reference_pushes
+from benchmarks.force_reference import make_mesh, reference_pushes
 from benchmarks.force_witness import (
     MESHES,
     WitnessError,
-    make_icosphere,
+    make_finger,
     read_forces,
     solve_with_calculix,
     write_deck,
 )
-from benchmarks.hexahedra import cylinder_hexahedra
 from tests.scenes import load_cylinder
 
 RESULT = """
@@ -30,8 +31,8 @@ RESULT = """
 """
 
 
-def test_the_icosphere_has_the_volume_of_a_sphere_and_outward_triangles() -> None:
-    points, triangles = make_icosphere(3)
+def test_the_finger_has_the_volume_of_a_sphere_and_outward_triangles() -> None:
+    points, triangles = make_finger(3)
     corners = points[triangles]
     assert len(triangles) == 20 * 4**3
     assert np.linalg.det(corners).min() > 0.0
@@ -40,15 +41,8 @@ def test_the_icosphere_has_the_volume_of_a_sphere_and_outward_triangles() -> Non
 
 
 def test_the_deck_holds_the_support_and_moves_the_finger_by_each_depth() -> None:
-    push = reference_pushes(load_cylinder())[0]
-    mesh = cylinder_hexahedra(
-        radius=push.radius,
-        length=push.length,
-        support_angle_rad=push.support_angle_rad,
-        along=push.along,
-        angle_rad=push.angle_rad,
-        scale=MESHES[0],
-    )
+    push = replace(reference_pushes(load_cylinder())[0], scale=MESHES[0])
+    mesh = make_mesh(push)
     centre = np.array([0.0, 0.0, push.radius + 1.0])
     lines = write_deck(mesh, push, centre, [0.1, 0.5]).splitlines()
     assert lines.count("*END STEP") == 2

@@ -58,7 +58,7 @@ minimum number of these parts."""
 STAMP_MODEL_STD_S = 1.5e-4
 """The standard deviation (s) of the stamp offset that backlash and elasticity of the arms cause.
 
-The error was 0.1 ms rms in the simulated laboratories 0 to 9.
+The error was 0.1 ms rms in simulated laboratories with seeds 0 to 9.
 """
 
 MARK_SWING_M, MARK_FREQUENCY_HZ, MARK_SECONDS = 0.02, 1.0, 8.0

@@ -32,7 +32,7 @@ COMMON_ERROR_M = 6.5e-5
 """The standard deviation per axis of the error that all touches share, which residuals cannot show.
 
 The causes are the mean bias of the detected centre of a tilted marker and the stereo calibration.
-The value makes the stated error equal the true one in the simulated laboratories 0 to 11.
+The value makes the stated error equal the true one in simulated laboratories with seeds 0 to 11.
 """
 
 PRIOR_STD_LN = np.array([0.5, 0.7, 0.4])

@@ -86,7 +86,7 @@ IMAGE_MODEL_STD_M = 6e-5
 """Image error that remains if all calibrated parameters are exact, m (root mean square).
 
 The causes are the lens of the projector and the calculated shape of the sheet. The value is from
-the simulated laboratories 0 to 11.
+simulated laboratories with seeds 0 to 11.
 """
 
 
