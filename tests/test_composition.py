@@ -29,6 +29,7 @@ from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.benchmarks import FORCE
 from flexsheet.nodes.methods import Point
+from flexsheet.nodes.triangulator.tracking_benchmark import HORIZON_MS
 
 SCENES = Path(__file__).resolve().parent.parent / "launch" / "scenes"
 FINGERTIP, SHEET, IMAGE = SystemMetric.FINGERTIP, SystemMetric.SHEET, SystemMetric.IMAGE
@@ -167,13 +168,13 @@ def make_choice(family: str, *evaluations: MethodEvaluation) -> Choice:
 
 def test_stages_are_made_of_the_measured_families() -> None:
     scene = load_scene(SCENES / "light-touch.yaml")
-    leads = [{"lead_ms": 0, "factor": 1.0}, {"lead_ms": 20, "factor": 2.0},
-             {"lead_ms": 50, "factor": 3.0}]  # fmt: skip
+    horizons = [{HORIZON_MS: 0, "factor": 1.0}, {HORIZON_MS: 20, "factor": 2.0},
+             {HORIZON_MS: 50, "factor": 3.0}]  # fmt: skip
     asked: list[float] = []
 
     def measure(scene: Scene, noise_px: float) -> Sequence[MethodEvaluation]:
         asked.append(noise_px)
-        return evaluate("adaptive", 10.0 * noise_px, 1e-4, cases=leads)
+        return evaluate("adaptive", 10.0 * noise_px, 1e-4, cases=horizons)
 
     stages = tune_system.make_stages(
         scene,
@@ -181,7 +182,7 @@ def test_stages_are_made_of_the_measured_families() -> None:
             make_choice(
                 "marker", *evaluate("moments", 0.1, 1e-4), *evaluate("subpixel_fit", 0.01, 4e-4)
             ),
-            make_choice("tracking", *evaluate("adaptive", 0.7, 1e-4, cases=leads)),
+            make_choice("tracking", *evaluate("adaptive", 0.7, 1e-4, cases=horizons)),
             make_choice("correction", *evaluate("two_pass", 0.2, 1.0)),
             make_choice("soft-body", *evaluate("linear", 0.1, 1e-3, extra_metrics={FORCE: -7.0})),
         ],
@@ -196,6 +197,16 @@ def test_stages_are_made_of_the_measured_families() -> None:
     assert stages["correction"][0].biases[TO_LIGHT] == pytest.approx(1000.0)
     assert stages["soft-body"][0].biases[FORCE_ERROR] == pytest.approx(7.0)
     assert stages["marker"][0].cores == pytest.approx(2 * scene.camera.rate_hz * 1e-4)
+
+
+def test_a_stage_is_made_of_the_measured_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Measure the real method family, so that its cases have the keys that the stage reads."""
+    monkeypatch.setattr(tune_system, "REPEATS", 1)
+    scene = load_scene(SCENES / "light-touch.yaml")
+    evaluations = tune_system.measure_tracking(scene, 0.1)
+    (tracking,) = tune_system.make_stages(scene, [make_choice("tracking", *evaluations)]).values()
+    spreads = {one.method: one.spreads for one in tracking}["adaptive"]
+    assert 0.0 < spreads[FINGERTIP] < spreads[SHEET]
 
 
 def test_every_tolerance_of_a_scene_is_a_limit() -> None:
@@ -240,11 +251,11 @@ def test_a_shipped_scene_keeps_its_choice_and_an_interrupted_tuning_continues(
 
     scene_file = SCENES / "light-touch.yaml"
     scene = load_scene(scene_file)
-    leads = [{"lead_ms": 0}, {"lead_ms": 50}]
+    horizons = [{HORIZON_MS: 0}, {HORIZON_MS: 50}]
     choices = []
     for one in TUNABLES:
         setting = getattr(scene.methods, one.key)
-        cases = {"cases": leads} if one.name == "tracking" else {}
+        cases = {"cases": horizons} if one.name == "tracking" else {}
         evaluations = [
             *evaluate(str(setting), 0.1, 1e-5, **cases),
             *evaluate("another", 0.01, 1e-3, **cases),

@@ -40,7 +40,7 @@ from flexsheet.messages.methods import Methods
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.benchmarks import FORCE
 from flexsheet.nodes.methods import Point, Trial
-from flexsheet.nodes.triangulator.tracking_benchmark import make_tracking_family
+from flexsheet.nodes.triangulator.tracking_benchmark import HORIZON_MS, make_tracking_family
 
 RENDERED_HZ = 30.0
 """The maximum frame rate of the renderer in `launch/demo.yaml`."""
@@ -49,8 +49,6 @@ IMAGES = 2
 """The number of images per exposure in which the marker is searched."""
 
 STROKE_S = 10.0
-LEAD = "lead_ms"
-
 MeasureTracking = Callable[[Scene, float], Sequence[MethodEvaluation]]
 
 
@@ -162,11 +160,11 @@ def _list_tracking(
 
 
 def _make_tracking(scene: Scene, one: MethodEvaluation, given: Mapping[str, str]) -> StageOption:
-    leads = [point.case[LEAD] for point in one.points]
-    first, last = min(leads), max(leads)
+    horizons = [point.case[HORIZON_MS] for point in one.points]
+    first, last = min(horizons), max(horizons)
     fingertip, sheet = (
-        P95_OVER_RMS * _largest([p for p in one.points if p.case[LEAD] == lead], _error)
-        for lead in (first, last)
+        P95_OVER_RMS * _largest([p for p in one.points if p.case[HORIZON_MS] == horizon], _error)
+        for horizon in (first, last)
     )
     took_ms = 1e3 * one.median_s
     return StageOption(

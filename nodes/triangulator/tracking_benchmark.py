@@ -22,6 +22,9 @@ MARKER_NOISE_PX = 0.01
 """The standard deviation of a marker's centre by the subpixel fit at a distance of half a metre
 (`flexsheet chart marker`)."""
 
+HORIZON_MS = "horizon_ms"
+"""The key of a case's prediction horizon."""
+
 HORIZONS_S = (0.0, 0.02, 0.05)
 """The prediction horizons after the exposure: no prediction, until the frame is displayed, and
 until the arms have moved."""
@@ -138,7 +141,7 @@ def make_tracking_family(
                 for method in TRACKING_METHODS:
                     just_measured = method == "none" and horizon_s == 0.0
                     in_range = method not in WITHOUT_VELOCITY or motion.resting or just_measured
-                    case: Case = {"motion": name, "horizon_ms": round(1e3 * horizon_s)}
+                    case: Case = {"motion": name, HORIZON_MS: round(1e3 * horizon_s)}
                     trial = _trial(scene, method, case, seen, horizon_s, in_range=in_range)
                     yield replace(trial, in_scene=in_scene)
 
