@@ -133,9 +133,19 @@ def test_a_tolerance_that_no_method_meets_is_named_with_its_cost() -> None:
     assert not found.accepted
     assert set(found.last.exceeded) == {TO_ARM}
     verdict, reason = found.explain()
-    assert verdict.startswith("no configuration meets all tolerances")
+    assert verdict.startswith("no tested configuration meets all tolerances")
     assert "exposure_to_arm_ms: 15.5, tolerance 15; methods add marker 1" in reason
     assert len(graph.ran) <= 4
+
+
+def test_a_tolerance_that_no_method_meets_does_not_end_the_search() -> None:
+    """The latency is too large with all methods; the methods still have to meet the others."""
+    limits = {**LIMITS, FORCE_ERROR: 22.0}
+    graph = SimulatedGraph({TO_ARM: 30.0, FORCE_ERROR: 12.0})
+    found = compose(STAGES, limits, graph, margin=0.1)
+    assert [one["sheet-force"] for one in graph.ran][:2] == ["linear", "table"]
+    assert set(found.last.exceeded) == {TO_ARM}
+    assert found.chosen["sheet-force"].method == "table"
 
 
 def test_a_method_out_of_its_range_is_not_accepted_even_if_the_graph_is_exact() -> None:
@@ -146,10 +156,14 @@ def test_a_method_out_of_its_range_is_not_accepted_even_if_the_graph_is_exact() 
 
 
 def test_predictions_learn_only_what_the_tables_lack() -> None:
-    learned = Unexplained().learn({SHEET: 3.0, TO_ARM: 4.0}, {SHEET: 5.0, TO_ARM: 10.0})
-    assert learned.parts == pytest.approx({SHEET: 4.0, TO_ARM: 6.0})
-    assert Unexplained().learn({SHEET: 3.0}, {SHEET: 2.0}).parts == {}
-    assert learned.learn({SHEET: 0.0}, {SHEET: 1.0}).parts[SHEET] == pytest.approx(4.0)
+    combination = {"a": StageOption("a", 1.0, {SHEET: 3.0}, {TO_ARM: 4.0, FORCE_ERROR: -5.0})}
+    learned = Unexplained().learn(combination, {SHEET: 5.0, TO_ARM: 10.0, FORCE_ERROR: 12.0})
+    assert learned.parts == pytest.approx({SHEET: 4.0, TO_ARM: 6.0, FORCE_ERROR: 7.0})
+    assert predict(combination, learned) == pytest.approx(
+        {SHEET: 5.0, TO_ARM: 10.0, FORCE_ERROR: 12.0}
+    )
+    assert Unexplained().learn(combination, {SHEET: 2.0}).parts == {}
+    assert learned.learn(combination, {SHEET: 3.1}).parts[SHEET] == pytest.approx(4.0)
 
 
 def evaluate(method: str, error: float, took: float, **more: Any) -> list[MethodEvaluation]:
@@ -290,5 +304,5 @@ def test_a_shipped_scene_keeps_its_choice_and_an_interrupted_tuning_continues(
         composition, chosen = tune()
         assert len(ran) == 5
         assert composition.accepted
-        for one in chosen:
-            assert one.chosen.setting == getattr(scene.methods, one.key)
+        for choice in chosen:
+            assert choice.chosen.setting == getattr(scene.methods, choice.key)

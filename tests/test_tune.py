@@ -174,7 +174,7 @@ def test_an_insufficient_method_is_reported_with_its_excess() -> None:
     missed = choice_of([point("cheap", 4.2), point("dear", 2.5), point("dear", 0.1, depth=2)])
     assert not missed.met
     assert missed.explain() == (
-        "made-up: no method meets the tolerance 1 mm; best is dear (1 ms), outside in 1 of 2 "
+        "made-up: the tolerance 1 mm is met by no method; dear (1 ms) misses it in 1 of 2 "
         "cases: its error is 2.5 mm at depth_mm 1"
     )
 
@@ -387,7 +387,7 @@ def test_an_insufficient_method_has_a_separate_exit_code(
     monkeypatch.setattr(tune, "tune", lambda *_, **__: [missed])
     outcome = run(SCENES / "demanding.yaml", "--dry-run", "--runs", "0")
     assert outcome.exit_code == NOT_MET
-    assert "no method meets the tolerance 1 mm; best is cheap" in outcome.output
+    assert "the tolerance 1 mm is met by no method; cheap (10 µs) misses it" in outcome.output
     assert "no file written" in outcome.output
 
 

@@ -19,6 +19,13 @@ from typing import Any
 MAX_RUNS = 4
 """The maximum number of configurations that are run through the graph."""
 
+EQUAL_RATIO = 1.05
+"""The ratio below which two errors of the system count as equal."""
+
+EQUAL_DELAY_RATIO = 1.5
+"""The ratio below which two latencies count as equal. The largest 95 % latency of three runs of one
+configuration varies by this ratio between different times on one computer."""
+
 P95_OVER_RMS = 1.614
 """The ratio of the 95 % quantile to the root mean square of the length of a 3D Gaussian error."""
 
@@ -70,29 +77,25 @@ class Unexplained:
 
     parts: Figures = field(default_factory=dict)
 
-    def learn(self, predicted: Figures, measured: Figures) -> Unexplained:
-        """Return the excess updated with a run.
+    def learn(self, combination: Combination, measured: Figures) -> Unexplained:
+        """Return the excess updated with the measured metrics of a combination.
 
-        predicted: metrics predicted for the run, excluding any excess.
+        With this excess, `predict` returns the measured value of each metric that it underestimated
+        before.
         """
         parts = dict(self.parts)
+        squares, sums = _add_up(combination)
         for metric, value in measured.items():
-            known = predicted.get(metric, 0.0)
-            if value > known:
-                rest = value - known if metric in DELAYS else math.sqrt(value**2 - known**2)
-                parts[metric] = max(parts.get(metric, 0.0), rest)
-        return Unexplained(parts)
+            rest = max(0.0, value - sums.get(metric, 0.0))
+            if metric not in DELAYS:
+                rest = math.sqrt(max(0.0, rest**2 - squares.get(metric, 0.0)))
+            parts[metric] = max(parts.get(metric, 0.0), rest)
+        return Unexplained({metric: rest for metric, rest in parts.items() if rest > 0.0})
 
 
 def predict(combination: Combination, unexplained: Unexplained | None = None) -> Figures:
     """Predict the system metrics of a combination: spreads add as squares, biases linearly."""
-    squares: dict[SystemMetric, float] = {}
-    sums: dict[SystemMetric, float] = {}
-    for option in combination.values():
-        for metric, value in option.spreads.items():
-            squares[metric] = squares.get(metric, 0.0) + value**2
-        for metric, value in option.biases.items():
-            sums[metric] = sums.get(metric, 0.0) + abs(value)
+    squares, sums = _add_up(combination)
     for metric, value in (unexplained or Unexplained()).parts.items():
         if metric in DELAYS:
             sums[metric] = sums.get(metric, 0.0) + value
@@ -100,6 +103,20 @@ def predict(combination: Combination, unexplained: Unexplained | None = None) ->
             squares[metric] = squares.get(metric, 0.0) + value**2
     metrics = dict.fromkeys((*squares, *sums))
     return {one: math.sqrt(squares.get(one, 0.0)) + sums.get(one, 0.0) for one in metrics}
+
+
+def _add_up(
+    combination: Combination,
+) -> tuple[dict[SystemMetric, float], dict[SystemMetric, float]]:
+    """Return the sum of the squared spreads, and the sum of the biases, of each metric."""
+    squares: dict[SystemMetric, float] = {}
+    sums: dict[SystemMetric, float] = {}
+    for option in combination.values():
+        for metric, value in option.spreads.items():
+            squares[metric] = squares.get(metric, 0.0) + value**2
+        for metric, value in option.biases.items():
+            sums[metric] = sums.get(metric, 0.0) + abs(value)
+    return squares, sums
 
 
 def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
@@ -198,17 +215,18 @@ class Composition:
         names = ", ".join(f"{stage} {method}" for stage, method in run.methods.items())
         if self.accepted:
             return [f"accepted after {len(self.runs)} runs of the graph: {names}"]
-        lines = [f"no configuration meets all tolerances; the best is: {names}"]
+        lines = [f"no tested configuration meets all tolerances; the best is: {names}"]
         for metric in run.exceeded:
             stages = ", ".join(
                 f"{stage} {part:.3g}" for stage, part in budget(self.chosen, metric).items()
             )
             best = min(self.runs, key=lambda one: one.measured.get(metric, math.inf))
-            lines.append(
-                f"{metric}: {run.measured[metric]:.3g}, tolerance {self.tolerances[metric]:.3g}; "
-                f"methods add {stages or 'nothing'}; the best run has {best.measured[metric]:.3g} "
-                f"for {best.cores / run.cores if run.cores else 1.0:.2g} times the processor time"
-            )
+            line = f"{metric}: {run.measured[metric]:.3g}, tolerance {self.tolerances[metric]:.3g}"
+            line += f"; methods add {stages or 'nothing'}"
+            if best is not run and run.cores:
+                line += f"; the run with the smallest value has {best.measured[metric]:.3g} for "
+                line += f"{best.cores / run.cores:.2g} times the processor time of the methods"
+            lines.append(line)
         lines += [
             f"{stage} {option.method}: its range does not contain the scene's working range"
             for stage, option in self.chosen.items()
@@ -233,43 +251,84 @@ def compose(
     """Find the cheapest combination that meets all tolerances in a run of the graph.
 
     Runs the cheapest combination whose predicted metrics keep the margin. If its run exceeds a
-    tolerance, corrects all predictions by the difference, and runs the next combination. If no
-    prediction is within the tolerances, runs the combination that exceeds them least.
+    tolerance, corrects all predictions by the difference, and runs the next combination, until no
+    other one is predicted to be better in what exceeds its tolerance. If no combination can meet a
+    tolerance, the combination must be near the smallest value, and meet the other tolerances.
     """
     combinations = list_combinations(stages)
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     unexplained, runs = Unexplained(), list[GraphRun]()
     tried: list[Combination] = []
-    while len(runs) < max_runs:
+    while len(runs) < max_runs and len(tried) < len(combinations):
         left = [one for one in combinations if one not in tried]
-        if not left:
-            break
-        promising = [one for one in left if not _predicted_excess(one, unexplained, allowed)]
-        if not promising and runs:
-            limits = tolerances  # runs may use the margin that predictions leave
-            promising = [one for one in left if not _predicted_excess(one, unexplained, limits)]
-        proposed = (
-            promising[0]
-            if promising
-            else min(left, key=lambda one: _miss(one, unexplained, allowed))
-        )
+        proposed = _propose(left, unexplained, allowed)
+        if runs and _predicted_excess(proposed, unexplained, allowed):
+            # Runs may use the margin that predictions leave.
+            proposed = _propose(left, unexplained, tolerances)
         tried.append(proposed)
         measured = run_graph(proposed)
         predicted = predict(proposed)
         exceeded = excess(measured, tolerances)
         runs.append(GraphRun(name_methods(proposed), cost(proposed), predicted, measured, exceeded))
-        if (not exceeded and _is_in_range(proposed)) or not promising:
+        unexplained = unexplained.learn(proposed, measured)
+        others = [predict(one, unexplained) for one in left if _is_in_range(one)]
+        if _is_in_range(proposed) and not any(
+            _equal_ratio(metric) * one.get(metric, math.inf) < measured[metric]
+            for one in others
+            for metric in exceeded
+        ):
             break
-        unexplained = unexplained.learn(predicted, measured)
+    limits = _relax(tolerances, [run.measured for run in runs])
     best = min(
         range(len(runs)),
         key=lambda i: (
             not _is_in_range(tried[i]),
-            max(runs[i].exceeded.values(), default=0.0),
+            _sum_excess(runs[i].measured, limits),
             runs[i].cores,
         ),
     )
     return Composition(tried[best], tuple(runs), tolerances)
+
+
+def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
+    """Return the cheapest combination whose predicted metrics are within the attainable limits.
+
+    If there is none, return the one with the fewest methods out of range, then the smallest excess.
+    """
+    predicted = [predict(one, unexplained) for one in left]
+    usable = [figures for one, figures in zip(left, predicted, strict=True) if _is_in_range(one)]
+    attainable = _relax(limits, usable)
+
+    def key(i: int) -> tuple[int, float, float]:
+        outside = sum(not option.in_range for option in left[i].values())
+        return outside, _sum_excess(predicted[i], attainable), cost(left[i])
+
+    return left[min(range(len(left)), key=key)]
+
+
+def _relax(limits: Figures, found: Sequence[Figures]) -> Figures:
+    """Raise each limit to the smallest value found, plus its spread, if the limit is smaller."""
+    return {
+        metric: max(
+            limit,
+            _equal_ratio(metric)
+            * min((one[metric] for one in found if metric in one), default=0.0),
+        )
+        for metric, limit in limits.items()
+    }
+
+
+def _equal_ratio(metric: SystemMetric) -> float:
+    return EQUAL_DELAY_RATIO if metric in DELAYS else EQUAL_RATIO
+
+
+def _sum_excess(figures: Figures, limits: Figures) -> float:
+    """Return the sum of the logarithms of value / limit over the metrics that exceed their limit.
+
+    Return infinity if a value is not a number.
+    """
+    ratios = excess(figures, limits).values()
+    return math.inf if any(map(math.isnan, ratios)) else sum(map(math.log, ratios))
 
 
 def _is_in_range(combination: Combination) -> bool:
@@ -278,10 +337,3 @@ def _is_in_range(combination: Combination) -> bool:
 
 def _predicted_excess(one: Combination, unexplained: Unexplained, limits: Figures) -> bool:
     return not _is_in_range(one) or bool(excess(predict(one, unexplained), limits))
-
-
-def _miss(one: Combination, unexplained: Unexplained, limits: Figures) -> tuple[int, float, float]:
-    """Return a key that sorts combinations by methods out of range, then excess, then cost."""
-    outside = sum(not option.in_range for option in one.values())
-    worst = max(excess(predict(one, unexplained), limits).values(), default=0.0)
-    return outside, worst, cost(one)

@@ -201,15 +201,21 @@ class Choice:
         allowed = f"{_format(self.tolerance)} {unit}"
         took = format_duration(one.median_s)
         if not self.met:
-            near = f"best is {one.method} ({took}), outside in {one.missed} of {one.cases} cases"
+            others = [other.method for other in self.evaluations if other.meets]
+            near = f"{one.method} ({took}) misses it in {one.missed} of {one.cases} cases"
+            meets = ", ".join(others) + " in other configurations" if others else "no method"
             fault = self._describe_fault(one)
-            return f"{self.family}: no method meets the tolerance {allowed}; {near}: {fault}"
+            return f"{self.family}: the tolerance {allowed} is met by {meets}; {near}: {fault}"
         cheaper = [other for other in self.evaluations if other.median_s * TIE_RATIO < one.median_s]
         rest = "no method is faster"
         if cheaper:
             nearest = min(cheaper, key=_miss_key)
             rest = f"{nearest.method} is faster ({format_duration(nearest.median_s)}), but "
-            rest += self._describe_fault(nearest)
+            rest += (
+                "a configuration with it does not meet the tolerances"
+                if nearest.meets
+                else self._describe_fault(nearest)
+            )
         left = f"{one.method} ({took}), error {_format(one.error)}, tolerance {allowed}"
         return f"{self.family}: {left}; {rest}"
 
