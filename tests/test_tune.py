@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +175,7 @@ def test_an_insufficient_method_is_reported_with_its_excess() -> None:
     missed = choice_of([point("cheap", 4.2), point("dear", 2.5), point("dear", 0.1, depth=2)])
     assert not missed.met
     assert missed.explain() == (
-        "made-up: the tolerance 1 mm is met by no method; dear (1 ms) misses it in 1 of 2 "
+        "made-up: no method meets the tolerance 1 mm; best is dear (1 ms), outside in 1 of 2 "
         "cases: its error is 2.5 mm at depth_mm 1"
     )
 
@@ -195,7 +196,7 @@ def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.Monkey
     def measured(asked: Family, scene: Scene, wanted: object) -> Sequence[Point]:
         return [point(name, errors.get(name, 0.3), took=1e-3) for name in asked.methods]
 
-    tunables = find_tunables(["correction", "sheet-shape"])
+    tunables = find_tunables(["correction", "sheet-shape"], SCENE)
     shape, correction = tune.tune(SCENE, tunables, measure=measured)
     assert shape.chosen.setting == "reduced_order"  # as quick as the others, and more exact
     assert (correction.chosen.method, correction.chosen.setting) == ("two_pass", "two_pass")
@@ -204,6 +205,34 @@ def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.Monkey
     assert shape.chosen.setting == "four_triangles"
     assert correction.chosen.method == "two_pass_triangles"
     assert correction.chosen.setting == "two_pass"
+
+
+def test_method_families_that_a_scene_does_not_use_are_not_tuned() -> None:
+    """The plane has neither a material, thus no force, nor a projector, thus no image."""
+    plane = load_scene(SCENES / "rigid-plane.yaml")
+    assert [one.name for one in find_tunables([], plane)] == ["marker", "tracking"]
+    assert len(find_tunables([], SCENE)) == 6
+    with pytest.raises(tune.UnknownTunableError, match=r'"correction": it has no `projector`'):
+        find_tunables(["correction"], plane)
+
+
+def test_a_composed_choice_is_explained_without_the_tolerance_of_its_family() -> None:
+    choice = replace(choice_of([point("cheap", 4.2), point("dear", 2.5, took=1e-3)]), composed=True)
+    assert choice.met
+    assert (
+        choice.explain()
+        == "made-up: dear (1 ms), error 2.5 mm; alternatives: cheap (10 µs, 4.2 mm)"
+    )
+    text = insert_choices(
+        "name: a\n",
+        [replace(choice, key="marker")],
+        today="2026-01-02",
+        machine="a machine",
+        commit=None,
+        unmet=["sheet_mm", "force_percent"],
+    )
+    assert "; a machine; INSUFFICIENT: sheet_mm, force_percent.\n" in text
+    assert "marker: dear  # 1 ms, error 2.5 mm\n" in text
 
 
 def put(text: str, *choices: tune.Choice) -> str:
@@ -387,7 +416,7 @@ def test_an_insufficient_method_has_a_separate_exit_code(
     monkeypatch.setattr(tune, "tune", lambda *_, **__: [missed])
     outcome = run(SCENES / "demanding.yaml", "--dry-run", "--runs", "0")
     assert outcome.exit_code == NOT_MET
-    assert "the tolerance 1 mm is met by no method; cheap (10 µs) misses it" in outcome.output
+    assert "no method meets the tolerance 1 mm; best is cheap" in outcome.output
     assert "no file written" in outcome.output
 
 

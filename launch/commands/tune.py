@@ -97,7 +97,7 @@ def tune(
 
     scene = load_scene(scene_file)
     try:
-        tunables = tune.find_tunables(family or [])
+        tunables = tune.find_tunables(family or [], scene)
     except tune.UnknownTunableError as error:
         raise CommandError(f"--family: {error}") from None
     target = None if dry_run else output or scene_file
@@ -140,7 +140,8 @@ def tune(
     else:
         _print_choices(choices)
     if target is not None:
-        tune.write_choices(scene_file, target, choices)
+        unmet = () if composition is None else tuple(composition.last.exceeded)
+        tune.write_choices(scene_file, target, choices, unmet)
     words.print("no file written (--dry-run)" if target is None else f"written: {target}")
     if not met:
         raise typer.Exit(NOT_MET)
@@ -157,7 +158,7 @@ def _print_choices(choices: Sequence[Choice]) -> None:
             format_duration(choice.chosen.slowest_s),
             f"{choice.chosen.error:.3g}",
             f"{choice.tolerance:.3g} {choice.unit}",
-            f"{100 * choice.spare_ratio:.0f} %" if choice.met else "-",
+            f"{100 * choice.spare_ratio:.0f} %" if choice.chosen.meets else "-",
             ""
             if choice.met
             else f"outside in {choice.chosen.missed} of {choice.chosen.cases} cases",

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, get_args
 
@@ -66,17 +67,23 @@ class Tunable:
     families: locations `module:NAME` of the `Family` objects that it consists of, in the order of
     measurement. Later parts take minutes to prepare, and are measured only if no earlier method is
     sufficient. settings: value to write into the scene for each method, by the method's name in the
-    chart of the method family.
+    chart of the method family. required_key: dotted key of the scene without which no node uses
+    the family.
     """
 
     name: str
     families: tuple[str, ...]
     settings: Mapping[str, Setting]
+    required_key: str | None = None
 
     @property
     def key(self) -> str:
         """Return the key of the method family in the scene's `methods`."""
         return self.name.replace("-", "_")
+
+    def is_used(self, scene: Scene) -> bool:
+        """Return whether the nodes of this scene use the method family."""
+        return self.required_key is None or attrgetter(self.required_key)(scene) is not None
 
 
 def _make_settings(methods: object) -> dict[str, Setting]:
@@ -90,6 +97,7 @@ def _make_soft_body(method: str, skin_spacing_m: float) -> Setting:
 
 _BENCHMARKS = "flexsheet.launch.methods.benchmarks"
 _FEM_SOLVER = "flexsheet.nodes.fem_solver.benchmarks"
+MATERIAL, PROJECTOR = "object.material", "projector"
 TUNABLES = (
     Tunable(
         "marker", ("flexsheet.nodes.triangulator.benchmarks:MARKER",), _make_settings(MarkerMethod)
@@ -99,16 +107,19 @@ TUNABLES = (
         "sheet-force",
         (f"{_BENCHMARKS}:SHEET_LAWS", f"{_BENCHMARKS}:SHEET_FORCE"),
         _make_settings(SheetForceMethod),
+        required_key=MATERIAL,
     ),
     Tunable(
         "sheet-shape",
         (f"{_BENCHMARKS}:QUICK_SHAPE", f"{_BENCHMARKS}:SHEET_SHAPE"),
         _make_settings(SheetShapeMethod),
+        required_key=PROJECTOR,
     ),
     Tunable(
         "correction",
         (f"{_BENCHMARKS}:QUICK_CORRECTION", f"{_BENCHMARKS}:CORRECTION"),
         _make_settings(Correction),
+        required_key=PROJECTOR,
     ),
     Tunable(
         "soft-body",
@@ -119,6 +130,7 @@ TUNABLES = (
             "linear, fine": _make_soft_body("linear", 0.003),
             "nonlinear table, medium": _make_soft_body("nonlinear_table", 0.0045),
         },
+        required_key=MATERIAL,
     ),
 )
 """The tunable method families in the order of tuning. The sheet shape precedes the image
@@ -131,10 +143,11 @@ TWO_PASS_NAMES = {
 """The names of the two-pass image correction in its chart, by method of the sheet shape."""
 
 
-def find_tunables(names: Sequence[str]) -> list[Tunable]:
-    """Return the tunable method families, in tuning order.
+def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
+    """Return the tunable method families that the scene uses, in tuning order.
 
-    names: names of the method families; if empty, all are returned. Raises UnknownTunableError.
+    names: names of the method families; if empty, all are returned. Raises UnknownTunableError for
+    an unknown name, and for a family that the scene does not use.
     """
     known = [one.name for one in TUNABLES]
     for name in names:
@@ -142,7 +155,14 @@ def find_tunables(names: Sequence[str]) -> list[Tunable]:
             raise UnknownTunableError(
                 f'unknown method family "{name}"; {did_you_mean(name, known)}'
             )
-    return [one for one in TUNABLES if not names or one.name in names]
+    chosen = [one for one in TUNABLES if not names or one.name in names]
+    for one in chosen:
+        if names and not one.is_used(scene):
+            raise UnknownTunableError(
+                f'scene "{scene.name}" does not use the method family "{one.name}": it has no '
+                f"`{one.required_key}`"
+            )
+    return [one for one in chosen if one.is_used(scene)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +197,11 @@ class MethodEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The choice of one method of a method family, with the evaluations of all measured methods."""
+    """The choice of one method of a method family, with the evaluations of all measured methods.
+
+    composed: whether the method was chosen for the errors of the whole system, so that the
+    tolerance of its method family does not decide.
+    """
 
     family: str
     key: str
@@ -185,10 +209,11 @@ class Choice:
     tolerance: float
     chosen: MethodEvaluation
     evaluations: tuple[MethodEvaluation, ...]
+    composed: bool = False
 
     @property
     def met(self) -> bool:
-        return self.chosen.meets
+        return self.composed or self.chosen.meets
 
     @property
     def spare_ratio(self) -> float:
@@ -197,27 +222,35 @@ class Choice:
 
     def explain(self) -> str:
         """Return one sentence for the user that gives the reason for the choice."""
+        if self.composed:
+            return self._explain_composed()
         one, unit = self.chosen, self.unit
         allowed = f"{_format(self.tolerance)} {unit}"
         took = format_duration(one.median_s)
         if not self.met:
-            others = [other.method for other in self.evaluations if other.meets]
-            near = f"{one.method} ({took}) misses it in {one.missed} of {one.cases} cases"
-            meets = ", ".join(others) + " in other configurations" if others else "no method"
+            near = f"best is {one.method} ({took}), outside in {one.missed} of {one.cases} cases"
             fault = self._describe_fault(one)
-            return f"{self.family}: the tolerance {allowed} is met by {meets}; {near}: {fault}"
+            return f"{self.family}: no method meets the tolerance {allowed}; {near}: {fault}"
         cheaper = [other for other in self.evaluations if other.median_s * TIE_RATIO < one.median_s]
         rest = "no method is faster"
         if cheaper:
             nearest = min(cheaper, key=_miss_key)
             rest = f"{nearest.method} is faster ({format_duration(nearest.median_s)}), but "
-            rest += (
-                "a configuration with it does not meet the tolerances"
-                if nearest.meets
-                else self._describe_fault(nearest)
-            )
+            rest += self._describe_fault(nearest)
         left = f"{one.method} ({took}), error {_format(one.error)}, tolerance {allowed}"
         return f"{self.family}: {left}; {rest}"
+
+    def _explain_composed(self) -> str:
+        one = self.chosen
+        text = f"{self.family}: {one.method} ({format_duration(one.median_s)}), error "
+        text += f"{_format(one.error)} {self.unit}"
+        others = [
+            f"{other.method} ({format_duration(other.median_s)}, {_format(other.error)} "
+            f"{self.unit})"
+            for other in self.evaluations
+            if other is not one
+        ]
+        return f"{text}; alternatives: {', '.join(others)}" if others else text
 
     def _describe_fault(self, one: MethodEvaluation) -> str:
         parts = []
@@ -411,19 +444,27 @@ METHODS = "methods"
 
 
 def insert_choices(
-    text: str, choices: Sequence[Choice], *, today: str, machine: str, commit: str | None
+    text: str,
+    choices: Sequence[Choice],
+    *,
+    today: str,
+    machine: str,
+    commit: str | None,
+    unmet: Sequence[str] = (),
 ) -> str:
     """Return the text of a scene file with the choices inserted in its mapping `methods`.
 
     All other text is unchanged, including the methods of other method families. If `methods` is a
-    mapping on one line, it is expanded to several lines.
+    mapping on one line, it is expanded to several lines. unmet: names of the system metrics that
+    exceed their tolerance, for the comment.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
     block = _find_block(text, lines)
     chosen = {choice.key: choice for choice in choices}
     code = "" if commit is None else f"; code {commit[:10]}"
-    head = f"# Chosen by `flexsheet tune` on {today}; {machine}{code}.{ending}"
+    missed = f"; INSUFFICIENT: {', '.join(unmet)}" if unmet else ""
+    head = f"# Chosen by `flexsheet tune` on {today}; {machine}{code}{missed}.{ending}"
     new = [head, block.header or f"{METHODS}:{ending}"]
     for key, own in block.parts:
         if key in chosen:
@@ -447,7 +488,8 @@ def _make_line(choice: Choice, indent: str) -> str:
         format_duration(choice.chosen.median_s),
         f"{_format(choice.tolerance)} {choice.unit}",
     )
-    comment = f"{took}, error {_format(choice.chosen.error)}, tolerance {allowed}"
+    comment = f"{took}, error {_format(choice.chosen.error)}"
+    comment += f" {choice.unit}" if choice.composed else f", tolerance {allowed}"
     if not choice.met:
         missed = f"outside in {choice.chosen.missed} of {choice.chosen.cases} cases"
         comment = f"INSUFFICIENT: {comment}; {missed}"
@@ -573,11 +615,14 @@ def _draft_path(target: Path) -> Path:
     return target.with_name(f".{target.stem}.{os.getpid()}.yaml")
 
 
-def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None:
+def write_choices(
+    source: Path, target: Path, choices: Sequence[Choice], unmet: Sequence[str] = ()
+) -> None:
     """Write the choices atomically into a scene file or into a copy of it.
 
-    If the file is a symbolic link, the file that it points to is written. Raises BadInputError if
-    other parts of the scene would change, or the target cannot be written.
+    unmet: names of the system metrics that exceed their tolerance, for the comment. If the file is
+    a symbolic link, the file that it points to is written. Raises BadInputError if other parts of
+    the scene would change, or the target cannot be written.
     """
     text = insert_choices(
         relocate_paths(_read(source), source, target),
@@ -585,6 +630,7 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None
         today=datetime.now(UTC).date().isoformat(),
         machine=machine_name(),
         commit=git_commit(),
+        unmet=unmet,
     )
     before = load_scene(source)
     # Write the draft to the target's folder, since paths in a scene are relative to its folder.

@@ -187,6 +187,7 @@ def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> lis
         replace(
             choice,
             chosen=next(one for one in choice.evaluations if one.method == methods[choice.family]),
+            composed=True,
         )
         for choice in choices
     ]
