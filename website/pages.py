@@ -28,6 +28,7 @@ from website import (
     registers_page,
     ros2_page,
     scene_page,
+    system_page,
     tolerances_page,
     tracking_page,
 )
@@ -45,6 +46,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "charts": lambda: render_charts(CHARTS),
     "commands": commands_page.render,
     "errors": errors_page.render,
+    "load": lambda: system_page.render_load(RESULTS),
     "message-header": messages_page.render_header,
     "message-types": messages_page.render_types,
     "mxt-packet": registers_page.render_packet,
@@ -54,6 +56,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "ros2-topics": ros2_page.render_topics,
     "scene-keys": scene_page.render,
     "scenes": lambda: scenes.render(RESULTS / "scenes.json"),
+    "system": lambda: system_page.render_system(RESULTS),
     "tolerances": tolerances_page.render,
     "topics": messages_page.render_topics,
     "tracking-regret": lambda: tracking_page.render(CHARTS / "tracking-regret.json"),
@@ -100,3 +103,4 @@ if __name__ == "__main__":
             page.write_text(figures.update(page.read_text(encoding="utf-8")), encoding="utf-8")
         for path, text in drawings().items():
             (DOCS / path).write_text(text, encoding="utf-8")
+        system_page.draw(RESULTS, DOCS / "images")

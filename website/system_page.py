@@ -1,0 +1,68 @@
+"""Draw and tabulate the recorded measurements of the whole system and of its load limits."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks import load
+from flexsheet.launch.methods.configurations import CONTROL_AGAIN
+from flexsheet.launch.methods.system_picture import draw_system_chart
+
+SYSTEM, LOAD = "system.json", "load.json"
+COLUMNS = {
+    "sheet_mm": "sheet, mm",
+    "image_mm": "image, mm",
+    "force_percent": "force, %",
+    "fingertip_mm": "fingertip, mm",
+}
+"""The headings of the 95 % errors in a point of the system chart."""
+
+
+def draw(results: Path, images: Path) -> None:
+    """Draw the pictures of the recorded measurements; without a record, draw nothing."""
+    if (results / SYSTEM).exists():
+        draw_system_chart(_read(results / SYSTEM)["results"], images / "system.svg")
+    if (results / LOAD).exists():
+        load.draw_rows(_read(results / LOAD)["results"]["rows"], images / "load.svg")
+
+
+def render_system(results: Path) -> str:
+    """Return a table with the configurations of each scene in the system chart, in Markdown."""
+    heads = ("scene", "configuration", "cores", "to arm, ms", "to light, ms", *COLUMNS.values())
+    lines = [f"| {' | '.join((*heads, 'exceeds'))} |", "|---" * (len(heads) + 1) + "|"]
+    record = _read(results / SYSTEM)
+    for point in record["results"]["points"]:
+        if point["configuration"] == CONTROL_AGAIN:
+            continue
+        cells = [
+            point["scene"],
+            point["configuration"],
+            f"{point['cpu_cores']:.2f}",
+            *(_format_latency(point[f"exposure_to_{end}_ms"]) for end in ("arm", "light")),
+            *("–" if point[key] is None else f"{point[key]:.2f}" for key in COLUMNS),
+            ", ".join(key.removesuffix(".p95") for key in point["failing"]) or "–",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join([*lines, "", _describe(record)])
+
+
+def render_load(results: Path) -> str:
+    """Return a table of the levels of each load factor, in Markdown."""
+    record = _read(results / LOAD)
+    return f"{load.format_table(record['results']['rows'])}\n\n{_describe(record)}"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return record
+
+
+def _format_latency(quantiles: Mapping[str, float] | None) -> str:
+    return "–" if quantiles is None else f"{quantiles['p50']:.0f} / {quantiles['p99']:.0f}"
+
+
+def _describe(record: Mapping[str, Any]) -> str:
+    return f"{record['machine']}, load {record['load']:.1f}; `{record['command']}`."
