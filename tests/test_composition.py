@@ -149,10 +149,24 @@ def test_a_tolerance_that_no_method_meets_does_not_end_the_search() -> None:
 
 
 def test_a_method_out_of_its_range_is_not_accepted_even_if_the_graph_is_exact() -> None:
-    stages = {"soft-body": [StageOption("fem", 0.1, in_range=False)]}
+    stages = {"soft-body": [StageOption("fem", 0.1, outside=0.5)]}
     found = compose(stages, LIMITS, lambda _: {SHEET: 0.1}, margin=0.2)
     assert not found.accepted
     assert any("range" in line for line in found.explain())
+
+
+def test_the_method_with_the_fewest_cases_out_of_range_is_preferred() -> None:
+    """The error of a method counts only within its range, so a small range must not help it."""
+    stages = {
+        "soft-body": [
+            StageOption("shallow", 0.1, biases={FORCE_ERROR: 5.0}, outside=0.6),
+            StageOption("deep", 0.2, biases={FORCE_ERROR: 25.0}, outside=0.1),
+        ]
+    }
+    found = compose(stages, LIMITS, SimulatedGraph(), margin=0.2)
+    assert name_methods(found.chosen) == {"soft-body": "deep"}
+    assert not found.accepted
+    assert "soft-body deep: 10% of the scene's cases are out of range" in found.explain()
 
 
 def test_predictions_learn_only_what_the_tables_lack() -> None:

@@ -52,8 +52,8 @@ class StageOption:
     """A method that can be chosen for a stage.
 
     cores: processor time per second. spreads, biases: 95 % errors or delays (ms) that it adds to
-    metrics. given: methods of other stages for which these values were measured. in_range: whether
-    the method's stated range contains the scene's working range.
+    metrics. given: methods of other stages for which these values were measured. outside: fraction
+    of the scene's cases that are out of the method's stated range.
     """
 
     method: str
@@ -61,7 +61,11 @@ class StageOption:
     spreads: Mapping[SystemMetric, float] = field(default_factory=dict)
     biases: Mapping[SystemMetric, float] = field(default_factory=dict)
     given: Mapping[str, str] = field(default_factory=dict)
-    in_range: bool = True
+    outside: float = 0.0
+
+    @property
+    def in_range(self) -> bool:
+        return self.outside == 0.0
 
 
 Combination = Mapping[str, StageOption]
@@ -228,7 +232,7 @@ class Composition:
                 line += f"{best.cores / run.cores:.2g} times the processor time of the methods"
             lines.append(line)
         lines += [
-            f"{stage} {option.method}: its range does not contain the scene's working range"
+            f"{stage} {option.method}: {option.outside:.0%} of the scene's cases are out of range"
             for stage, option in self.chosen.items()
             if not option.in_range
         ]
@@ -253,16 +257,19 @@ def compose(
     Runs the cheapest combination whose predicted metrics keep the margin. If its run exceeds a
     tolerance, corrects all predictions by the difference, and runs the next combination, until no
     other one is predicted to be better in what exceeds its tolerance. If no combination can meet a
-    tolerance, the combination must be near the smallest value, and meet the other tolerances.
+    tolerance, the combination must be near the smallest value, and meet the other tolerances. Only
+    combinations with the fewest cases out of range are considered.
     """
     combinations = list_combinations(stages)
+    least_outside = min(map(_outside, combinations))
+    combinations = [one for one in combinations if _outside(one) == least_outside]
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     unexplained, runs = Unexplained(), list[GraphRun]()
     tried: list[Combination] = []
     while len(runs) < max_runs and len(tried) < len(combinations):
         left = [one for one in combinations if one not in tried]
         proposed = _propose(left, unexplained, allowed)
-        if runs and _predicted_excess(proposed, unexplained, allowed):
+        if runs and excess(predict(proposed, unexplained), allowed):
             # Runs may use the margin that predictions leave.
             proposed = _propose(left, unexplained, tolerances)
         tried.append(proposed)
@@ -271,8 +278,8 @@ def compose(
         exceeded = excess(measured, tolerances)
         runs.append(GraphRun(name_methods(proposed), cost(proposed), predicted, measured, exceeded))
         unexplained = unexplained.learn(proposed, measured)
-        others = [predict(one, unexplained) for one in left if _is_in_range(one)]
-        if _is_in_range(proposed) and not any(
+        others = [predict(one, unexplained) for one in left if one is not proposed]
+        if not any(
             _equal_ratio(metric) * one.get(metric, math.inf) < measured[metric]
             for one in others
             for metric in exceeded
@@ -280,12 +287,7 @@ def compose(
             break
     limits = _relax(tolerances, [run.measured for run in runs])
     best = min(
-        range(len(runs)),
-        key=lambda i: (
-            not _is_in_range(tried[i]),
-            _sum_excess(runs[i].measured, limits),
-            runs[i].cores,
-        ),
+        range(len(runs)), key=lambda i: (_sum_excess(runs[i].measured, limits), runs[i].cores)
     )
     return Composition(tried[best], tuple(runs), tolerances)
 
@@ -293,17 +295,20 @@ def compose(
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
     """Return the cheapest combination whose predicted metrics are within the attainable limits.
 
-    If there is none, return the one with the fewest methods out of range, then the smallest excess.
+    If there is none, return the one with the smallest excess.
     """
     predicted = [predict(one, unexplained) for one in left]
-    usable = [figures for one, figures in zip(left, predicted, strict=True) if _is_in_range(one)]
-    attainable = _relax(limits, usable)
+    attainable = _relax(limits, predicted)
 
-    def key(i: int) -> tuple[int, float, float]:
-        outside = sum(not option.in_range for option in left[i].values())
-        return outside, _sum_excess(predicted[i], attainable), cost(left[i])
+    def key(i: int) -> tuple[float, float]:
+        return _sum_excess(predicted[i], attainable), cost(left[i])
 
     return left[min(range(len(left)), key=key)]
+
+
+def _outside(combination: Combination) -> float:
+    """Return the sum of the fractions of cases that are out of the methods' ranges."""
+    return sum(option.outside for option in combination.values())
 
 
 def _relax(limits: Figures, found: Sequence[Figures]) -> Figures:
@@ -329,11 +334,3 @@ def _sum_excess(figures: Figures, limits: Figures) -> float:
     """
     ratios = excess(figures, limits).values()
     return math.inf if any(map(math.isnan, ratios)) else sum(map(math.log, ratios))
-
-
-def _is_in_range(combination: Combination) -> bool:
-    return all(option.in_range for option in combination.values())
-
-
-def _predicted_excess(one: Combination, unexplained: Unexplained, limits: Figures) -> bool:
-    return not _is_in_range(one) or bool(excess(predict(one, unexplained), limits))

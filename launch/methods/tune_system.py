@@ -130,7 +130,7 @@ def _make_option(
         spreads,
         biases,
         given,
-        in_range=not one.outside and math.isfinite(one.error),
+        outside=_outside(one),
     )
 
 
@@ -173,8 +173,13 @@ def _make_tracking(scene: Scene, one: MethodEvaluation, given: Mapping[str, str]
         {SystemMetric.FINGERTIP: fingertip, SystemMetric.SHEET: sheet},
         {SystemMetric.TO_ARM: took_ms, SystemMetric.TO_LIGHT: took_ms},
         given,
-        in_range=not one.outside,
+        outside=_outside(one),
     )
+
+
+def _outside(one: MethodEvaluation) -> float:
+    """Return the fraction of the cases out of the method's range; 1 if it has no reference."""
+    return len(one.outside) / one.cases if math.isfinite(one.error) else 1.0
 
 
 def _error(point: Point) -> float:
