@@ -31,7 +31,7 @@ from flexsheet.launch.running.host import (
 )
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
-from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
+from flexsheet.messages.busy import describe_busy, describe_busy_remedy, describe_pressure, is_busy
 from flexsheet.messages.notes import SELF_CHECK_REMEDIES, NodeNote, describe_self_check
 from flexsheet.messages.scene import Scene, shows_check_marks
 from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
@@ -468,10 +468,11 @@ def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
 
 def _check_load(status: HostStatus) -> HostFinding:
     if is_busy(status):
-        return HostFinding(status.host, "load", "warning", describe_busy(status), BUSY_REMEDY)
+        remedy = describe_busy_remedy(nice_denied=status.nice_denied)
+        return HostFinding(status.host, "load", "warning", describe_busy(status), remedy)
     what = f"load {status.load_ratio:.2f} per core"
     if status.cpu is not None:
-        what += f"; {status.cpu.node} waits for a processor {status.cpu.wait_ratio:.0%} of the time"
+        what += f"; {describe_pressure(status.cpu)}"
     return HostFinding(status.host, "load", "ok", what)
 
 
