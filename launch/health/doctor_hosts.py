@@ -323,12 +323,16 @@ def _check_clocks(
 def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     assert probe.status is not None
     nodes = probe.status.nodes
-    missing = [one.name for one in nodes if one.state != "ready"]
+    ended = [one.name for one in nodes if one.state == "exited"]
+    starting = [one.name for one in nodes if one.state == "starting"]
     restarted = [f"{one.name} {one.restarts}" for one in nodes if one.restarts]
     remedy = f"see {probe.status.run}/logs in the folder of runs on {probe.host}"
     finding = partial(HostFinding, probe.host, "nodes")
-    if missing:
-        return finding("failed", f"these nodes are not ready: {', '.join(missing)}", remedy)
+    if ended:
+        return finding("failed", f"these nodes have ended: {', '.join(ended)}", remedy)
+    if starting:
+        what = f"these nodes are still starting: {', '.join(starting)}"
+        return finding("warning", what, f"wait some seconds; otherwise {remedy}")
     if restarted:
         what = f"{len(nodes)} nodes are ready; restarts: {', '.join(restarted)}"
         return finding("warning", what, remedy)
