@@ -9,14 +9,27 @@ MAX_LOAD_RATIO = 1.5
 """The maximum load per core, used if a computer cannot measure how long its nodes wait."""
 
 BUSY_REMEDY = (
-    "the arms may pause meanwhile; end other programs, give the graph more cores, start fewer "
-    "nodes, or start the graph as root, which gives the simulated arms priority"
+    "the arms may pause meanwhile; end other programs, give the graph more cores, or start fewer "
+    "nodes"
 )
 
 
 def is_busy(host: HostStatus) -> bool:
     """Return whether a computer has too few free processors for the nodes that run on it."""
     return host.load_ratio > MAX_LOAD_RATIO if host.cpu is None else host.cpu.busy
+
+
+def describe_busy_remedy(*, nice_denied: bool) -> str:
+    """Return what the user of a busy computer can do.
+
+    nice_denied: whether nodes run without the priority that their launch file requires.
+    """
+    if not nice_denied:
+        return BUSY_REMEDY
+    return (
+        f"{BUSY_REMEDY}; with the capability CAP_SYS_NICE, the launcher can give the simulated "
+        "arms priority"
+    )
 
 
 def describe_busy(host: HostStatus) -> str:

@@ -93,6 +93,13 @@ class NodeNote(Enum):
         "A command was outside a limit and was not sent. Run `flexsheet arms reset`, and report "
         "this error with a recording.",
     )
+    SKEWED_EDGE = (
+        "the edge is skewed by",
+        BUSY_FIRST
+        + "Then check whether one arm has stopped or lags (`flexsheet arms status`), and "
+        "whether the bases are calibrated (docs/set-up-arms.md). After a fault, run "
+        "`flexsheet arms reset`.",
+    )
     JOINT_RANGE = (
         "joint out of range",
         "The controller refused a joint angle. Compare its limits with `arms` of the scene.",
@@ -249,8 +256,9 @@ SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "camera_moved": "Fasten the camera, and calibrate its pose again (docs/set-up-camera.md).",
     "cameras_misaligned": "Fasten both cameras and lenses, and run `flexsheet calibrate stereo`.",
     "marker_offset": "Put the marker back where it was, or calibrate its offset again.",
-    "servo_lag": "The measured lag is used. Check the payload and filters of the arm, or set "
-    "`servo_lag_s` of its bridge to the measured lag.",
+    "servo_lag": BUSY_FIRST + "An overloaded computer is the usual cause with simulated arms. For "
+    "a real arm, check its payload and its controller's filters. The measured lag is used; "
+    "`servo_lag_s` of the bridge sets the expected one.",
     "sheet_stiffness": "Set `sheet.young_modulus_pa` of the scene to the calibrated value over the "
     "thickness, or calibrate the sheet again.",
     "arm_not_following": "Check the arm for a collision, its load, and the backlash of its gears.",

@@ -698,6 +698,11 @@ class HostStatus(Message):
     cpu: CpuPressure | None = Field(
         default=None, description="None: the system does not measure it, or no node runs yet"
     )
+    nice_denied: bool = Field(
+        default=False,
+        description="true: the user may not set a `nice` of the launch file, so that nodes run "
+        "without their priority",
+    )
 
 
 PathJoin = Literal["rounded_lines", "spline"]

@@ -295,6 +295,16 @@ async def test_the_node_receives_arming_and_reports_its_state() -> None:
     await node.close()
 
 
+def test_the_laboratory_uses_the_interface_of_the_arms_of_its_scene() -> None:
+    plan = load_graph(SCENE_FILE.parent.parent / "lab.yaml")
+    scene = plan.scene_message()
+    assert scene is not None
+    assert {scene.arms.left.model.name, scene.arms.right.model.name} == {"rv-1a"}
+    bridges = plan.nodes_of_type("arm_bridge")
+    found = {(one.parameters["driver"], one.parameters["port"]) for one in bridges}
+    assert found == {("mxt", 10000)}
+
+
 def test_real_arms_need_arming_and_the_demos_do_not() -> None:
     folder = SCENE_FILE.parent.parent
     for name, expected in (("lab.yaml", "manual"), ("demo.yaml", "auto")):

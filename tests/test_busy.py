@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from flexsheet.launch.running.cpu import MAX_WAIT_RATIO, WINDOW_S, CpuWatch
-from flexsheet.messages.busy import describe_busy, is_busy
+from flexsheet.messages.busy import describe_busy, describe_busy_remedy, is_busy
 from flexsheet.messages.types import CpuPressure, HostStatus, ProgramCpu
 
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -77,6 +77,16 @@ def test_a_busy_computer_names_who_waits_and_who_runs(kernel: ProcFiles) -> None
     assert [one.cores for one in found.programs] == pytest.approx([1.5, 0.3, 0.2])
 
 
+def test_a_wait_that_began_before_the_window_is_at_most_all_of_the_window(
+    kernel: ProcFiles,
+) -> None:
+    """The kernel counts a wait of 8 s when it ends."""
+    run(kernel, 10, left_s=0.0, right_s=0.0)
+    found = run(kernel, 1, left_s=8.0, right_s=0.0)
+    assert found is not None
+    assert (found.node, found.wait_ratio) == ("left", 1.0)
+
+
 def test_what_is_long_past_does_not_count(kernel: ProcFiles) -> None:
     run(kernel, 10, left_s=0.9, right_s=0.9)
     found = run(kernel, int(WINDOW_S) + 1, left_s=0.0, right_s=0.0)
@@ -118,6 +128,12 @@ def test_a_busy_computer_is_described_by_node_and_programs() -> None:
         "the computer main is busy: twin_arms waits for a processor 61% of the time; "
         "cores in use: chromium 1.3, renderer 0.4"
     )
+
+
+def test_only_nodes_without_their_priority_are_advised_to_get_it() -> None:
+    assert "end other programs" in describe_busy_remedy(nice_denied=False)
+    assert "priority" not in describe_busy_remedy(nice_denied=False)
+    assert "CAP_SYS_NICE" in describe_busy_remedy(nice_denied=True)
 
 
 def test_where_waiting_is_not_measured_the_load_decides() -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -19,6 +21,7 @@ import numpy as np
 import pytest
 
 from flexsheet.launch import cli
+from flexsheet.launch.commands.session import describe_output
 from flexsheet.launch.running import runs
 from flexsheet.messages.bag import BagReader, BagWriter
 from flexsheet.messages.base import Header
@@ -354,7 +357,31 @@ def test_status_shows_rates_of_all_nodes(flexsheet: Command, running: Path) -> N
     assert set(rows) >= {"beacon", "listener", "recorder"}
     assert {port["topic"] for port in rows["beacon"]["outputs"]} >= {"twin/finger", "status"}
     assert printed.json()["self_checks"] == []
-    assert "twin/finger" in flexsheet("status").out
+    shown = " ".join(flexsheet("status").out.split())
+    assert re.search(r"twin/finger \d+ Hz", shown)
+    assert "status " not in shown
+
+
+def test_status_shows_no_rate_that_has_no_meaning() -> None:
+    port = {"topic": "frame", "rate_hz": 0.0, "messages": 1}
+    assert describe_output(port) == "frame"
+    assert describe_output({**port, "messages": 2}) == "frame 0 Hz"
+    assert describe_output({**port, "topic": "scene", "messages": 9}) == "scene"
+
+
+def test_launch_prints_the_address_of_the_console_once(
+    flexsheet: Command, runs_root: Path, tmp_path: Path
+) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    values = {"scene": str(Path("launch/scenes/rigid-plane.yaml").resolve()), **GRAPH}
+    printed = flexsheet(
+        "launch", write(tmp_path, values), "--console",
+        "--set", f"console.page_port={port}", "--duration", "0.1",
+    )  # fmt: skip
+    assert printed.code == 0, printed.err
+    assert printed.err.count(f"console: http://127.0.0.1:{port}/") == 1
 
 
 def test_logs_print_the_log_of_a_node(flexsheet: Command, running: Path) -> None:

@@ -185,6 +185,18 @@ FAULTS: dict[str, tuple[Any, tuple[str, str, str], str]] = {
             NodeProcess(name="arm_left_bridge", state="exited", restarts=2, hangs=0),)),
         ("left", "nodes", "failed"), "log",
     ),
+    "starting": (
+        lambda v: changed(v["left"], nodes=(
+            NodeProcess(name="arm_left_bridge", state="starting", restarts=0, hangs=0),)),
+        ("left", "nodes", "warning"), "wait",
+    ),
+    "priority": (
+        lambda v: changed(
+            v["left"], nice_denied=True,
+            cpu=CpuPressure(busy=True, wait_ratio=0.6, node="arm_left_bridge"),
+        ),
+        ("left", "load", "warning"), "CAP_SYS_NICE",
+    ),
     "device": (
         lambda v: changed(v["main"], missing_devices=("/dev/video0",)),
         ("main", "devices", "failed"), "cable",

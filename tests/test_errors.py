@@ -68,6 +68,7 @@ def test_every_cause_of_a_self_check_has_a_finding_and_a_remedy() -> None:
         ("The sheet holds its pose: the measured fingertip is too old.", "fingertip_too_old"),
         ("The left arm reports: waits for the arm to stand still.", "arm-stands-still"),
         ("left arm: fault (arm: joint out of range)", "joint-range"),
+        ("measured: the edge is skewed by 14.3 degrees relative to the line", "skewed-edge"),
         ("the handler of a message failed: UnreachableError: no joint angles", "unreachable"),
         (f'topic "arm_left": host left {NodeNote.KEY_REFUSED.phrase}', "key-refused"),
         ('unknown topic "fingr"; did you mean "finger"?', "unknown-topic"),

@@ -249,6 +249,21 @@ async def test_a_node_that_is_not_ready_in_time_is_ended(tmp_path: Path, runs_ro
     assert_nothing_left(runs_root)
 
 
+async def test_a_node_that_waits_for_a_processor_may_start_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
+    monkeypatch.setattr(ProcessorTime, "read", lambda process: starved)
+    restart = {"policy": "never"}
+    late = beacon(parameters={"ready_after_s": 2.0}, start_deadline_s=0.3, restart=restart)
+    printed: list[str] = []
+    plan = plan_of(tmp_path, beacon=late)
+    async with RunningGraph(plan, report=lambda node, line: printed.append(line)) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        assert graph.restarts == {"beacon": 0}
+    assert sum("beacon is not ready yet: it waited" in line for line in printed) == 1
+
+
 @pytest.mark.alone
 async def test_a_hung_node_is_killed_with_a_stack_trace_and_restarted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -38,6 +38,15 @@ def test_a_nice_launcher_allows_more(monkeypatch: pytest.MonkeyPatch) -> None:
     assert min_nice_step() == -5
 
 
+def test_nodes_of_a_launcher_with_their_priority_lack_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    allow(monkeypatch, capable=False, limit=0)
+    own = min(node.nice for node in DEMO.nodes.values())
+    monkeypatch.setattr(os, "getpriority", lambda which, who: own)
+    assert describe_nice_problem(list(DEMO.nodes.values())) is None
+
+
 def test_a_missing_permission_for_priority_is_reported_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -50,6 +59,17 @@ def test_a_missing_permission_for_priority_is_reported_once(
     assert "arm_left_bridge" in problem
     assert "renderer" not in problem
     assert "\n" not in problem
+
+
+@pytest.mark.parametrize(("user", "remedy"), [(0, "CAP_SYS_NICE"), (1000, "start as root")])
+def test_root_is_not_advised_to_become_root(
+    monkeypatch: pytest.MonkeyPatch, user: int, remedy: str
+) -> None:
+    allow(monkeypatch, capable=False, limit=0)
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    problem = describe_nice_problem(list(DEMO.nodes.values()))
+    assert problem is not None
+    assert [one for one in ("CAP_SYS_NICE", "start as root") if one in problem] == [remedy]
 
 
 def test_what_the_arms_wait_for_goes_before_all_else_in_the_demo() -> None:

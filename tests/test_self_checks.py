@@ -17,7 +17,7 @@ import pytest
 from flexsheet.launch.health.doctor_hosts import check_apparatus
 from flexsheet.launch.health.probe import HostProbe, Reachability
 from flexsheet.launch.plans.plan import load_graph, load_scene
-from flexsheet.messages.notes import SELF_CHECK_REMEDIES
+from flexsheet.messages.notes import BUSY_FIRST, SELF_CHECK_REMEDIES
 from flexsheet.messages.sheet_calibration import Fitted, SheetCalibration
 from flexsheet.messages.types import SelfCheck, Status, StereoPair
 from flexsheet.nodes.arm_bridge.self_checks import ServoCheck
@@ -334,6 +334,7 @@ def test_doctor_and_console_show_the_cause_with_its_remedy() -> None:
     (finding,) = check_apparatus(probe, [])
     assert (finding.check, finding.state) == ("self-check", "warning")
     assert finding.remedy == SELF_CHECK_REMEDIES["servo_lag"]
+    assert finding.remedy.startswith(BUSY_FIRST)
     fine = status.model_copy(
         update={"self_checks": (check.model_copy(update={"suspected": False}),)}
     )

@@ -401,6 +401,10 @@ async def test_frames_come_on_a_fixed_grid_and_missed_ones_are_counted(scene: Sc
         await sent.until("twin/stereo", 5)
         clock.ahead_ns += 200_000_000
         frames = await sent.until("twin/stereo", 12)
+        assert node.note == f"{node.missed_frames} frames missed"
+        node.path_label = "stroke"
+        await sent.until("twin/stereo", 15)
+        assert node.note == f'path "stroke", {node.missed_frames} frames missed'
     finally:
         await node.close()
     period_ns = round(1e9 / scene.camera.rate_hz)

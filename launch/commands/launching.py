@@ -30,7 +30,7 @@ from flexsheet.launch.commands.output import (
     print_table,
     words,
 )
-from flexsheet.nodes import node_class
+from flexsheet.nodes import NodeRole, node_class
 from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
@@ -124,10 +124,25 @@ def launch(
     def ready(run: Run) -> None:
         if as_json:
             print_json_line(describe_run(plan, run, host))
+        for node in plan.nodes_on(host):
+            # The launcher does not know a free port that the console chooses (0).
+            if (
+                node.role is NodeRole.CONSOLE
+                and node.parameters["page_port"]
+                and node.name not in (without or ())
+            ):
+                words.print(f"console: {page_url(node)}")
         start_loop_check(plan, host)
 
     work = run_graph(plan, host, duration, without=without or (), when_ready=ready)
     raise typer.Exit(asyncio.run(work))
+
+
+def page_url(console: ResolvedNode) -> str:
+    """Return the address of the page of a console with a fixed port."""
+    address = console.parameters["address"]
+    host = f"[{address}]" if ":" in address else address
+    return f"http://{host}:{console.parameters['page_port']}/"
 
 
 def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:

@@ -90,7 +90,9 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
     else:
         words.print(f"{plan.launch_file}, run {found.directory}")
         for row in rows:
-            row["publishes"] = [f"{one['topic']} {one['rate_hz']:.0f} Hz" for one in row["outputs"]]
+            row["publishes"] = [
+                describe_output(one) for one in row["outputs"] if one["topic"] != "status"
+            ]
             for name in ("inputs", "outputs", "errors"):
                 del row[name]
         print_rows(rows, as_json=False)
@@ -144,6 +146,16 @@ def _describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
         "errors": status.errors,
         "note": status.last_error if status.state == "degraded" else status.note,
     }
+
+
+def describe_output(port: dict[str, Any]) -> str:
+    """Return the topic of an output, with its rate if the topic is published periodically."""
+    from flexsheet.messages.topics import find_topic
+
+    topic = find_topic(port["topic"])
+    if topic.rate_hz is None or port["messages"] < 2:
+        return topic.name
+    return f"{topic.name} {port['rate_hz']:.0f} Hz"
 
 
 def _list_suspicions(statuses: dict[str, Status]) -> list[dict[str, Any]]:

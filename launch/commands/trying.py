@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.launching import describe_run, run_graph, start_loop_check
+from flexsheet.launch.commands.launching import describe_run, page_url, run_graph, start_loop_check
 from flexsheet.launch.commands.options import (
     DEMO,
     ApparatusOption,
@@ -66,8 +66,7 @@ def try_it(
     )
     with keyboard_interrupts(), progress_words() as progress:
         precompute_graph(plan, progress)
-    console = plan.nodes["console"].parameters
-    url = f"http://{console['address']}:{console['page_port']}/"
+    url = page_url(plan.nodes["console"])
 
     def ready(run: Run) -> None:
         if as_json:

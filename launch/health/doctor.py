@@ -17,8 +17,9 @@ from flexsheet.launch.health.opengl import OPENGL_REMEDY, find_opengl_problem
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.cpu import CpuWatch
+from flexsheet.launch.running.priority import min_node_nice
 from flexsheet.launch.running.runs import find_orphans, is_free, list_live_runs, root
-from flexsheet.messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressure
+from flexsheet.messages.busy import MAX_LOAD_RATIO, describe_busy_remedy, describe_pressure
 from flexsheet.messages.notes import NodeNote
 
 DEMO = Path(__file__).parent.parent / "demo.yaml"
@@ -84,9 +85,9 @@ def check_load() -> Finding:
     else:
         text, busy = describe_pressure(pressure), pressure.busy
     if busy:
-        return Finding(
-            "load", "warning", f"this computer {NodeNote.COMPUTER_BUSY.phrase} {text}", BUSY_REMEDY
-        )
+        what = f"this computer {NodeNote.COMPUTER_BUSY.phrase} {text}"
+        remedy = describe_busy_remedy(nice_denied=min_node_nice() >= 0)
+        return Finding("load", "warning", what, remedy)
     return Finding("load", "ok", text)
 
 

@@ -31,7 +31,7 @@ from flexsheet.launch.running.host import (
 )
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
-from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
+from flexsheet.messages.busy import describe_busy, describe_busy_remedy, describe_pressure, is_busy
 from flexsheet.messages.notes import SELF_CHECK_REMEDIES, NodeNote, describe_self_check
 from flexsheet.messages.scene import Scene, shows_check_marks
 from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
@@ -323,12 +323,16 @@ def _check_clocks(
 def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
     assert probe.status is not None
     nodes = probe.status.nodes
-    missing = [one.name for one in nodes if one.state != "ready"]
+    ended = [one.name for one in nodes if one.state == "exited"]
+    starting = [one.name for one in nodes if one.state == "starting"]
     restarted = [f"{one.name} {one.restarts}" for one in nodes if one.restarts]
     remedy = f"see {probe.status.run}/logs in the folder of runs on {probe.host}"
     finding = partial(HostFinding, probe.host, "nodes")
-    if missing:
-        return finding("failed", f"these nodes are not ready: {', '.join(missing)}", remedy)
+    if ended:
+        return finding("failed", f"these nodes have ended: {', '.join(ended)}", remedy)
+    if starting:
+        what = f"these nodes are still starting: {', '.join(starting)}"
+        return finding("warning", what, f"wait some seconds; otherwise {remedy}")
     if restarted:
         what = f"{len(nodes)} nodes are ready; restarts: {', '.join(restarted)}"
         return finding("warning", what, remedy)
@@ -468,10 +472,11 @@ def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
 
 def _check_load(status: HostStatus) -> HostFinding:
     if is_busy(status):
-        return HostFinding(status.host, "load", "warning", describe_busy(status), BUSY_REMEDY)
+        remedy = describe_busy_remedy(nice_denied=status.nice_denied)
+        return HostFinding(status.host, "load", "warning", describe_busy(status), remedy)
     what = f"load {status.load_ratio:.2f} per core"
     if status.cpu is not None:
-        what += f"; {status.cpu.node} waits for a processor {status.cpu.wait_ratio:.0%} of the time"
+        what += f"; {describe_pressure(status.cpu)}"
     return HostFinding(status.host, "load", "ok", what)
 
 

@@ -70,8 +70,9 @@ class CpuWatch:
         waited_s = {pid: waited for pid, waited in counted.items() if waited is not None}
         while self._history and self._history[0].time_s < now_s - WINDOW_S:
             self._history.popleft()
+        # The kernel counts a wait when it ends, also the part of it before the window.
         ratios = {
-            name: (waited_s[pid] - before.waited_s[pid]) / (now_s - before.time_s)
+            name: min(1.0, (waited_s[pid] - before.waited_s[pid]) / (now_s - before.time_s))
             for name, pid in watched.items()
             if pid in waited_s and (before := self._first_with(pid)) and before.time_s < now_s
         }

@@ -23,9 +23,10 @@ from flexsheet.launch.plans.hosts import clock_node, launcher_on
 from flexsheet.launch.plans.plan_model import ArmingMode, ResolvedGraph, ResolvedNode, tools_on
 from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuWatch
 from flexsheet.launch.running.estop_file import EStopFile
+from flexsheet.launch.running.priority import list_denied
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Handler, Publisher, Source, Subscriber
-from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
+from flexsheet.messages.busy import describe_busy, describe_busy_remedy, is_busy
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from flexsheet.messages.notes import NodeNote
@@ -120,6 +121,7 @@ class HostAgent:
         nodes = plan.nodes_on(host)
         self._devices, self._folder = list_device_files(nodes), find_recording_folder(nodes)
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
+        self._nice_denied = bool(list_denied(nodes))
 
     def start(self) -> None:
         """Subscribe to e-stops and start to publish.  Requires a running event loop."""
@@ -313,7 +315,8 @@ class HostAgent:
         began, self._was_busy = busy and not self._was_busy, busy
         if began and now_ns >= self._busy_reported_ns + BUSY_REPORT_PERIOD_S * 1e9:
             self._busy_reported_ns = now_ns
-            self._on_problem(f"{describe_busy(status)}; {BUSY_REMEDY}")
+            remedy = describe_busy_remedy(nice_denied=status.nice_denied)
+            self._on_problem(f"{describe_busy(status)}; {remedy}")
 
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)
@@ -347,6 +350,7 @@ class HostAgent:
             else tuple(HostKey(host=name, key=key) for name, key in self._keys.public.items()),
             estop=None if self._latched is None else self._latched.reason,
             cpu=self._cpu.update(watched, pids),
+            nice_denied=self._nice_denied,
         )
 
 

@@ -29,13 +29,29 @@ def _has_cap_sys_nice() -> bool:
     return bool(int(effective, 16) >> CAP_SYS_NICE & 1)
 
 
+def min_node_nice() -> int:
+    """Return the minimum `nice` of a node that the user may set or that this process has."""
+    return min(min_nice_step(), os.getpriority(os.PRIO_PROCESS, 0))
+
+
+def list_denied(nodes: Sequence[ResolvedNode]) -> list[str]:
+    """Return the names of the nodes that cannot get their niceness."""
+    minimum = min_node_nice()
+    return [node.name for node in nodes if node.nice < minimum]
+
+
 def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
     """Describe the nodes whose niceness is not permitted; return None if there are none."""
-    minimum = min_nice_step()
-    names = [node.name for node in nodes if node.nice < minimum]
+    names = list_denied(nodes)
     if not names:
         return None
+    # Root lacks the capability in most containers.
+    remedy = (
+        "give the container the capability CAP_SYS_NICE"
+        if os.geteuid() == 0
+        else "start as root or set `nice` in /etc/security/limits.conf"
+    )
     return (
-        f"{', '.join(names)}: this user may not set nice below {minimum}, so these nodes do not "
-        "get their priority; start as root or set `nice` in /etc/security/limits.conf"
+        f"{', '.join(names)}: this user may not set nice below {min_node_nice()}, so these nodes "
+        f"do not get their priority; {remedy}"
     )

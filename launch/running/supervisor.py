@@ -623,12 +623,7 @@ class RunningGraph:
     async def _run_once(self, process: ResolvedProcess) -> str | None:
         """Run a process until it ends; return its failure as text, or None if there is no error."""
         child = await self._spawn(process)
-        await asyncio.wait(
-            (child.ready, child.exited),
-            timeout=process.start_deadline_s,
-            return_when=asyncio.FIRST_COMPLETED,
-        )
-        late = not child.ready.done() and not child.exited.done()
+        late = await self._is_late(child, process)
         if late:
             child.signal(signal.SIGKILL)
         elif child.ready.done():
@@ -650,6 +645,25 @@ class RunningGraph:
             return f"{missing}; its log contains the call stacks"
         return describe_exit(code)
 
+    async def _is_late(self, child: Child, process: ResolvedProcess) -> bool:
+        """Wait until a process is ready, exits, or exceeds its start deadline.
+
+        Return whether it exceeded the deadline. Time in which it waited for a processor core does
+        not count.
+        """
+        on_starved = partial(self._report_starved, f"{process.name} is not ready yet")
+        # A process sends its first heartbeat when it is ready.
+        deadline = asyncio.ensure_future(
+            child.wait_until_silent(process.start_deadline_s, on_starved)
+        )
+        try:
+            await asyncio.wait(
+                (child.ready, child.exited, deadline), return_when=asyncio.FIRST_COMPLETED
+            )
+        finally:
+            deadline.cancel()
+        return not child.ready.done() and not child.exited.done()
+
     def _set_exit_code(self, process: ResolvedProcess, code: int) -> None:
         self.exit_codes.update(dict.fromkeys((node.name for node in process.nodes), code))
 
@@ -658,14 +672,9 @@ class RunningGraph:
         liveness_s = process.settings.liveness_s
         if liveness_s is None:
             return False
-
-        def on_starved(waited_s: float) -> None:
-            self._report(
-                LAUNCHER,
-                f"{process.name} sends no heartbeat but does not hang: it waited {waited_s:.1f} s "
-                "for a processor core; this computer is overloaded, run fewer programs on it",
-            )
-
+        on_starved = partial(
+            self._report_starved, f"{process.name} sends no heartbeat but does not hang"
+        )
         silence = asyncio.ensure_future(child.wait_until_silent(liveness_s, on_starved))
         try:
             await asyncio.wait((silence, child.exited), return_when=asyncio.FIRST_COMPLETED)
@@ -675,6 +684,13 @@ class RunningGraph:
         if hangs:
             child.end_hanging()
         return hangs
+
+    def _report_starved(self, what: str, waited_s: float) -> None:
+        self._report(
+            LAUNCHER,
+            f"{what}: it waited {waited_s:.1f} s for a processor core; this computer is "
+            "overloaded, run fewer programs on it",
+        )
 
     async def _spawn(self, process: ResolvedProcess) -> Child:
         assert self._lifeline is not None  # made before any supervisor

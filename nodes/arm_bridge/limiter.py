@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.notes import NodeNote
 from flexsheet.nodes.models.motion import BRAKE_FRACTION, closing_speed
 from flexsheet.nodes.models.rigid import angle_between
 from flexsheet.nodes.models.sheet import edge_force_n
@@ -361,8 +362,8 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
     skew_rad = angle_between(across if left else -across, edge[:3, 0])
     if not skew_rad <= limits.max_twist_rad:
         return (
-            f"the edge is skewed by {np.degrees(skew_rad):.1f} degrees relative to the line "
-            f"between both edges, maximum {np.degrees(limits.max_twist_rad):.1f}"
+            f"{NodeNote.SKEWED_EDGE.phrase} {np.degrees(skew_rad):.1f} degrees relative to the "
+            f"line between both edges, maximum {np.degrees(limits.max_twist_rad):.1f}"
         )
     return None
 

@@ -341,7 +341,8 @@ class TwinFingerNode(Node):
         read_out_ns = start_ns + self.exposure_ns + round(1e9 * self._read_out_s)
         await self._sleep_until(read_out_ns)
         self.twin__stereo.publish(pair, source_ns=middle_ns)
-        self.note = f'path "{self.path_label}", {self.missed_frames} frames missed'
+        path = f'path "{self.path_label}", ' if self.path_label else ""
+        self.note = f"{path}{self.missed_frames} frames missed"
         if self.parameters.hand == "coupled" and self.coupled is None:
             self.note = f"{self.note}; the force of the sheet on the finger is being computed"
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from flexsheet.launch.experiments.stroke import ARM_EVENTS
-from flexsheet.messages.busy import BUSY_REMEDY
 
 Gravity = Literal["bad", "doubtful"]
 
@@ -84,7 +83,7 @@ def _check_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Iterat
             text += "Overload is the probable cause of the delays. "
         often = host["busy_fraction"] > BRIEFLY_BUSY_FRACTION
         gravity: Gravity = "bad" if stopped or often else "doubtful"
-        yield SessionFinding(gravity, f"{text}What to do: {BUSY_REMEDY}.", "bag")
+        yield SessionFinding(gravity, f"{text}What to do: {host['busy_remedy']}.", "bag")
 
 
 MAX_TOPICS_LISTED = 10
