@@ -424,3 +424,23 @@ def _is_running(pid: int) -> bool:
         return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
         return False
+
+
+@pytest.mark.parametrize(("scene", "expected"), [("cylinder", [0.0045]), ("rigid-plane", [])])
+def test_the_table_of_the_soft_body_is_computed_before_its_configuration_runs(
+    scene: str, expected: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    computed: list[float] = []
+    where = "flexsheet.launch.methods.configurations"
+    for name in ("precompute_deflection_shapes", "precompute_force_table"):
+        monkeypatch.setattr(f"{where}.{name}", lambda *_: None)
+    monkeypatch.setattr(
+        f"{where}.precompute_soft_body", lambda _, spacing_m, *others: computed.append(spacing_m)
+    )
+    (finest,) = [
+        one
+        for one in list_configurations(load_scene(SCENES / f"{scene}.yaml"))
+        if one.name == "most exact"
+    ]
+    finest.prepare(load_scene(SCENES / f"{scene}.yaml"), lambda text: None)
+    assert computed == expected

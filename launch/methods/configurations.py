@@ -15,6 +15,7 @@ from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.precompute import (
     precompute_deflection_shapes,
     precompute_force_table,
+    precompute_soft_body,
 )
 from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
@@ -96,14 +97,17 @@ class Configuration:
         ]
 
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
-        """Compute and cache the tables of the sheet that the methods need.
+        """Compute and cache the tables that the methods need; that of a soft body takes minutes.
 
-        A missing table of the soft body is not computed; the linear method then replaces it.
+        Otherwise other methods would be measured, because nodes replace a missing table.
         """
         if self.methods.sheet_shape == "reduced_order" and scene.projector is not None:
             precompute_deflection_shapes(scene, None, progress)
         if self.methods.sheet_force == "table":
             precompute_force_table(scene, None, progress)
+        body = self.methods.soft_body
+        if body is not None and body.method == "nonlinear_table" and scene.object.material:
+            precompute_soft_body(scene, body.skin_spacing_m, None, None, progress)
 
     def describe(self) -> dict[str, Any]:
         """Return methods and parameters of the planner, for a trial in simulated time."""
