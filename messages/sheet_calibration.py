@@ -80,6 +80,11 @@ class SheetCalibration(Part):
     left_out: tuple[LeftOutRow, ...]
     residual_rms_ratio: NonNegative
     max_residual_ratio: NonNegative
+    residual_rms_sigmas: NonNegative | None = Field(
+        default=None,
+        description="rms of the residuals divided by their assumed standard deviations; null: "
+        "not computed",
+    )
     min_stretch_ratio: Positive
     max_stretch_ratio: Positive
     max_depth_m: Positive

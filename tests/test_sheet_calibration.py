@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from flexsheet.launch.calibration.sheet_fit import (
+    MAX_RMS_SIGMAS,
     MeasuredPush,
     SheetModelFitError,
     fit_sheet_model,
@@ -110,6 +112,58 @@ def test_errors_are_within_stated_deviations_without_outliers() -> None:
     ):
         assert abs(value - true) < 4.0 * deviation
         assert 0.0 < deviation < 0.2 * true
+
+
+FAULT_DEPTHS = (0.002, 0.004, 0.007, 0.012, 0.02, 0.03, 0.04, 0.05)
+
+
+def make_sheet_model(modulus: float = 1000.0, width: float = 0.24) -> ScaledSheetModel:
+    return make_model(
+        NOMINAL,
+        modulus_thickness_n_per_m=modulus,
+        slack_width_m=width,
+        cubic_ratio=1.0,
+        mooney_ratio=0.0,
+    )
+
+
+@pytest.mark.parametrize(("modulus", "width"), [(1000.0, 0.24), (500.0, 0.24), (1000.0, 0.243)])
+def test_a_correct_sheet_with_small_forces_is_not_doubted(modulus: float, width: float) -> None:
+    """The relative residual of a soft sheet is large, because noise dominates at small forces."""
+    law = make_sheet_model(modulus, width)
+    rows = pushes_of(law, depths=FAULT_DEPTHS, noise_n=0.01, edges=True)
+    fit = fit_sheet_model(rows, NOMINAL)
+    assert fit.rms_ratio > 0.05
+    assert fit.rms_sigmas < 0.8 * MAX_RMS_SIGMAS
+    verified = SheetPush(1.05, RADIUS), np.array([0.004, 0.016])
+    expected = law.evaluate(*verified).force_n
+    assert fit.law.evaluate(*verified).force_n == pytest.approx(expected, rel=0.03)
+
+
+def slip(rows: list[MeasuredPush]) -> list[MeasuredPush]:
+    """Replace the last rows by those of a sheet of which a clamp has released 4 mm."""
+    loose = pushes_of(make_sheet_model(width=0.244), depths=FAULT_DEPTHS, noise_n=0.005, edges=True)
+    kept = round(0.85 * len(rows))
+    return rows[:kept] + loose[kept:]
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        slip,
+        lambda rows: [replace(one, force_n=one.force_n**0.9) for one in rows],
+        lambda rows: [replace(one, force_n=1.1 * one.force_n) for one in rows],
+        lambda rows: [replace(one, force_n=one.force_n + 0.05) for one in rows],
+        lambda rows: [replace(one, depth_m=one.depth_m + 1e-3) for one in rows],
+        lambda rows: [replace(one, edge_distance_m=one.edge_distance_m + 0.03) for one in rows],
+    ],
+    ids=["slipping clamp", "other force law", "gain", "zero of the gauge", "depth", "edges"],
+)
+def test_a_wrong_sheet_or_gauge_is_doubted(fault: Any) -> None:
+    """The gain is detected only because another sensor measures the edge forces."""
+    good = pushes_of(make_sheet_model(), depths=FAULT_DEPTHS, noise_n=0.005, edges=True)
+    assert fit_sheet_model(good, NOMINAL).rms_sigmas < 0.5 * MAX_RMS_SIGMAS
+    assert fit_sheet_model(fault(good), NOMINAL).rms_sigmas > 1.1 * MAX_RMS_SIGMAS
 
 
 def test_mooneys_fraction_is_found_at_large_stretch() -> None:

@@ -35,6 +35,13 @@ OUTLIER_SIGMAS = 5.0
 """The residual above which a measured push is an outlier, in standard deviations. The fit is
 repeated without outliers."""
 
+MAX_RMS_SIGMAS = 1.0
+"""The maximum rms residual of a valid fit, in assumed standard deviations.
+
+Above it, noise and model error exceed the values above, and the predicted force error is too small.
+A relative residual is no criterion: noise dominates it at small forces, which are not felt.
+"""
+
 MAX_RELATIVE_DEVIATION = 0.5
 """The maximum relative standard deviation of a parameter that counts as determined."""
 
@@ -71,6 +78,8 @@ class SheetModelFit:
     standard_deviations: fitted parameters, in the same order. used: mask (n,) of the rows that are
     not outliers. residual_ratio: measured force divided by fitted force, minus one (n,). rms_ratio,
     worst_ratio: rms and maximum residual ratio of the used rows with forces above the noise.
+    rms_sigmas: rms of the residuals of all rows, divided by their assumed standard deviations; the
+    larger of the values for contact and edge forces. Outliers count as OUTLIER_SIGMAS.
     """
 
     law: ScaledSheetModel
@@ -81,6 +90,7 @@ class SheetModelFit:
     residual_ratio: Floats
     rms_ratio: float
     worst_ratio: float
+    rms_sigmas: float
     nominal_width_m: float
 
 
@@ -188,7 +198,8 @@ def fit_sheet_model(
         )
 
     def residuals(numbers: Floats, used: Bools) -> Floats:
-        rows = _residuals(build_model(numbers), pushes, nominal.width_m, used)
+        contact, edge = _residuals(build_model(numbers), pushes, nominal.width_m)
+        rows = np.concatenate([contact[used], edge[used & np.isfinite(edge)]])
         if not with_prior:
             return rows
         width_sigmas = numbers[1] * nominal.width_m / PRIOR_WIDTH_M
@@ -206,9 +217,7 @@ def fit_sheet_model(
         )
         start[:size] = solved.x
         if loss == "soft_l1":
-            error = np.abs(
-                _residuals(build_model(solved.x), pushes, nominal.width_m, used, fold=True)
-            )
+            error = np.fmax(*np.abs(_residuals(build_model(solved.x), pushes, nominal.width_m)))
             used = error <= OUTLIER_SIGMAS * max(1.0, 1.4826 * float(np.median(error)))
             if used.sum() < 2 * size:
                 raise SheetModelFitError(
@@ -242,6 +251,7 @@ def fit_sheet_model(
     force = np.array([push.force_n for push in pushes])
     counted = used & (force > 3.0 * FORCE_NOISE_N)
     counted = counted if counted.any() else used
+    groups = np.clip(_residuals(law, pushes, nominal.width_m), -OUTLIER_SIGMAS, OUTLIER_SIGMAS)
     return SheetModelFit(
         law=law,
         names=names,
@@ -251,6 +261,9 @@ def fit_sheet_model(
         residual_ratio=ratio,
         rms_ratio=float(np.sqrt(np.mean(ratio[counted] ** 2))),
         worst_ratio=float(np.abs(ratio[counted]).max()),
+        rms_sigmas=max(
+            float(np.sqrt(np.nanmean(one**2))) for one in groups if np.isfinite(one).any()
+        ),
         nominal_width_m=nominal.width_m,
     )
 
@@ -271,32 +284,22 @@ def _predict(
     return forces, edges
 
 
-def _residuals(
-    law: SheetForceModel,
-    pushes: Sequence[MeasuredPush],
-    width_m: float,
-    used: Bools,
-    *,
-    fold: bool = False,
-) -> Floats:
-    """Return the weighted residuals of the pushes that `used` selects: contact and edge forces.
+def _residuals(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
+    """Return the residuals (2, n) of contact and edge forces, divided by their standard deviations.
 
-    The contact forces are first. fold: return instead the larger magnitude of both residuals of
-    every push (n,).
+    A residual is NaN if the edge force was not measured.
     """
     forces, edges = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
     measured_edges = np.array(
         [np.nan if push.edge_force_n is None else push.edge_force_n for push in pushes]
     )
-    force_error = (forces - measured) / np.hypot(FORCE_NOISE_N, MODEL_ERROR_RATIO * measured)
-    edge_error = (edges - measured_edges) / np.hypot(
-        EDGE_NOISE_N, MODEL_ERROR_RATIO * measured_edges
+    return np.stack(
+        [
+            (forces - measured) / np.hypot(FORCE_NOISE_N, MODEL_ERROR_RATIO * measured),
+            (edges - measured_edges) / np.hypot(EDGE_NOISE_N, MODEL_ERROR_RATIO * measured_edges),
+        ]
     )
-    if fold:
-        larger: Floats = np.fmax(np.abs(force_error), np.abs(edge_error))
-        return larger
-    return np.concatenate([force_error[used], edge_error[used & np.isfinite(measured_edges)]])
 
 
 def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:

@@ -240,6 +240,7 @@ def make_calibration(
         ),
         residual_rms_ratio=fit.rms_ratio,
         max_residual_ratio=fit.worst_ratio,
+        residual_rms_sigmas=fit.rms_sigmas,
         min_stretch_ratio=min(stretches),
         max_stretch_ratio=max(stretches),
         max_depth_m=max(push.depth_m for push in pushes),
@@ -294,6 +295,7 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
                 "left_out": [one.model_dump() for one in calibration.left_out],
                 "residual_rms_ratio": calibration.residual_rms_ratio,
                 "max_residual_ratio": calibration.max_residual_ratio,
+                "residual_rms_sigmas": calibration.residual_rms_sigmas,
                 "table": calibration.table is not None,
                 **{name: one.model_dump() for name, one in fitted.items()},
             }
@@ -321,7 +323,8 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
             (
                 "residuals",
                 f"{100 * calibration.residual_rms_ratio:.1f} % rms, "
-                f"{100 * calibration.max_residual_ratio:.1f} % max",
+                f"{100 * calibration.max_residual_ratio:.1f} % max, "
+                f"{calibration.residual_rms_sigmas:.2f} standard deviations",
             ),
             ("table", "none" if calibration.table is None else calibration.table.ratios.shape),
         ]

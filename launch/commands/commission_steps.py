@@ -261,7 +261,7 @@ class Laboratory:
         )
 
     def calibrate_sheet(self, lab: Commissioning) -> StepResult:
-        from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
+        from flexsheet.launch.calibration.sheet_fit import MAX_RMS_SIGMAS, SheetModelFitError
         from flexsheet.launch.calibration.sheet_rows import read_rows
         from flexsheet.messages.sheet_calibration import save_sheet_calibration
 
@@ -297,11 +297,13 @@ class Laboratory:
             }
         )
         save_sheet_calibration(found, lab.folder / SHEET)
+        assert found.residual_rms_sigmas is not None
         return StepResult(
-            residual=100.0 * found.residual_rms_ratio,
-            unit="%",
-            limit=5.0,
-            advice="Tighten the clamps, and push more slowly; remove rows with a sliding finger.",
+            residual=found.residual_rms_sigmas,
+            unit="sd",
+            limit=MAX_RMS_SIGMAS,
+            advice="Tighten the clamps, zero the force gauge, and push more slowly; remove rows "
+            "with a sliding finger.",
             uncertainty={
                 "modulus_percent": 100.0 * modulus.standard_deviation / modulus.value,
                 "slack_width_mm": 1e3 * found.slack_width_m.standard_deviation,
