@@ -385,6 +385,7 @@ class Frame(Message):
     correction: Correction
     stereo: StereoMode
     label: str
+    pattern: Pattern = Field(default="object", description="pattern of the display settings")
     eyes_world_m: EyePair = Field(description="positions of the left and right eye, m")
     world_from_sheet: Transform
     pushed_point_world_m: Vector3

@@ -46,7 +46,8 @@ class StepName(StrEnum):
     edges: pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of
     the flanges. sheet: force model of the sheet. projector: pose and lens of the projector. marker:
     position of the marker on the finger. eyes: positions of the viewer's eyes. delays: servo lags
-    of the arms. verification: errors during a stroke of the finger.
+    of the arms, offset of the camera's timestamps, latency of the projector. verification: errors
+    during a stroke of the finger.
     """
 
     CAMERA = "camera"
@@ -296,8 +297,7 @@ def _now() -> str:
 
 MEASURED_IN_OPERATION = (
     "The actuation delay of each arm, the camera's rate and the age of its images are measured "
-    "while the graph runs. The positions of a head tracker replace the measured eyes. No step "
-    "measures the delay of the projector."
+    "while the graph runs. The positions of a head tracker replace the measured eyes."
 )
 
 

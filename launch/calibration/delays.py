@@ -270,7 +270,7 @@ def swing_sheet(
     return true, tuple(make_motion(rows, "edge") for rows in sheet.reported_rows)
 
 
-def _draw_exposures(
+def draw_exposures(
     scene: Scene, apparatus: Apparatus, end_ns: int, seed: int
 ) -> Iterable[tuple[int, int]]:
     """Yield timestamps and true times (ns) of simulated exposures."""
@@ -298,7 +298,7 @@ def simulate_stamp_offset(
     for number in range(len(SIDES)):
 
         def see(number: int = number) -> Iterable[tuple[int, StereoPair]]:
-            for stamp_ns, exposed_ns in _draw_exposures(
+            for stamp_ns, exposed_ns in draw_exposures(
                 scene, apparatus, int(true[0].times_ns[-1]), seed + number
             ):
 

@@ -49,7 +49,9 @@ from flexsheet.nodes.models.sheet import edge_force_n
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 if TYPE_CHECKING:
+    from flexsheet.launch.calibration.delays import MeasuredLag
     from flexsheet.launch.calibration.prediction import Knowledge
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
 
 STEREO, ARMS, SHEET, MARKER = "stereo.yaml", "arms.yaml", "sheet.yaml", "marker.yaml"
 BOARD = Board(kind="chessboard", columns=9, rows=6, square_m=0.025)
@@ -83,8 +85,9 @@ INSTRUCTIONS: dict[StepName, str] = {
     "--data marker=CSV; give the finger's radius with --finger-radius-mm",
     StepName.EYES: "align a bead with projected crosses, with one eye closed, record the positions "
     "of both, and give --data eyes=CSV",
-    StepName.DELAYS: "run `flexsheet experiment stroke --launch FOLDER/launch.yaml --json` with "
-    "the launch file of this folder, and give the bag that its output names with --data delays=BAG",
+    StepName.DELAYS: "run `flexsheet experiment stroke --switches 60 --launch FOLDER/launch.yaml "
+    "--json` with the launch file of this folder, and give the bag that its output names with "
+    "--data delays=BAG",
     StepName.VERIFICATION: "run `flexsheet experiment stroke --launch FOLDER/launch.yaml --json` "
     "with the launch file of this folder, and give its output with --data verification=JSON",
 }
@@ -477,13 +480,13 @@ class Laboratory:
 
     def measure_delays(self, lab: Commissioning) -> StepResult:
         from flexsheet.launch.calibration.delays import measure_in_simulation, read_delays
+        from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 
         scene, stereo = load_scene(lab.scene_copy), lab.find_file(STEREO)
         optics = None if stereo is None else load_calibration(stereo)
+        graph, added_s = load_graph(lab.launch_copy), 0.0
         if self.apparatus is None:
-            from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
-
-            added_s = NodeCalibrations.of(load_graph(lab.launch_copy)).stamp_offset_s
+            added_s = NodeCalibrations.of(graph).stamp_offset_s
             found = read_delays(self._find_data(StepName.DELAYS), scene, optics, added_s)
         else:
             found = measure_in_simulation(scene, self.apparatus, calibration=optics, seed=self.seed)
@@ -502,6 +505,13 @@ class Laboratory:
             measured["stamp_offset"] = stamp
             value = round(stamp.lag_s, 5)
             values.append(NodeValue(node_type="camera", parameter="stamp_offset_s", value=value))
+        if scene.projector is not None and graph.nodes_of_type("renderer"):
+            latency = self._measure_display_latency(scene, graph, stamp, added_s)
+            measured["display_latency"] = latency
+            value = round(max(latency.lag_s, 0.0), 4)
+            values.append(
+                NodeValue(node_type="renderer", parameter="display_latency_s", value=value)
+            )
         return StepResult(
             residual=1e3 * max(one.uncertainty_s for one in measured.values()),
             unit="ms",
@@ -511,6 +521,35 @@ class Laboratory:
             node_values=tuple(values),
             figures={f"{name}_ms": 1e3 * one.lag_s for name, one in measured.items()},
             covariances={} if stamp is None else {"stamp_s2": [[stamp.uncertainty_s**2]]},
+        )
+
+    def _measure_display_latency(
+        self, scene: Scene, graph: ResolvedGraph, stamp: MeasuredLag | None, added_s: float
+    ) -> MeasuredLag:
+        """Measure the time from the swap of a frame to the middle of its display.
+
+        stamp: stamp offset, from which the times in the data deviate; None: unknown. added_s: part
+        of it that the data contain.
+        """
+        from flexsheet.launch.calibration.delays import MeasuredLag
+        from flexsheet.launch.calibration.display_latency import (
+            estimate_display_latency,
+            read_switch_images,
+            simulate_switch_images,
+        )
+        from flexsheet.launch.calibration.prediction import STAMP_STD_S
+
+        if self.apparatus is None:
+            images = read_switch_images(self._find_data(StepName.DELAYS))
+        else:
+            images = simulate_switch_images(scene, self.apparatus, seed=self.seed)
+        change, stamp = estimate_display_latency(images), stamp or MeasuredLag(added_s, STAMP_STD_S)
+        given = graph.nodes_of_type("renderer")[0].parameters
+        # A window shows each frame until the next one. A simulated frame is displayed at once.
+        shown_s = 1.0 / given["rate_hz"] if given["output"] == "window" else 0.0
+        return MeasuredLag(
+            change.lag_s + stamp.lag_s - added_s + 0.5 * shown_s,
+            math.hypot(change.uncertainty_s, stamp.uncertainty_s),
         )
 
     def verify(self, lab: Commissioning) -> StepResult:

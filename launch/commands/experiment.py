@@ -121,6 +121,15 @@ def stroke(
             "the image, frame latencies are null. Not with several strokes or variants.",
         ),
     ] = None,
+    switches: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=1000,
+            help="Number of switches of the projected image between white and black after the "
+            "stroke. The bag then shows the latency of the projector. Not with several strokes.",
+        ),
+    ] = 0,
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -156,11 +165,18 @@ def stroke(
             _print_stroke_table(table)
         return
     from flexsheet.launch.experiments import stroke as experiment
-    from flexsheet.launch.experiments.run import make_stroke_procedure, run_experiment
+    from flexsheet.launch.experiments.run import (
+        chain_procedures,
+        make_stroke_procedure,
+        make_switch_procedure,
+        run_experiment,
+    )
 
     bag = make_result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
         procedure = make_stroke_procedure([seconds], progress)
+        if switches:
+            procedure = chain_procedures(procedure, make_switch_procedure(switches, progress))
         omitted = without or ()
         run_experiment(
             launch_file, given, bag, procedure, progress, apparatus=apparatus, without=omitted

@@ -13,6 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError, image, stroke
 from flexsheet.launch.experiments.driver import Driver, TableMethod
 from flexsheet.launch.plans.features import Feature
@@ -22,12 +24,15 @@ from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
-from flexsheet.messages.types import Correction, FingerPath, Shading
+from flexsheet.messages.types import Correction, Display, FingerPath, Shading
 from flexsheet.nodes.signals import handle_signals
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 RUNS = Path("runs")
 DELIVERY_S = 0.3
+SWITCH_SEED, SWITCH_INTERVAL_S = 1, (0.25, 0.4)
+"""The random seed of the times between two switches of the projected image, and their range (s).
+The times exceed the latency, and vary the phase between switches and exposures."""
 
 Progress = Callable[[str], None]
 Procedure = Callable[[Driver, Scene], Awaitable[None]]
@@ -158,6 +163,23 @@ def make_stroke_procedure(
         for duration in seconds:
             progress(f"stroke over 60° in {duration:g} s")
             await driver.follow(stroke.stroke_path(scene, duration))
+
+    return procedure
+
+
+def make_switch_procedure(count: int, progress: Progress) -> Procedure:
+    """Make a procedure that switches the projected image `count` times between white and black."""
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        random = np.random.default_rng(SWITCH_SEED)
+        progress(f"{count} switches of the projected image")
+        for number in range(count + 1):
+            driver.show(
+                Display(
+                    correction="two_pass", stereo="mono", pattern="white" if number % 2 else "black"
+                )
+            )
+            await asyncio.sleep(random.uniform(*SWITCH_INTERVAL_S))
 
     return procedure
 

@@ -142,6 +142,7 @@ class FrameRenderer:
             correction=shown.correction,
             stereo=shown.stereo,
             label=shown.label,
+            pattern=shown.pattern,
             eye=which,
             eyes_world_m=pair,
             world_from_sheet=sheet.world_from_sheet,

@@ -1,0 +1,182 @@
+"""Measure the latency of the projector with the stereo camera.
+
+The renderer switches the projected image between white and black at random times. The messages of
+its frames state these times, and the images of the sheet show the old or the new state. Each image
+therefore bounds the latency, which is estimated from all images together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.special import ndtr
+
+from flexsheet.launch.calibration.delays import MeasuredLag, draw_exposures
+from flexsheet.launch.experiments.run import SWITCH_INTERVAL_S
+from flexsheet.messages.apparatus import NOMINAL_DISPLAY_LATENCY_S, Apparatus
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.scene import Scene, require_projector
+from flexsheet.messages.types import Frame, StereoPair
+from flexsheet.nodes.twin.projector import LitSheet, sheet_poses
+from flexsheet.nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.truth import apply_apparatus
+
+MIN_SWITCHES = 20
+MAX_LATENCY_S = 0.15
+"""The maximum latency that is considered, in seconds."""
+
+STEP_S = 2e-4
+JITTERS_S = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
+ERROR_RATES = (0.003, 0.01, 0.03, 0.1, 0.2)
+"""The considered standard deviations of the times, and fractions of wrongly classified images."""
+
+MIN_CONTRAST = 3.0
+"""The minimum difference in brightness of the images of both states, in grey levels."""
+
+SIMULATED_SWITCHES, LEVELS = 60, 16
+"""The number of simulated switches, and of brightness levels of a partly lit exposure."""
+
+
+class DisplayLatencyError(FlexsheetError, ValueError):
+    """Raised for images from which the latency of the projector cannot be estimated."""
+
+    code = "display-latency-calibration"
+    remedy = "Let the camera see the lit sheet, and record a stroke with --switches 60."
+
+
+@dataclass(frozen=True, slots=True)
+class SwitchImage:
+    """An image after a switch of the projected image; times in seconds of one clock.
+
+    switched_s: time when the renderer showed the new state. start_s, end_s: exposure. is_new:
+    whether the image shows the new state.
+    """
+
+    switched_s: float
+    start_s: float
+    end_s: float
+    is_new: bool
+
+
+def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
+    """Estimate the time from a switch to the change of the light on the sheet.
+
+    An image shows the new state if the light changed before the middle of its exposure, apart from
+    errors of the times and wrongly classified images, whose rates are unknown. The result is mean
+    and standard deviation of the posterior distribution with uniform prior. Raises
+    DisplayLatencyError for too few switches and if the images do not show them.
+    """
+    switches = len({one.switched_s for one in images})
+    if switches < MIN_SWITCHES:
+        raise DisplayLatencyError(
+            f"{switches} switches of the projected image; at least {MIN_SWITCHES} are required"
+        )
+    start_s, end_s, switched_s = np.array(
+        [(one.start_s, one.end_s, one.switched_s) for one in images]
+    ).T
+    is_new = np.array([one.is_new for one in images])
+    ages_s = 0.5 * (start_s + end_s) - switched_s
+    late = ages_s > MAX_LATENCY_S
+    if late.sum() < MIN_SWITCHES or is_new[late].mean() < 0.5:
+        raise DisplayLatencyError(
+            f"only {int(is_new[late].sum())} of {int(late.sum())} images later than "
+            f"{1e3 * MAX_LATENCY_S:.0f} ms after a switch show the new state"
+        )
+    latencies_s = np.arange(0.0, MAX_LATENCY_S, STEP_S)
+    logs = []
+    for jitter_s in JITTERS_S:
+        deviations_s = np.hypot(jitter_s, (end_s - start_s) / np.sqrt(12.0))
+        new = ndtr((ages_s - latencies_s[:, None]) / deviations_s)
+        right = np.where(is_new, new, 1.0 - new)
+        logs += [np.log(rate + (1.0 - 2.0 * rate) * right).sum(axis=1) for rate in ERROR_RATES]
+    weights = np.exp(np.array(logs) - np.max(logs)).sum(axis=0)
+    weights /= weights.sum()
+    mean_s = float(weights @ latencies_s)
+    return MeasuredLag(mean_s, float(np.sqrt(weights @ (latencies_s - mean_s) ** 2)))
+
+
+def classify_images(
+    switches: Sequence[tuple[float, bool]], exposures: Iterable[tuple[float, float, float]]
+) -> list[SwitchImage]:
+    """Compare the brightness of images with the projected state, which is white or black.
+
+    switches: times (s) and whether the new state is white. exposures: start, end (s) and mean grey
+    level of each image. Raises DisplayLatencyError if the brightness of all images is similar.
+    """
+    times_s = np.array([at_s for at_s, _ in switches])
+    seen = [one for one in exposures if times_s[0] < 0.5 * (one[0] + one[1])]
+    seen = [one for one in seen if 0.5 * (one[0] + one[1]) < times_s[-1] + SWITCH_INTERVAL_S[0]]
+    black, white = np.quantile([one[2] for one in seen] or [0.0], (0.25, 0.75))
+    if white - black < MIN_CONTRAST:
+        raise DisplayLatencyError(
+            f"no switch is visible in {len(seen)} images: the grey levels of white and black "
+            f"differ by {white - black:.1f}, but at least {MIN_CONTRAST:g} are required"
+        )
+    images = []
+    for start_s, end_s, level in seen:
+        number = int(np.searchsorted(times_s, 0.5 * (start_s + end_s))) - 1
+        at_s, is_white = switches[number]
+        images.append(
+            SwitchImage(at_s, start_s, end_s, (level > 0.5 * (black + white)) == is_white)
+        )
+    return images
+
+
+def read_switch_images(bag: Path) -> list[SwitchImage]:
+    """Read the images of the switches from a bag; return none if it contains no switch."""
+    shown = [
+        (1e-9 * (message.swapped_ns or message.drawn_ns), message.pattern)
+        for _, message, _, _ in BagReader(bag, topics=["frame"])
+        if isinstance(message, Frame) and message.light_ns
+    ]
+    switches = [
+        (at_s, pattern == "white")
+        for (_, before), (at_s, pattern) in pairwise(shown)
+        if before != pattern and {before, pattern} == {"white", "black"}
+    ]
+    if not switches:
+        return []
+    exposures = (
+        (
+            1e-9 * header.source_ns - 0.5 * message.exposure_s,
+            1e-9 * header.source_ns + 0.5 * message.exposure_s,
+            float(message.left.mean()),
+        )
+        for _, message, header, _ in BagReader(bag, topics=["stereo"])
+        if isinstance(message, StereoPair)
+    )
+    return classify_images(switches, exposures)
+
+
+def simulate_switch_images(scene: Scene, apparatus: Apparatus, *, seed: int) -> list[SwitchImage]:
+    """Simulate images of the sheet while the projector of an apparatus switches.
+
+    The simulated projector shows a frame at once when its latency has passed.
+    """
+    random = np.random.default_rng((seed, 4))
+    true = apply_apparatus(scene, apparatus)
+    projector = require_projector(true)
+    size = projector.height_px, projector.width_px
+    patterns = [
+        np.full(size, round(255.0 * part), np.uint8) for part in np.linspace(0.0, 1.0, LEVELS + 1)
+    ]
+    lit = LitSheet(scene, make_true_camera(true.camera), projector, seed=seed)
+    levels = [float(image.mean()) for image in lit.pair(patterns, sheet_poses(1)[0])[0]]
+    switched_s = 1.0 + np.cumsum(random.uniform(*SWITCH_INTERVAL_S, SIMULATED_SWITCHES))
+    light_s = switched_s + NOMINAL_DISPLAY_LATENCY_S + apparatus.projector.latency_offset_s
+    half_s = 0.5 * scene.camera.exposure_s
+    instants_s = half_s * np.linspace(-1.0, 1.0, 2 * LEVELS + 1)[1::2]
+    exposures = []
+    for stamp_ns, exposed_ns in draw_exposures(
+        scene, apparatus, round(1e9 * (switched_s[-1] + 1.0)), seed
+    ):
+        is_white = np.searchsorted(light_s, 1e-9 * exposed_ns + instants_s) % 2
+        level = levels[int(is_white.sum())]
+        exposures.append((1e-9 * stamp_ns - half_s, 1e-9 * stamp_ns + half_s, level))
+    states = [(float(at_s), number % 2 == 0) for number, at_s in enumerate(switched_s)]
+    return classify_images(states, exposures)
