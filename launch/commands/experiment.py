@@ -127,7 +127,8 @@ def stroke(
             min=0,
             max=1000,
             help="Number of switches of the projected image between white and black after the "
-            "stroke. The bag then shows the latency of the projector. Not with several strokes.",
+            "stroke, for the latency of the projector. The bag then contains the images of the "
+            "camera. Not with several strokes.",
         ),
     ] = 0,
     output: ResultFolderOption = None,
@@ -177,6 +178,7 @@ def stroke(
         procedure = make_stroke_procedure([seconds], progress)
         if switches:
             procedure = chain_procedures(procedure, make_switch_procedure(switches, progress))
+            given = [*given, "recorder.include=[stereo]"]
         omitted = without or ()
         run_experiment(
             launch_file, given, bag, procedure, progress, apparatus=apparatus, without=omitted
