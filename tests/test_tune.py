@@ -454,10 +454,12 @@ def test_families_ask_for_the_scenes_own_cases_only(monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.parametrize(("name", "missed"), [("light-touch", False), ("demanding", True)])
 def test_tuned_scenes_report_whether_they_are_sufficient(name: str, missed: bool) -> None:
+    """The latencies depend on the computer on which the scene was tuned."""
     text = (SCENES / f"{name}.yaml").read_text()
     methods = Methods.model_validate(YAML(typ="safe").load(text)["methods"])
     assert methods.tracking is not None
-    assert ("INSUFFICIENT" in text) == missed
+    reported = text.partition("INSUFFICIENT: ")[2].partition(".\n")[0].split(", ")
+    assert bool({*reported} - {"", "exposure_to_arm_ms", "exposure_to_light_ms"}) == missed
     families = dict(methods)
     del families["compliance"]
     assert (None not in families.values()) or missed

@@ -258,7 +258,8 @@ def compose(
     tolerance, corrects all predictions by the difference, and runs the next combination, until no
     other one is predicted to be better in what exceeds its tolerance. If no combination can meet a
     tolerance, the combination must be near the smallest value, and meet the other tolerances. Only
-    combinations with the fewest cases out of range are considered.
+    combinations with the fewest cases out of range are considered. At the end, cheaper combinations
+    are run whose errors may be as small, if the predictions were too large.
     """
     combinations = list_combinations(stages)
     least_outside = min(map(_outside, combinations))
@@ -266,30 +267,78 @@ def compose(
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     unexplained, runs = Unexplained(), list[GraphRun]()
     tried: list[Combination] = []
+
+    def run(proposed: Combination) -> GraphRun:
+        measured = run_graph(proposed)
+        exceeded = excess(measured, tolerances)
+        tried.append(proposed)
+        runs.append(
+            GraphRun(name_methods(proposed), cost(proposed), predict(proposed), measured, exceeded)
+        )
+        return runs[-1]
+
     while len(runs) < max_runs and len(tried) < len(combinations):
         left = [one for one in combinations if one not in tried]
         proposed = _propose(left, unexplained, allowed)
         if runs and excess(predict(proposed, unexplained), allowed):
             # Runs may use the margin that predictions leave.
             proposed = _propose(left, unexplained, tolerances)
-        tried.append(proposed)
-        measured = run_graph(proposed)
-        predicted = predict(proposed)
-        exceeded = excess(measured, tolerances)
-        runs.append(GraphRun(name_methods(proposed), cost(proposed), predicted, measured, exceeded))
-        unexplained = unexplained.learn(proposed, measured)
+        latest = run(proposed)
+        unexplained = unexplained.learn(proposed, latest.measured)
         others = [predict(one, unexplained) for one in left if one is not proposed]
         if not any(
-            _equal_ratio(metric) * one.get(metric, math.inf) < measured[metric]
+            _equal_ratio(metric) * one.get(metric, math.inf) < latest.measured[metric]
             for one in others
-            for metric in exceeded
+            for metric in latest.exceeded
         ):
             break
+    best = _find_best(runs, tolerances)
+    while len(runs) < max_runs:
+        cheaper = _find_cheaper(combinations, tried, runs[best], tolerances, margin)
+        if cheaper is None:
+            break
+        run(cheaper)
+        best = _find_best(runs, tolerances)
+        if best != len(runs) - 1:
+            break
+    return Composition(tried[best], tuple(runs), tolerances)
+
+
+def _find_best(runs: Sequence[GraphRun], tolerances: Figures) -> int:
+    """Return the index of the cheapest run that exceeds the attainable limits least."""
     limits = _relax(tolerances, [run.measured for run in runs])
-    best = min(
+    return min(
         range(len(runs)), key=lambda i: (_sum_excess(runs[i].measured, limits), runs[i].cores)
     )
-    return Composition(tried[best], tuple(runs), tolerances)
+
+
+def _find_cheaper(
+    combinations: Sequence[Combination],
+    tried: Sequence[Combination],
+    best: GraphRun,
+    tolerances: Figures,
+    margin: float,
+) -> Combination | None:
+    """Return the cheapest other combination that may be as good as the best run; None: none.
+
+    The errors of a method are those of its worst case, so that their sum overestimates the errors
+    of the system. The ratio of measured to predicted errors of the best run corrects this.
+    """
+    limits = _relax(tolerances, [best.measured])
+    for one in combinations:
+        if cost(one) >= best.cores:
+            return None
+        expected = {
+            metric: value * min(1.0, best.measured.get(metric, 0.0) / best.predicted[metric])
+            if best.predicted.get(metric)
+            else value
+            for metric, value in predict(one).items()
+            if metric in best.measured
+        }
+        allowed = {metric: (1.0 - margin) * limit for metric, limit in limits.items()}
+        if one not in tried and not excess(expected, allowed):
+            return one
+    return None
 
 
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
