@@ -2,11 +2,11 @@
 
 This is the reference method, against which the faster ones are measured. The finger is a rigid
 sphere or a rigid capsule, a sphere with a straight shaft. In deep pushes the skin closes over the
-sphere and touches the shaft. A penalty pressure acts on contact points of the skin (the surface of the body). It first
-grows with the square of the penetration, so forces have a continuous slope, and then linearly.
-Under a pressure equal to Young's modulus the penetration is about a hundredth of the radius.
-Newton's method with a line search minimises the sum of elastic and contact energy. An inverted
-element has infinite energy, so it is never accepted.
+sphere and touches the shaft. A penalty pressure acts on contact points of the skin (the surface of
+the body). It first grows with the square of the penetration, so forces have a continuous slope, and
+then linearly. Under a pressure equal to Young's modulus the penetration is about a hundredth of the
+radius. Newton's method with a line search minimises the sum of elastic and contact energy. An
+inverted element has infinite energy, so it is never accepted.
 
 Without friction the solution depends only on the position of the finger. If the finger sticks, it
 also depends on the path: tangential springs connect each contact point to where it was touched.
