@@ -13,10 +13,10 @@ from flexsheet.nodes.fem_solver.mesh import boundary_faces
 from flexsheet.nodes.fem_solver.newton import (
     NO_STICK,
     EquilibriumState,
+    FingerObstacle,
     Friction,
     NeoHookeanBody,
     NewtonNotConvergedError,
-    SphereObstacle,
 )
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
 from tests.solids import box
@@ -104,6 +104,38 @@ def test_the_force_is_the_energys_derivative_along_the_finger(body: NeoHookeanBo
 
     slope = (energy(states[3]) - energy(states[1])) / (2 * step)
     assert states[2].force_n[2] == pytest.approx(slope, rel=1e-4)
+
+
+def test_the_shaft_of_a_capsule_presses_like_a_cylinder() -> None:
+    nodes, elements = box((3, 3, 2), (SIDE, SIDE, HEIGHT))
+    faces = boundary_faces(elements)
+    given: dict[str, Any] = {"modulus_pa": MODULUS, "radius_m": FINGER}
+    axis = np.array([0.6, 0.0, 0.8])
+    capsule = FingerObstacle(nodes, elements, faces, axis=axis, **given)
+    sphere = FingerObstacle(nodes, elements, faces, **given)
+    # The whole shaft is inside the block, and the tip is below it.
+    tip = np.array([0.45 * SIDE, 0.5 * SIDE, -0.5 * FINGER])
+    inner, depth, normals, away = capsule.inside(nodes, tip)
+    along = (capsule.points(nodes)[inner] - tip) @ axis
+    shaft = along > FINGER
+    assert shaft.sum() > 10
+    assert np.abs(normals[shaft] @ axis).max() < 1e-12
+    assert depth + away == pytest.approx(FINGER)
+    assert len(sphere.inside(nodes, tip)[0]) < len(inner)
+
+    direction = np.random.default_rng(0).normal(size=nodes.shape)
+    step = 1e-8 * direction
+    change = capsule.energy(nodes + step, tip, NO_STICK) - capsule.energy(
+        nodes - step, tip, NO_STICK
+    )
+    forces = capsule.forces(nodes, tip, NO_STICK)
+    assert change == pytest.approx(2.0 * (forces * step).sum(), rel=1e-4)
+    matrices = np.zeros((len(elements), 30, 30))
+    capsule.add_tangents(matrices, nodes, tip, NO_STICK, geometric_stiffness_weight=1.0)
+    local = direction[elements].reshape(len(elements), 30, 1)
+    curvature = float((local.transpose(0, 2, 1) @ matrices @ local).sum())
+    bent = capsule.forces(nodes + step, tip, NO_STICK) - capsule.forces(nodes - step, tip, NO_STICK)
+    assert curvature == pytest.approx((bent * direction).sum() / 2e-8, rel=1e-4)
 
 
 def test_without_friction_the_result_is_independent_of_the_path(
@@ -213,7 +245,7 @@ def test_a_finger_in_the_air_moves_nothing(body: NeoHookeanBody) -> None:
 def test_obstacle_tangent_is_the_derivative_of_its_forces() -> None:
     nodes, elements = box((1, 1, 1), (0.01, 0.01, 0.01))
     faces = boundary_faces(elements)
-    obstacle = SphereObstacle(nodes, elements, faces, modulus_pa=MODULUS, radius_m=FINGER)
+    obstacle = FingerObstacle(nodes, elements, faces, modulus_pa=MODULUS, radius_m=FINGER)
     there = np.array([0.003, 0.006, 0.0166])
     way = np.random.default_rng(5).normal(size=nodes.shape)
     held = obstacle.update_stick(nodes, there + 1e-4, NO_STICK)

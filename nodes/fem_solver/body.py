@@ -29,8 +29,9 @@ QUICK_TABLE = "quick_table"
 """The name of the method that uses the coarse table, which is computed first from few snapshots."""
 LINEAR_ERROR_RATIO, TABLE_ERROR_RATIO, UNCORRECTED_RATIO, QUICK_EXTRA_RATIO = 0.25, 0.03, 0.15, 0.07
 """The stated relative errors of the force. They belong to the linear method, the complete table
-with and without force correction, and the coarse table (additional error). They hold at depths
-above 1 mm for 95 % of the touchable nodes (docs/soft-body-verification.md)."""
+with and without force correction, and the coarse table (additional error). They hold for 95 % of
+the touchable nodes at depths above 1 mm, and with the linear method above 4 mm
+(docs/soft-body-verification.md)."""
 
 
 def state_force_error_ratio(method: str, geometry: Geometry) -> float:

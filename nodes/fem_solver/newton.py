@@ -1,11 +1,12 @@
-"""Solve the contact of a fingertip sphere with a neo-Hookean body by Newton's method.
+"""Solve the contact of a finger with a neo-Hookean body by Newton's method.
 
 This is the reference method, against which the faster ones are measured. The finger is a rigid
-sphere. A penalty pressure acts on contact points of the skin (the surface of the body). It first
-grows with the square of the penetration, so forces have a continuous slope, and then linearly.
-Under a pressure equal to Young's modulus the penetration is about a hundredth of the radius.
-Newton's method with a line search minimises the sum of elastic and contact energy. An inverted
-element has infinite energy, so it is never accepted.
+sphere or a rigid capsule, a sphere with a straight shaft. In deep pushes the skin closes over the
+sphere and touches the shaft. A penalty pressure acts on contact points of the skin (the surface of
+the body). It first grows with the square of the penetration, so forces have a continuous slope, and
+then linearly. Under a pressure equal to Young's modulus the penetration is about a hundredth of the
+radius. Newton's method with a line search minimises the sum of elastic and contact energy. An
+inverted element has infinite energy, so it is never accepted.
 
 Without friction the solution depends only on the position of the finger. If the finger sticks, it
 also depends on the path: tangential springs connect each contact point to where it was touched.
@@ -24,7 +25,7 @@ from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.contact import POINT_SPACING_RATIO, sample_triangle
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import FACES, SUBTRIANGLES, boundary_faces
+from flexsheet.nodes.fem_solver.mesh import FACES, SUBTRIANGLES, nodes_in_planes, skin_faces
 from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, NestedDissection
 
 Friction = Literal["none", "stick"]
@@ -88,18 +89,27 @@ class _StickState:
 NO_STICK = _StickState(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3)))
 
 
-class SphereObstacle:
-    """The penalty contact between the skin of a body and the spherical finger."""
+class FingerObstacle:
+    """The penalty contact between the skin of a body and the finger."""
 
     def __init__(
-        self, nodes: Floats, elements: Ints, faces: Ints, *, modulus_pa: float, radius_m: float
+        self,
+        nodes: Floats,
+        elements: Ints,
+        faces: Ints,
+        *,
+        modulus_pa: float,
+        radius_m: float,
+        axis: Floats | None = None,
     ) -> None:
         """Distribute the contact points over the faces.
 
         faces (f, 6): six-node triangles that the finger can touch. modulus_pa: Young's modulus of
         the body, to which the contact stiffness is proportional. radius_m: radius of the finger.
+        axis (3,): unit vector from the tip of the finger along its shaft, a cylinder of the same
+        radius; None for a sphere.
         """
-        self.radius_m = radius_m
+        self.radius_m, self._axis = radius_m, axis
         self._count, self._faces = len(nodes), faces
         corners = nodes[faces[:, :3]]
         # Place the points close enough together that the finger cannot pass between them.
@@ -119,13 +129,15 @@ class SphereObstacle:
         return result
 
     def inside(self, positions: Floats, centre: Floats) -> tuple[Ints, Floats, Floats, Floats]:
-        """Find the contact points inside the sphere.
+        """Find the contact points inside the finger.
 
         positions (n, 3): nodes, m. centre (3,): centre of the sphere, m. Return four arrays for k
-        points: indices (k,), penetrations (k,), m, outward normals of the sphere (k, 3), and
-        distances from the centre (k,), m.
+        points: indices (k,), penetrations (k,), m, outward normals of the finger (k, 3), and
+        distances from the centre or the axis of the shaft (k,), m.
         """
         offset = self.points(positions) - centre
+        if self._axis is not None:
+            offset -= np.maximum(offset @ self._axis, 0.0)[:, None] * self._axis
         distance = np.linalg.norm(offset, axis=1)
         inner = np.flatnonzero(distance < self.radius_m)
         away = distance[inner]
@@ -178,13 +190,17 @@ class SphereObstacle:
 
         The contact stiffness is the second derivative of the contact energy.
         geometric_stiffness_weight: 1 for the exact derivative. A smaller weight reduces the part
-        that results from the curvature of the sphere and can make the stiffness indefinite.
+        that results from the curvature of the finger and can make the stiffness indefinite.
         """
         inner, depth, normals, away = self.inside(positions, centre)
         slope = np.where(depth < self._rounding, depth / self._rounding, 1.0)
         outer = normals[:, :, None] * normals[:, None, :]
         turning = (self._pressure(depth) / away)[:, None, None] * geometric_stiffness_weight
-        inner_blocks = slope[:, None, None] * outer - turning * (np.eye(3) - outer)
+        curved = np.eye(3) - outer
+        if self._axis is not None:
+            on_shaft = np.abs(normals @ self._axis) < 1e-9
+            curved[on_shaft] -= self._axis[:, None] * self._axis
+        inner_blocks = slope[:, None, None] * outer - turning * curved
         numbers = np.append(inner, stick.points)
         along = np.eye(3) - stick.normals[:, :, None] * stick.normals[:, None, :]
         blocks = np.concatenate([inner_blocks, along]) * self._penalty[numbers][:, None, None]
@@ -241,6 +257,8 @@ class NeoHookeanBody:
         min_step_fraction: float = MIN_STEP_FRACTION,
         max_step_ratio: float = MAX_STEP_RATIO,
         factor_dtype: type[np.floating[Any]] = np.float64,
+        mirror_axes: tuple[int, ...] = (),
+        finger_axis: Floats | None = None,
     ) -> None:
         """Prepare the solver.
 
@@ -248,21 +266,36 @@ class NeoHookeanBody:
         six-node triangles that the finger can touch, with outward normals. tolerance: maximum
         residual force, relative to the largest nodal force. min_step_fraction: minimum fraction of
         a load step. max_step_ratio: maximum load step, in finger radii. factor_dtype: precision of
-        the factors of the tangent stiffness; it affects only the search direction. Raise
-        SolidMeshError for inverted elements and ValueError for an invalid material.
+        the factors of the tangent stiffness; it affects only the search direction.
+        mirror_axes: axes of planes of symmetry, on one side of which the mesh is; the forces are
+        those of this part. finger_axis (3,): direction of the finger's shaft; None for a sphere.
+        Raise SolidMeshError for inverted elements and ValueError for an invalid material.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
         )
-        self.obstacle = SphereObstacle(
-            nodes, elements, faces, modulus_pa=young_modulus_pa, radius_m=finger_radius_m
+        self.obstacle = FingerObstacle(
+            nodes,
+            elements,
+            faces,
+            modulus_pa=young_modulus_pa,
+            radius_m=finger_radius_m,
+            axis=finger_axis,
         )
         self.fixed, self.friction = fixed, friction
         self.tolerance, self.min_step_fraction = tolerance, min_step_fraction
         self.max_step_ratio = max_step_ratio
         self.factor_dtype = factor_dtype
         self._order = NestedDissection(nodes, elements, fixed)
-        self._hull = boundary_faces(elements)[:, SUBTRIANGLES].reshape(-1, 3)
+        self._hull = skin_faces(nodes, elements, mirror_axes)[:, SUBTRIANGLES].reshape(-1, 3)
+        self._max_winding = 0.5 ** (1 + len(mirror_axes))
+        in_planes = nodes_in_planes(nodes, mirror_axes)
+        self._fixed_dofs = in_planes | fixed[:, None]
+        at_planes = (in_planes & ~fixed[:, None])[elements].reshape(len(elements), -1)
+        self._constrained = np.flatnonzero(at_planes.any(axis=1))
+        free = ~at_planes[self._constrained]
+        # Without its coupling, a constrained degree of freedom keeps its own positive stiffness.
+        self._coupled = (free[:, :, None] & free[:, None, :]) | np.eye(30, dtype=bool)
 
     def solve_load_steps(
         self, centres: Iterable[Floats], *, start: tuple[Floats, Floats] | None = None
@@ -337,7 +370,7 @@ class NeoHookeanBody:
         for iteration in range(MAX_ITERATIONS):
             inner = self.solid.forces(displacement)
             contact_forces = self.obstacle.forces(nodes + displacement, centre, stick)
-            residual = np.where(self.fixed[:, None], 0.0, inner + contact_forces)
+            residual = np.where(self._fixed_dofs, 0.0, inner + contact_forces)
             scale = max(np.abs(inner).max(), np.abs(contact_forces).max())
             if np.abs(residual).max() <= self.tolerance * scale:
                 return displacement, factors
@@ -368,7 +401,7 @@ class NeoHookeanBody:
                 f"an element of the mesh is inverted (minimum volume ratio {ratio:.3g})"
             )
         triangles = (self.solid.nodes + displacement)[self._hull] - centre
-        if winding_number(triangles) > 0.5:
+        if winding_number(triangles) > self._max_winding:
             raise NewtonNotConvergedError("the centre of the finger is inside the body")
 
     def _energy(self, displacement: Floats, centre: Floats, stick: _StickState) -> float:
@@ -391,7 +424,7 @@ class NeoHookeanBody:
         positions, fraction = self.solid.nodes + displacement, 1e-3 * (target - position)
         change = self.obstacle.forces(positions, position + fraction, stick)
         change -= self.obstacle.forces(positions, position - fraction, stick)
-        change[self.fixed] = 0.0
+        change[self._fixed_dofs] = 0.0
         return displacement - factors.solve(500.0 * change.ravel()).reshape(-1, 3)
 
     def _factorize(self, displacement: Floats, centre: Floats, stick: _StickState) -> Factors:
@@ -411,6 +444,7 @@ class NeoHookeanBody:
                 geometric_stiffness_weight=geometric_stiffness_weight,
             )
             self.solid.stiffen(matrices, stiffening)
+            matrices[self._constrained] *= self._coupled
             try:
                 return self._order.factor(matrices.astype(self.factor_dtype, copy=False))
             except IndefiniteError:

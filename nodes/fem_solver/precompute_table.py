@@ -39,6 +39,7 @@ from flexsheet.nodes.fem_solver.contact import unit_linear_body
 from flexsheet.nodes.fem_solver.mesh import build_mesh
 from flexsheet.nodes.fem_solver.mesh.from_scene import VERSION as mesh_version
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
+from flexsheet.nodes.fem_solver.shipped_pushes import load_shipped, shipped_path
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotSet
 from flexsheet.nodes.fem_solver.table import (
     FilledNodes,
@@ -52,7 +53,7 @@ from flexsheet.nodes.models.shapes import make_shape
 
 T = TypeVar("T")
 
-VERSION = 4
+VERSION = 5
 """The version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
 """The numbers of progress steps for a snapshot and for a node of the table."""
@@ -187,13 +188,16 @@ def compute_table(
     """
     entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
-    return cached(
-        entry,
-        cache_dir,
-        lambda: _compute_table(
+
+    def compute() -> Table:
+        for name, snapshot in load_shipped(shipped_path(entry)).items():
+            if checkpoints.load(name) is None:
+                checkpoints.save(name, encode_fields(snapshot))
+        return _compute_table(
             spec, model, checkpoints, executor, progress, workers=workers, on_quick=on_quick
-        ),
-    )
+        )
+
+    return cached(entry, cache_dir, compute)
 
 
 def _compute_table(

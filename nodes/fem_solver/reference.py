@@ -39,7 +39,7 @@ from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, Snapshot
 from flexsheet.nodes.fem_solver.table import CANDIDATE_FACES, END_SPAN_M, Table, fill_table
 from flexsheet.nodes.methods import Progress
 
-VERSION = 2
+VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,8 @@ def _load_snapshot(path: Path) -> Snapshot:
 def _digest(*jobs: SnapshotJob) -> str:
     digest = hashlib.sha256(f"{VERSION}".encode())
     for job in jobs:
-        digest.update(f"{job.poisson_ratio} {job.finger_radius_m} {job.depths_m}".encode())
+        given = (job.poisson_ratio, job.finger_radius_m, job.depths_m, job.mirror_axes)
+        digest.update(repr(given).encode())
         sample = job.sample
         arrays = (job.nodes, job.elements, job.fixed, job.faces, sample.point, sample.normal)
         for array in arrays:

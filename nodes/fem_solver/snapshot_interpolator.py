@@ -104,20 +104,24 @@ class SnapshotInterpolator:
         self._solved, self._user, self._radius = solved, towards_user, radius_m
         self._points = np.array([one.sample.point for one in solved])
         self.depths_m = solved[0].snapshot.depths_m
+        self._fixed: dict[int, Singles] = {}
+        self._rest: Floats | None = None
 
     def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Singles, Floats, float]:
         """Interpolate the snapshots at a new sample point.
 
-        rest (s, 3): undeformed skin nodes, m. Return the displacement (k, s, 3), m, and the force
-        (k, 3), N, for 1 Pa at k depths. The last result is the number of converged depths, as a
-        weighted mean over the snapshots used.
+        rest (s, 3): undeformed skin nodes, m; calls with the same array are faster. Return the
+        displacement (k, s, 3), m, and the force (k, 3), N, for 1 Pa at k depths. The last result is
+        the number of converged depths, as a weighted mean over the snapshots used.
         """
+        if rest is not self._rest:
+            self._rest, self._fixed = rest, {}
         weights = self.neighbour_weights(sample)
         moved: Singles | None = None
         force = np.zeros(self._solved[0].snapshot.force_n.shape)
         reached = 0.0
         for number, weight in weights:
-            part, force_part = self._transport(self._solved[number], sample, rest)
+            part, force_part = self._transport(number, sample, rest)
             moved = (
                 np.float32(weight) * part if moved is None else moved + np.float32(weight) * part
             )
@@ -151,24 +155,33 @@ class SnapshotInterpolator:
         weights = kernel * (basis @ np.linalg.solve(normal, np.array([1.0, 0.0, 0.0])))
         return list(zip(near.tolist(), weights.tolist(), strict=True))
 
-    def _transport(
-        self, solved: PlacedSnapshot, sample: SamplePoint, rest: Floats
-    ) -> tuple[Singles, Floats]:
+    def _transport(self, number: int, sample: SamplePoint, rest: Floats) -> tuple[Singles, Floats]:
+        solved = self._solved[number]
+        if number not in self._fixed:
+            self._fixed[number] = _evaluate(solved, rest)
         rotation = (
             minimal_rotation(self._user, solved.sample.normal)
             @ minimal_rotation(self._user, sample.normal).T
         )
         distances = np.linalg.norm(rest - sample.point, axis=1) / self._radius
         weight = np.clip((FIXED_RATIO - distances) / (FIXED_RATIO - TRANSPORTED_RATIO), 0.0, 1.0)
-        weight = smoothstep(weight)[:, None]
-        there = solved.sample.point + (rest - sample.point) @ rotation.T
-        nodes, weights = solved.locator.weights(weight * there + (1.0 - weight) * rest)
-        moved = np.einsum(
-            "qa,kqai->kqi", weights.astype(np.float32), solved.snapshot.moved[:, nodes]
-        )
+        near = np.flatnonzero(weight)
+        weight = smoothstep(weight[near])[:, None]
+        there = solved.sample.point + (rest[near] - sample.point) @ rotation.T
+        moved = _evaluate(solved, weight * there + (1.0 - weight) * rest[near])
         back = rotation.astype(np.float32)
         part = weight.astype(np.float32)
-        return part * (moved @ back) + (1.0 - part) * moved, solved.snapshot.force_n @ rotation
+        result = self._fixed[number].copy()
+        result[:, near] = part * (moved @ back) + (1.0 - part) * moved
+        return result, solved.snapshot.force_n @ rotation
+
+
+def _evaluate(solved: PlacedSnapshot, points: Floats) -> Singles:
+    """Return the displacement (k, q, 3), m, of a snapshot at its skin points nearest to points."""
+    nodes, weights = solved.locator.weights(points)
+    moved = solved.snapshot.moved[:, nodes]
+    result: Singles = np.einsum("qa,kqai->kqi", weights.astype(np.float32), moved)
+    return result
 
 
 def _tangents(towards_user: Floats) -> list[int]:

@@ -19,11 +19,13 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Cylinder, StripSupport
 from flexsheet.nodes.arrays import Bools, Floats, Ints, Singles
 from flexsheet.nodes.fem_solver.mesh import (
+    SAME_M,
     Focus,
     MeshSpec,
     SolidMesh,
-    boundary_faces,
     cylinder_mesh,
+    nodes_in_planes,
+    skin_faces,
 )
 
 DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0.0225)
@@ -73,7 +75,9 @@ class SnapshotJob:
     """The inputs of a snapshot, which describe pushes at one sample point to several depths.
 
     nodes (n, 3), m, elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
-    six-node triangles that the finger can touch. depths_m: push depths.
+    six-node triangles that the finger can touch. depths_m: push depths. mirror_axes: axes of planes
+    of symmetry through the sample point, on one side of which the mesh is; 0 for x = 0 and 1 for
+    y = 0.
     """
 
     nodes: Floats
@@ -84,6 +88,7 @@ class SnapshotJob:
     poisson_ratio: float
     finger_radius_m: float
     depths_m: tuple[float, ...]
+    mirror_axes: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +130,11 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
         min_step_fraction=MIN_STEP_FRACTION,
         max_step_ratio=MAX_STEP_RATIO,
         factor_dtype=np.float32,
+        mirror_axes=job.mirror_axes,
+        finger_axis=job.sample.normal,
     )
-    skin_faces = boundary_faces(job.elements)
-    skin = np.unique(skin_faces)
+    faces = skin_faces(job.nodes, job.elements, job.mirror_axes)
+    skin = np.unique(faces)
     path = [
         job.sample.point + (job.finger_radius_m - d) * job.sample.normal for d in (0, *job.depths_m)
     ]
@@ -140,13 +147,33 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
             break
     states = states[1:]
     states += [replace(states[-1], reached=False)] * (len(job.depths_m) - len(states))
-    return Snapshot(
+    snapshot = Snapshot(
         rest=job.nodes[skin],
-        faces=np.searchsorted(skin, skin_faces),
+        faces=np.searchsorted(skin, faces),
         depths_m=np.array(job.depths_m),
         moved=np.array([state.displacement[skin] for state in states], dtype=np.float32),
         force_n=np.array([state.force_n for state in states]),
         reached=sum(state.reached for state in states),
+    )
+    for axis in job.mirror_axes:
+        snapshot = _unfold_snapshot(snapshot, job.sample, axis)
+    return snapshot
+
+
+def _unfold_snapshot(snapshot: Snapshot, sample: SamplePoint, axis: int) -> Snapshot:
+    """Return the snapshot of a whole body from that of its half on one side of a plane."""
+    signs = np.ones(3)
+    signs[axis] = -1.0
+    image, _ = reflect_snapshot(snapshot, sample, signs)
+    others = np.flatnonzero(~nodes_in_planes(snapshot.rest, (axis,))[:, axis])
+    number = np.arange(len(snapshot.rest))
+    number[others] = len(number) + np.arange(len(others))
+    return replace(
+        snapshot,
+        rest=np.concatenate([snapshot.rest, image.rest[others]]),
+        faces=np.concatenate([snapshot.faces, number[image.faces]]),
+        moved=np.concatenate([snapshot.moved, image.moved[:, others]], axis=1),
+        force_n=snapshot.force_n + image.force_n,
     )
 
 
@@ -266,6 +293,7 @@ def make_snapshot_job(
         poisson_ratio=poisson_ratio,
         finger_radius_m=finger_radius_m,
         depths_m=DEPTHS_M if depths_m is None else depths_m,
+        mirror_axes=() if focused is None else _mirror_axes(sample),
     )
 
 
@@ -288,6 +316,7 @@ def make_fine_job(
         poisson_ratio=poisson_ratio,
         finger_radius_m=finger_radius_m,
         depths_m=FINE_DEPTHS_M,
+        mirror_axes=_mirror_axes(sample),
     )
 
 
@@ -318,6 +347,17 @@ def _make_focused_mesh(
             near_m=near_m,
             growth=growth,
         ),
+        mirror_axes=_mirror_axes(sample),
+    )
+
+
+def _mirror_axes(sample: SamplePoint) -> tuple[int, ...]:
+    """Return the axes of the planes of symmetry of a cylinder that contain a push.
+
+    The planes are x = 0 and, since the support is centred on -z, y = 0.
+    """
+    return tuple(
+        axis for axis in (0, 1) if max(abs(sample.point[axis]), abs(sample.normal[axis])) < SAME_M
     )
 
 
@@ -328,8 +368,12 @@ def make_job_on_mesh(
     poisson_ratio: float,
     finger_radius_m: float,
     depths_m: tuple[float, ...],
+    mirror_axes: tuple[int, ...] = (),
 ) -> SnapshotJob:
-    """Return the job for pushes at a sample point to several depths with a given mesh."""
+    """Return the job for pushes at a sample point to several depths with a given mesh.
+
+    mirror_axes: axes of planes of symmetry, on one side of which the mesh is.
+    """
     return SnapshotJob(
         nodes=mesh.nodes,
         elements=mesh.elements,
@@ -339,6 +383,7 @@ def make_job_on_mesh(
         poisson_ratio=poisson_ratio,
         finger_radius_m=finger_radius_m,
         depths_m=depths_m,
+        mirror_axes=mirror_axes,
     )
 
 

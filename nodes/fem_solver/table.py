@@ -36,7 +36,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     triangle_shape_functions_at,
 )
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator, SnapshotSet
-from flexsheet.nodes.fem_solver.snapshots import FINE_RATIO, SamplePoint, Snapshot
+from flexsheet.nodes.fem_solver.snapshots import FINE_RATIO, SAME_RATIO, SamplePoint, Snapshot
 from flexsheet.nodes.models.interpolation import smoothstep
 
 LINEAR_DEPTHS_M = (0.0007,)
@@ -158,21 +158,64 @@ def fill_table(
     fields = np.empty((count, len(depths) - 1, response.rest.size), dtype=np.float32)
     force, reach = np.empty((count, len(depths), 3)), np.empty(count)
     samples = [SamplePoint(*one) for one in zip(points, normals, strict=True)]
+    images = find_mirror_images(points, response.rest, source.mirrors)
+    own = [number for number in range(count) if number not in images]
     jobs = [
-        FillJob(samples[start : start + FILLED_NODES], response.rest, triangles, source)
-        for start in range(0, count, FILLED_NODES)
+        FillJob(
+            [samples[number] for number in own[start : start + FILLED_NODES]],
+            response.rest,
+            triangles,
+            source,
+        )
+        for start in range(0, len(own), FILLED_NODES)
     ]
-    number = 0
-    for job, filled in zip(jobs, interpolate(jobs), strict=True):
-        for at, sample in enumerate(job.samples):
-            moved, force[number] = _blend_levels(
-                sample, linear, depths, filled.moved[at], filled.force_n[at]
-            )
-            fields[number] = moved[1:]
-            sound_m = depths[first + filled.valid[at] - 1]
-            reach[number] = min(_reach_m(filled.reached[at], depths[first:]), sound_m)
-            number += 1
+    parts = list(interpolate(jobs))
+    place = {number: divmod(at, FILLED_NODES) for at, number in enumerate(own)}
+    for number, sample in enumerate(samples):
+        partner, signs, permutation = images.get(number, (number, np.ones(3), None))
+        part, at = place[partner]
+        filled = parts[part]
+        solved = filled.moved[at]
+        if permutation is not None:
+            shape = (len(solved), len(permutation), 3)
+            solved = solved.reshape(shape)[:, permutation] * signs.astype(np.float32)
+            solved = solved.reshape(len(solved), -1)
+        moved, force[number] = _blend_levels(
+            sample, linear, depths, solved, filled.force_n[at] * signs
+        )
+        fields[number] = moved[1:]
+        sound_m = depths[first + filled.valid[at] - 1]
+        reach[number] = min(_reach_m(filled.reached[at], depths[first:]), sound_m)
     return Table(depths, fields, force * factors[:, None], reach)
+
+
+def find_mirror_images(
+    points: Floats, rest: Floats, mirrors: Sequence[Floats]
+) -> dict[int, tuple[int, Floats, Ints]]:
+    """Find the contact nodes whose pushes are mirror images of pushes at earlier contact nodes.
+
+    points (n, 3): contact nodes, m. rest (s, 3): undeformed skin nodes, m. mirrors: vectors (3,) of
+    signs, one for each mirror symmetry of the body; those that do not map all skin nodes to skin
+    nodes are ignored. For each node found, return the index of the earlier node, the signs, and
+    the index of the mirror image of each skin node (s,).
+    """
+    from scipy.spatial import cKDTree
+
+    same_m = SAME_RATIO * float(np.ptp(rest, axis=0).max())
+    nodes, skin = cKDTree(points), cKDTree(rest)
+    found: dict[int, tuple[int, Floats, Ints]] = {}
+    usable = []
+    for signs in mirrors:
+        away, permutation = skin.query(rest * signs)
+        if away.max() < same_m:
+            usable.append((signs, permutation, *nodes.query(points * signs)))
+    for number in range(len(points)):
+        for signs, permutation, away, partners in usable:
+            partner = int(partners[number])
+            if away[number] < same_m and partner < number and partner not in found:
+                found[number] = partner, signs, permutation
+                break
+    return found
 
 
 def compute_force_factors(

@@ -20,15 +20,19 @@ from flexsheet.nodes.fem_solver.mesh.from_scene import (
 from flexsheet.nodes.fem_solver.mesh.solid import (
     EDGES,
     FACES,
+    SAME_M,
     SUBTRIANGLES,
     SolidMesh,
     UnfitMeshError,
     boundary_faces,
+    nodes_in_planes,
+    skin_faces,
 )
 
 __all__ = [
     "EDGES",
     "FACES",
+    "SAME_M",
     "SUBTRIANGLES",
     "Focus",
     "MeshBudget",
@@ -41,5 +45,7 @@ __all__ = [
     "mesh_budget",
     "mesh_scene",
     "mesh_spec",
+    "nodes_in_planes",
+    "skin_faces",
     "world_from_mesh",
 ]

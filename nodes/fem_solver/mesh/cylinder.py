@@ -22,7 +22,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     SUBTRIANGLES,
     SolidMesh,
     add_midside_nodes,
-    boundary_faces,
+    skin_faces,
 )
 
 BACK_COARSENING = 2.0
@@ -59,14 +59,17 @@ def cylinder_mesh(
     touch_angle_rad: float,
     skin_spacing_m: float,
     focus: Focus | None = None,
+    mirror_axes: tuple[int, ...] = (),
 ) -> SolidMesh:
     """Return the mesh of a solid cylinder.
 
     support_angle_rad: full angle of the fixed strip, which is centred on -z. touch_angle_rad: half
     angle of the touchable skin, which is centred on +z. skin_spacing_m: distance between touchable
     nodes. focus: point around which the mesh is fine; None for a mesh that is fine on all touchable
-    skin. Elements are larger inside and at the back of the cylinder. Raise ValueError for a spacing
-    that is too large for the cylinder, or for invalid angles.
+    skin. mirror_axes: axes of planes of symmetry through the focus, 0 for x = 0 and 1 for y = 0;
+    the mesh contains only the half with positive coordinates. Elements are larger inside and at
+    the back of the cylinder. Raise ValueError for a spacing that is too large for the cylinder, or
+    for invalid angles.
     """
     half_support = 0.5 * support_angle_rad
     if not 0.0 < half_support < np.pi:
@@ -89,9 +92,12 @@ def cylinder_mesh(
     if focus is None:
         points, triangles = _disc(radius_m, half_support, sizes)
     else:
-        points, triangles = _focused_disc(radius_m, half_support, sizes, focus)
-    stations = _stations(length_m, sizes)
-    corners, tetrahedra = _extrude(points, triangles, stations)
+        points, triangles = _focused_disc(radius_m, half_support, sizes, focus, mirror_axes)
+    stations = _stations(length_m, sizes, mirror_axes)
+    # The slices at the focus are mirror images. With the other diagonals there, deep pushes invert
+    # elements earlier.
+    swapped = 1 if focus is None else int(np.abs(stations - focus.x_m).argmin())
+    corners, tetrahedra = _extrude(points, triangles, stations, swapped)
     layer = np.repeat(np.arange(len(stations)), len(points))
     return _finish_mesh(
         corners,
@@ -101,6 +107,7 @@ def cylinder_mesh(
         length_m=length_m,
         half_support=half_support,
         touch_angle=touch_angle_rad,
+        mirror_axes=mirror_axes,
     )
 
 
@@ -132,11 +139,11 @@ class _Sizes:
         return result
 
 
-def _stations(length_m: float, sizes: _Sizes) -> Floats:
+def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> Floats:
     """Return the x coordinates of the cross-sections, including both ends of the cylinder.
 
     If the sizes have a focus, one cross-section is at the focus, and the distances are equal within
-    `near_m`.
+    `near_m`. With the plane of symmetry x = 0, only x >= 0 is returned.
     """
     half = 0.5 * length_m
     stops = [-half, half]
@@ -144,6 +151,8 @@ def _stations(length_m: float, sizes: _Sizes) -> Floats:
         near, x = sizes.focus.near_m, sizes.focus.x_m
         inner = [x - near, x, x + near]
         stops[1:1] = [stop for stop in inner if abs(stop) < half - sizes.element_m]
+    if 0 in mirror_axes:
+        stops = [stop for stop in stops if stop >= 0.0]
     stations = []
     for start, stop in itertools.pairwise(stops):
         fine = np.linspace(start, stop, 2001)
@@ -211,13 +220,17 @@ def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, 
 
 
 def _focused_disc(
-    radius_m: float, half_support: float, sizes: _Sizes, focus: Focus
+    radius_m: float,
+    half_support: float,
+    sizes: _Sizes,
+    focus: Focus,
+    mirror_axes: tuple[int, ...],
 ) -> tuple[Floats, Ints]:
     """Return the points (n, 2) and the triangles (t, 3) of a cross-section that is fine at a focus.
 
     The cross-section is symmetric about the diameter through the focus, except at the ends of the
     support. In an asymmetric mesh, the force on the finger would have a sideways component of a few
-    percent of its magnitude.
+    percent of its magnitude. With the plane of symmetry y = 0, only the half y >= 0 is returned.
     """
     near = focus.near_m / radius_m
     inner = [(r, _sample_arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]
@@ -225,7 +238,7 @@ def _focused_disc(
     axis = np.concatenate([radii, -radii, [0.0]])
     points = [np.column_stack([0.0 * axis, axis])]
     triangles, count = [], len(axis)
-    for side in (1.0, -1.0):
+    for side in (1.0,) if 1 in mirror_axes else (1.0, -1.0):
         ends = side * (np.pi + half_support * np.array([-1.0, 1.0]) - focus.angle_rad)
         ends = np.sort(ends % (2.0 * np.pi))
         stops = [0.0, near, *ends[(near < ends) & (ends < np.pi)], np.pi]
@@ -271,11 +284,12 @@ def _triangles(points: Floats, where: Floats) -> Ints:
     return sound
 
 
-def _extrude(points: Floats, triangles: Ints, x: Floats) -> tuple[Floats, Ints]:
+def _extrude(points: Floats, triangles: Ints, x: Floats, swapped: int) -> tuple[Floats, Ints]:
     """Extrude a cross-section to corner nodes (k, 3) and tetrahedra (e, 4).
 
     points (n, 2), triangles (t, 3): cross-section. x (s,): positions of the cross-sections, m. The
-    diagonals alternate between slices, so that the mesh has no preferred direction.
+    diagonals alternate between slices, so that the mesh has no preferred direction. swapped: index
+    of a slice with swapped ends, which determines those of all slices.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])
@@ -283,7 +297,7 @@ def _extrude(points: Floats, triangles: Ints, x: Floats) -> tuple[Floats, Ints]:
     tetrahedra = []
     for number in range(slices):
         near, far = number * count, (number + 1) * count
-        if number % 2:
+        if (number - swapped) % 2 == 0:
             near, far = far, near
         tetrahedra.append(
             np.concatenate(
@@ -310,6 +324,7 @@ def _finish_mesh(
     length_m: float,
     half_support: float,
     touch_angle: float,
+    mirror_axes: tuple[int, ...],
 ) -> SolidMesh:
     """Build the mesh of 10-node elements, curve its edges, and find fixed and touchable nodes."""
     nodes, elements = add_midside_nodes(corners, tetrahedra)
@@ -317,7 +332,7 @@ def _finish_mesh(
     level[: len(corners)] = 2 * layer
     level[elements[:, 4:]] = layer[tetrahedra[:, EDGES]].sum(axis=2)
 
-    faces = boundary_faces(elements)
+    faces = skin_faces(nodes, elements, mirror_axes)
     on_cap = np.abs(np.abs(nodes[:, 0]) - 0.5 * length_m) < 1e-9 * length_m
     side = faces[~on_cap[faces[:, :3]].all(axis=1)]
     rim = np.unique(side)

@@ -21,6 +21,8 @@ FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0
 from outside, and then the midpoints of the edges between these corners."""
 SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 """The division of a six-node triangle into four flat triangles over the same nodes."""
+SAME_M = 1e-9
+"""The maximum distance of a node from a plane in which it is, in metres."""
 
 
 class UnfitMeshError(FlexsheetError, ValueError):
@@ -83,6 +85,27 @@ def boundary_faces(elements: Ints) -> Ints:
     )
     outer: Ints = faces[np.sort(first[counts == 1])]
     return outer
+
+
+def nodes_in_planes(nodes: Floats, mirror_axes: tuple[int, ...]) -> Bools:
+    """Return whether each node is in each plane of symmetry through the origin (n, 3).
+
+    nodes (n, 3), m. mirror_axes: axes of the planes; the other columns of the result are false.
+    """
+    inside: Bools = np.abs(nodes) < SAME_M
+    inside[:, [axis for axis in range(3) if axis not in mirror_axes]] = False
+    return inside
+
+
+def skin_faces(nodes: Floats, elements: Ints, mirror_axes: tuple[int, ...]) -> Ints:
+    """Return the boundary faces (f, 6) that are not in a plane of symmetry.
+
+    mirror_axes: axes of the planes, 0 for x = 0 and 1 for y = 0.
+    """
+    faces = boundary_faces(elements)
+    in_planes = np.any(np.all(nodes_in_planes(nodes, mirror_axes)[faces], axis=1), axis=1)
+    result: Ints = faces[~in_planes]
+    return result
 
 
 def add_midside_nodes(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:

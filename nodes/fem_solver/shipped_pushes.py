@@ -1,0 +1,68 @@
+"""Load the pushes of the coarse table that are shipped for some scenes.
+
+A scene with shipped pushes has a coarse table without solving a push. The files are in the folder
+`pushes`, by the key of the table; `python -m benchmarks.ship_pushes` writes them. A file is not
+used if anything that its pushes depend on has changed, because then the key differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.nodes.cache import Specification, load_arrays
+from flexsheet.nodes.fem_solver.snapshots import Snapshot
+from flexsheet.nodes.fem_solver.table import Table
+
+KEYS = ("rest", "faces", "depths_m", "moved", "scale_m", "force_n", "reached")
+FOLDER = Path(__file__).with_name("pushes")
+LEVELS = 32767
+"""The number of steps in which a displacement is stored, up to the largest of its depth."""
+
+
+def shipped_path(entry: Specification[Table]) -> Path:
+    """Return the path of the file for a table, which may not exist."""
+    return FOLDER / entry.path(FOLDER).name
+
+
+def load_shipped(path: Path) -> dict[str, Snapshot]:
+    """Return the shipped snapshots of a file by name; empty if the file does not exist."""
+    content = load_arrays(path)
+    if content is None:
+        return {}
+    names = sorted({name.partition("/")[0] for name in content})
+    return {name: _decode({key: content[f"{name}/{key}"] for key in KEYS}) for name in names}
+
+
+def _decode(arrays: Mapping[str, NDArray[Any]]) -> Snapshot:
+    return Snapshot(
+        rest=arrays["rest"].astype(np.float64),
+        faces=arrays["faces"].astype(np.int64),
+        depths_m=arrays["depths_m"],
+        moved=arrays["moved"] * arrays["scale_m"][:, None, None].astype(np.float32),
+        force_n=arrays["force_n"],
+        reached=int(arrays["reached"]),
+    )
+
+
+def save_shipped(path: Path, snapshots: Mapping[str, Snapshot]) -> None:
+    """Write snapshots by name to a compressed file with rounded displacements."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, one in snapshots.items():
+        scale_m = np.abs(one.moved).max(axis=(1, 2), initial=1e-9) / LEVELS
+        encoded = {
+            "rest": one.rest.astype(np.float32),
+            "faces": one.faces.astype(np.uint16),
+            "depths_m": one.depths_m,
+            "moved": np.round(one.moved / scale_m[:, None, None]).astype(np.int16),
+            "scale_m": scale_m,
+            "force_n": one.force_n,
+            "reached": np.array(one.reached),
+        }
+        arrays |= {f"{name}/{key}": encoded[key] for key in KEYS}
+    path.parent.mkdir(exist_ok=True)
+    np.savez_compressed(path, allow_pickle=False, **arrays)
