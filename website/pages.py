@@ -46,7 +46,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "charts": lambda: render_charts(CHARTS),
     "commands": commands_page.render,
     "errors": errors_page.render,
-    "load": lambda: system_page.render_load(RESULTS),
     "message-header": messages_page.render_header,
     "message-types": messages_page.render_types,
     "mxt-packet": registers_page.render_packet,

@@ -1,4 +1,4 @@
-"""Draw and tabulate the recorded measurements of the whole system and of its load limits."""
+"""Draw and tabulate the recorded measurement of the whole system."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import load
 from flexsheet.launch.methods.configurations import CONTROL_AGAIN
 from flexsheet.launch.methods.system_picture import draw_system_chart
 
-SYSTEM, LOAD = "system.json", "load.json"
+SYSTEM = "system.json"
+PARTS = ("points", "front")
 COLUMNS = {
     "sheet_mm": "sheet, mm",
     "image_mm": "image, mm",
@@ -22,11 +22,11 @@ COLUMNS = {
 
 
 def draw(results: Path, images: Path) -> None:
-    """Draw the pictures of the recorded measurements; without a record, draw nothing."""
-    if (results / SYSTEM).exists():
-        draw_system_chart(_read(results / SYSTEM)["results"], images / "system.svg")
-    if (results / LOAD).exists():
-        load.draw_rows(_read(results / LOAD)["results"]["rows"], images / "load.svg")
+    """Draw the first scene of the recorded measurement."""
+    result = _read(results / SYSTEM)["results"]
+    scene = result["points"][0]["scene"]
+    first = {key: [one for one in result[key] if one["scene"] == scene] for key in PARTS}
+    draw_system_chart(first, images / "system.svg")
 
 
 def render_system(results: Path) -> str:
@@ -47,12 +47,6 @@ def render_system(results: Path) -> str:
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join([*lines, "", _describe(record)])
-
-
-def render_load(results: Path) -> str:
-    """Return a table of the levels of each load factor, in Markdown."""
-    record = _read(results / LOAD)
-    return f"{load.format_table(record['results']['rows'])}\n\n{_describe(record)}"
 
 
 def _read(path: Path) -> dict[str, Any]:
