@@ -75,8 +75,8 @@ def _draw_front(
             linewidth=1,
             capsize=2,
         )
-        label = name if point["meets_tolerances"] else f"{name}: FAILS {_failing(point)}"
-        axes.annotate(label, (x, y), (6, 6), textcoords="offset points", fontsize=8, color=colour)
+        label = name if point["meets_tolerances"] else f"{name}\nexceeds: {_failing(point)}"
+        axes.annotate(label, (x, y), (6, 6), textcoords="offset points", fontsize=7, color=colour)
         if name in front:
             corners.append((x, y))
     if len(corners) > 1:
