@@ -271,6 +271,14 @@ def test_friction_stays_within_coulombs_limit(coefficient: float) -> None:
     assert np.allclose(total, 0.0, atol=1e-3)
 
 
+def test_alternating_friction_forces_converge() -> None:
+    """With changes halved only once, the nodes at the limit alternate between stick and slip."""
+    tip = np.array([-0.0023, 0.0701, -0.033])
+    pushed = solve(RUBBER, *edges(1.05), finger_tip=tip, friction_coefficient=0.85, cells=16)
+    total = pushed.finger_force_n + pushed.left_force_n + pushed.right_force_n
+    assert np.allclose(total, 0.0, atol=1e-3)
+
+
 def test_a_coefficient_that_is_never_reached_changes_nothing() -> None:
     tip = np.array([0.02, 0.0, -0.01])
     rough = solve(RUBBER, *edges(1.05), finger_tip=tip, friction_coefficient=1e6, cells=16)

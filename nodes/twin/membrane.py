@@ -46,10 +46,10 @@ MAX_STEP_RADII = 0.7
 MAX_ITERATIONS = 80
 
 UNDAMPED_ROUNDS = 6
-"""The number of equilibria per finger step after which changes of the friction forces are halved,
-because they may alternate."""
+"""The number of equilibria per finger step after each of which changes of the friction forces are
+halved once more, because they may alternate."""
 
-MAX_FRICTION_ROUNDS = 20
+MAX_FRICTION_ROUNDS = 30
 """The maximum number of equilibria that are solved per finger step while nodes slip."""
 
 FRICTION_TOLERANCE = 0.01
@@ -532,7 +532,7 @@ def solve_path(
             positions, count = _relax(mesh, positions, finger)
             iterations += count
             rounds = 0
-            while finger.release(positions, 1.0 if rounds < UNDAMPED_ROUNDS else 0.5):
+            while finger.release(positions, 0.5 ** (rounds // UNDAMPED_ROUNDS)):
                 rounds += 1
                 if rounds > MAX_FRICTION_ROUNDS:
                     raise NotConvergedError(
