@@ -276,7 +276,7 @@ def test_alternating_friction_forces_converge() -> None:
     tip = np.array([-0.0023, 0.0701, -0.033])
     pushed = solve(RUBBER, *edges(1.05), finger_tip=tip, friction_coefficient=0.85, cells=16)
     total = pushed.finger_force_n + pushed.left_force_n + pushed.right_force_n
-    assert np.allclose(total, 0.0, atol=1e-3)
+    assert np.linalg.norm(total) < 0.01 * np.linalg.norm(pushed.finger_force_n)
 
 
 def test_a_coefficient_that_is_never_reached_changes_nothing() -> None:
