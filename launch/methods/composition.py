@@ -16,6 +16,8 @@ from enum import StrEnum
 from itertools import product
 from typing import Any
 
+from flexsheet.launch.experiments import ExperimentError
+
 MAX_RUNS = 4
 """The maximum number of configurations that are run through the graph."""
 
@@ -171,7 +173,8 @@ def excess(figures: Figures, tolerances: Figures) -> dict[SystemMetric, float]:
 class GraphRun:
     """A run of one combination in the graph.
 
-    predicted, measured: 95 % values by metric. exceeded: ratio of value to tolerance of each metric
+    predicted, measured: 95 % values by metric; a metric that the run does not measure has its
+    predicted value in both. exceeded: ratio of value to tolerance of each metric
     that exceeds its tolerance.
     """
 
@@ -203,6 +206,12 @@ class Composition:
     def accepted(self) -> bool:
         return not self.last.exceeded and all(one.in_range for one in self.chosen.values())
 
+    @property
+    def unmet(self) -> list[str]:
+        """Return the metrics that exceed their tolerance, and the stages out of their range."""
+        stages = [stage for stage, option in self.chosen.items() if not option.in_range]
+        return [*self.last.exceeded, *(f"{stage} out of range" for stage in stages)]
+
     def report(self) -> dict[str, Any]:
         """Return the result as `flexsheet tune --json` prints it."""
         return {
@@ -219,7 +228,12 @@ class Composition:
         names = ", ".join(f"{stage} {method}" for stage, method in run.methods.items())
         if self.accepted:
             return [f"accepted after {len(self.runs)} runs of the graph: {names}"]
-        lines = [f"no tested configuration meets all tolerances; the best is: {names}"]
+        problem = (
+            "no tested configuration meets all tolerances"
+            if run.exceeded
+            else "the methods' ranges do not contain the scene's working range"
+        )
+        lines = [f"{problem}; the best is: {names}"]
         for metric in run.exceeded:
             stages = ", ".join(
                 f"{stage} {part:.3g}" for stage, part in budget(self.chosen, metric).items()
@@ -262,8 +276,10 @@ def compose(
     are run whose errors may be as small, if the predictions were too large.
     """
     combinations = list_combinations(stages)
+    if not combinations:
+        raise ExperimentError("no method of a method family could be measured in this scene")
     least_outside = min(map(_outside, combinations))
-    combinations = [one for one in combinations if _outside(one) == least_outside]
+    combinations = [one for one in combinations if math.isclose(_outside(one), least_outside)]
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     unexplained, runs = Unexplained(), list[GraphRun]()
     tried: list[Combination] = []
@@ -324,19 +340,18 @@ def _find_cheaper(
     The errors of a method are those of its worst case, so that their sum overestimates the errors
     of the system. The ratio of measured to predicted errors of the best run corrects this.
     """
-    limits = _relax(tolerances, [best.measured])
+    allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
+    limits = _relax(allowed, [best.measured])
     for one in combinations:
         if cost(one) >= best.cores:
             return None
         expected = {
-            metric: value * min(1.0, best.measured.get(metric, 0.0) / best.predicted[metric])
+            metric: value * min(1.0, best.measured[metric] / best.predicted[metric])
             if best.predicted.get(metric)
             else value
             for metric, value in predict(one).items()
-            if metric in best.measured
         }
-        allowed = {metric: (1.0 - margin) * limit for metric, limit in limits.items()}
-        if one not in tried and not excess(expected, allowed):
+        if one not in tried and not excess(expected, limits):
             return one
     return None
 
