@@ -197,7 +197,14 @@ def test_the_latency_goes_to_the_renderer_in_a_common_clock(
     delays = MeasuredDelays(servo, MeasuredLag(0.004, 2e-4))
     monkeypatch.setattr(f"{calibration}.delays.read_delays", lambda *_: delays)
     images = switch(0.020)
-    monkeypatch.setattr(f"{calibration}.display_latency.read_switch_images", lambda _: images)
+
+    def read(_: Path, offset_s: float) -> list[SwitchImage]:
+        return [
+            replace(one, start_s=one.start_s + offset_s, end_s=one.end_s + offset_s)
+            for one in images
+        ]
+
+    monkeypatch.setattr(f"{calibration}.display_latency.read_switch_images", read)
     lab, devices = open_laboratory(
         tmp_path / "lab",
         tmp_path / "launch.yaml",

@@ -25,6 +25,7 @@ from flexsheet.nodes.twin.paths import recorded_path
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
 from tests.scenes import load_cylinder
+from tests.waiting import until
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDING = ROOT.parent / "shared" / "data" / "finger" / "reach_and_grip.csv"
@@ -401,10 +402,10 @@ async def test_frames_come_on_a_fixed_grid_and_missed_ones_are_counted(scene: Sc
         await sent.until("twin/stereo", 5)
         clock.ahead_ns += 200_000_000
         frames = await sent.until("twin/stereo", 12)
-        assert node.note == f"{node.missed_frames} frames missed"
+        # The number increases before the note that states it.
+        await until(lambda: node.note == f"{node.missed_frames} frames missed")
         node.path_label = "stroke"
-        await sent.until("twin/stereo", 15)
-        assert node.note == f'path "stroke", {node.missed_frames} frames missed'
+        await until(lambda: node.note == f'path "stroke", {node.missed_frames} frames missed')
     finally:
         await node.close()
     period_ns = round(1e9 / scene.camera.rate_hz)

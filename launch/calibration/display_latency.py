@@ -127,8 +127,11 @@ def classify_images(
     return images
 
 
-def read_switch_images(bag: Path) -> list[SwitchImage]:
-    """Read the images of the switches from a bag; return none if it contains no switch."""
+def read_switch_images(bag: Path, stamp_offset_s: float = 0.0) -> list[SwitchImage]:
+    """Read the images of the switches from a bag; return none if it contains no switch.
+
+    stamp_offset_s: time of an exposure minus its timestamp.
+    """
     shown = [
         (1e-9 * (message.swapped_ns or message.drawn_ns), message.pattern)
         for _, message, _, _ in BagReader(bag, topics=["frame"])
@@ -143,8 +146,8 @@ def read_switch_images(bag: Path) -> list[SwitchImage]:
         return []
     exposures = (
         (
-            1e-9 * header.source_ns - 0.5 * message.exposure_s,
-            1e-9 * header.source_ns + 0.5 * message.exposure_s,
+            1e-9 * header.source_ns + stamp_offset_s - 0.5 * message.exposure_s,
+            1e-9 * header.source_ns + stamp_offset_s + 0.5 * message.exposure_s,
             float(message.left.mean()),
         )
         for _, message, header, _ in BagReader(bag, topics=["stereo"])
@@ -153,10 +156,13 @@ def read_switch_images(bag: Path) -> list[SwitchImage]:
     return classify_images(switches, exposures)
 
 
-def simulate_switch_images(scene: Scene, apparatus: Apparatus, *, seed: int) -> list[SwitchImage]:
+def simulate_switch_images(
+    scene: Scene, apparatus: Apparatus, *, seed: int, stamp_offset_s: float = 0.0
+) -> list[SwitchImage]:
     """Simulate images of the sheet while the projector of an apparatus switches.
 
-    The simulated projector shows a frame at once when its latency has passed.
+    The simulated projector shows a frame at once when its latency has passed. stamp_offset_s:
+    measured time of an exposure minus its timestamp.
     """
     random = np.random.default_rng((seed, 4))
     true = apply_apparatus(scene, apparatus)
@@ -177,6 +183,7 @@ def simulate_switch_images(scene: Scene, apparatus: Apparatus, *, seed: int) -> 
     ):
         is_white = np.searchsorted(light_s, 1e-9 * exposed_ns + instants_s) % 2
         level = levels[int(is_white.sum())]
-        exposures.append((1e-9 * stamp_ns - half_s, 1e-9 * stamp_ns + half_s, level))
+        at_s = 1e-9 * stamp_ns + stamp_offset_s
+        exposures.append((at_s - half_s, at_s + half_s, level))
     states = [(float(at_s), number % 2 == 0) for number, at_s in enumerate(switched_s)]
     return classify_images(states, exposures)

@@ -539,16 +539,20 @@ class Laboratory:
         )
         from flexsheet.launch.calibration.prediction import STAMP_STD_S
 
+        stamp = stamp or MeasuredLag(added_s, STAMP_STD_S)
+        offset_s = stamp.lag_s - added_s
         if self.apparatus is None:
-            images = read_switch_images(self._find_data(StepName.DELAYS))
+            images = read_switch_images(self._find_data(StepName.DELAYS), offset_s)
         else:
-            images = simulate_switch_images(scene, self.apparatus, seed=self.seed)
-        change, stamp = estimate_display_latency(images), stamp or MeasuredLag(added_s, STAMP_STD_S)
+            images = simulate_switch_images(
+                scene, self.apparatus, seed=self.seed, stamp_offset_s=offset_s
+            )
+        change = estimate_display_latency(images)
         given = graph.nodes_of_type("renderer")[0].parameters
         # A window shows each frame until the next one. A simulated frame is displayed at once.
         shown_s = 1.0 / given["rate_hz"] if given["output"] == "window" else 0.0
         return MeasuredLag(
-            change.lag_s + stamp.lag_s - added_s + 0.5 * shown_s,
+            change.lag_s + 0.5 * shown_s,
             math.hypot(change.uncertainty_s, stamp.uncertainty_s),
         )
 

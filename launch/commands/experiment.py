@@ -143,6 +143,10 @@ def stroke(
     if radii and scene is not None:
         raise CommandError("--radii uses the cylinder scenes of the package; remove --scene")
     if repeats > 1 or ablations or radii:
+        if switches:
+            raise CommandError(
+                "--switches needs a single stroke; remove --repeats, --ablations and --radii"
+            )
         from flexsheet.launch.experiments import stroke_table
 
         folder = make_result_folder(output, "strokes")

@@ -30,7 +30,7 @@ QUICK_TABLE = "quick_table"
 LINEAR_ERROR_RATIO, TABLE_ERROR_RATIO, UNCORRECTED_RATIO, QUICK_EXTRA_RATIO = 0.25, 0.03, 0.15, 0.07
 """The stated relative errors of the force. They belong to the linear method, the complete table
 with and without force correction, and the coarse table (additional error). They hold for 95 % of
-the touchable nodes at depths above 1 mm, and with the linear method above 4 mm
+the touchable nodes at depths above 1 mm, and with the linear method above 5 mm
 (docs/soft-body-verification.md)."""
 
 
