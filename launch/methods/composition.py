@@ -25,8 +25,8 @@ EQUAL_RATIO = 1.05
 """The ratio below which two errors of the system count as equal."""
 
 EQUAL_DELAY_RATIO = 1.5
-"""The ratio below which two latencies count as equal. The largest 95 % latency of three runs of one
-configuration varies by this ratio between different times on one computer."""
+"""The ratio below which two latencies count as equal. The 95 % latency of one configuration varies
+by about this ratio between the blocks of `flexsheet chart system` on an idle computer."""
 
 P95_OVER_RMS = 1.614
 """The ratio of the 95 % quantile to the root mean square of the length of a 3D Gaussian error."""

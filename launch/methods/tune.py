@@ -455,8 +455,8 @@ def insert_choices(
     """Return the text of a scene file with the choices inserted in its mapping `methods`.
 
     All other text is unchanged, including the methods of other method families. If `methods` is a
-    mapping on one line, it is expanded to several lines. unmet: names of the system metrics that
-    exceed their tolerance, for the comment.
+    mapping on one line, it is expanded to several lines. unmet: system metrics that exceed their
+    tolerance, and stages out of their range, for the comment.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
@@ -620,9 +620,9 @@ def write_choices(
 ) -> None:
     """Write the choices atomically into a scene file or into a copy of it.
 
-    unmet: names of the system metrics that exceed their tolerance, for the comment. If the file is
-    a symbolic link, the file that it points to is written. Raises BadInputError if other parts of
-    the scene would change, or the target cannot be written.
+    unmet: as in `insert_choices`. If the file is a symbolic link, the file that it points to is
+    written. Raises BadInputError if other parts of the scene would change, or the target cannot be
+    written.
     """
     text = insert_choices(
         relocate_paths(_read(source), source, target),
