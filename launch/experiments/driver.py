@@ -264,14 +264,15 @@ class Driver:
     async def follow(self, path: FingerPath) -> None:
         """Move the finger along a path, and wait until it has reached the end."""
         self.move_finger(path)
+        started = False
 
         def done() -> bool:
+            nonlocal started
             finger = self._newest.get("twin/finger")
-            return (
-                isinstance(finger, TwinFinger)
-                and finger.path_label == path.label
-                and finger.path_done
-            )
+            if not isinstance(finger, TwinFinger) or finger.path_label != path.label:
+                return False
+            started |= not finger.path_done  # an earlier path may have the same label
+            return started and finger.path_done
 
         await self.wait_for(
             done, f'the end of the finger path "{path.label}"', float(path.times_s[-1]) + WAIT_S
