@@ -34,6 +34,7 @@ from flexsheet.launch.experiments.offline import (
     exceeded_tolerances,
 )
 from flexsheet.launch.experiments.ports import choose_ports
+from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.experiments.stroke_table import (
     make_variants,
     summarize_means,
@@ -41,7 +42,7 @@ from flexsheet.launch.experiments.stroke_table import (
     write_radius_variant,
 )
 from flexsheet.launch.experiments.sweep import TrialError, execute_trial, run_sweep
-from flexsheet.launch.experiments.trial import read_flags
+from flexsheet.launch.experiments.trial import read_flags, run_sensitivity_trial
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.bag import BagWriter
@@ -337,13 +338,11 @@ def test_tolerances_are_those_of_the_scene(scene: Scene) -> None:
 def test_each_parameter_is_evaluated_or_says_why_not() -> None:
     assert set(TOLERANCES) >= sensitivity.TIMING
     for parameter in TOLERANCES:
-        found = sensitivity.evaluation_of(parameter, with_graph=False)
+        found = sensitivity.evaluation_of(parameter)
         assert (found is sensitivity.EvaluationKind.NOT_SIMULATED) == (parameter in NOT_SIMULATED)
         assert parameter.partition(".")[0] in sensitivity.AFFECTED
-    assert (
-        sensitivity.evaluation_of("arms.*.servo_lag_s", with_graph=True)
-        is sensitivity.EvaluationKind.GRAPH
-    )
+    found = sensitivity.evaluation_of("arms.*.servo_lag_s")
+    assert found is sensitivity.EvaluationKind.SIMULATED_TIME
 
 
 def test_the_history_of_the_rubber_raises_the_force_inwards_and_lowers_it_outwards() -> None:
@@ -359,17 +358,21 @@ def test_the_history_of_the_rubber_raises_the_force_inwards_and_lowers_it_outwar
 
 
 def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes = {"sheet.modulus_ratio": 10.0, "camera.position_offset_m": 0.3}
+    lag = "arms.*.servo_lag_s"
+    sizes = {"sheet.modulus_ratio": 10.0, "camera.position_offset_m": 0.3, lag: 0.1}
 
     def execute(trial: Mapping[str, Any]) -> dict[str, Any]:
+        assert not trial["with_images"]
+        assert bool(trial["stroke_seeds"]) == (trial["parameter"] == lag)
+        metrics = ["sheet_mm", "fingertip_mm"] if trial["stroke_seeds"] else trial["metrics"]
         effects = {
-            f"{sigma:g}": dict.fromkeys(trial["metrics"], abs(sigma) * sizes[trial["parameter"]])
+            f"{sigma:g}": dict.fromkeys(metrics, abs(sigma) * sizes[trial["parameter"]])
             for sigma in trial["sigmas"]
         }
         return {"parameter": trial["parameter"], "effects": effects}
 
     monkeypatch.setattr(sweep, "execute_trial", execute)
-    names = ",".join([*sizes, "arms.*.servo_lag_s", "eyes.sway_m", "finger.hand_mass_kg"])
+    names = ",".join([*sizes, "eyes.sway_m", "finger.hand_mass_kg"])
     arguments = ["experiment", "sensitivity", "--parameter", names, "--output", str(tmp_path)]
     printed = CliRunner().invoke(app, [*arguments, "--json"], catch_exceptions=False)
     result = json.loads(printed.stdout)
@@ -379,6 +382,7 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert [row["parameter"] for row in result["ranking"]] == [
         "sheet.modulus_ratio",
         "camera.position_offset_m",
+        lag,
     ]
     assert result["ranking"][0] == {
         "parameter": "sheet.modulus_ratio",
@@ -387,11 +391,35 @@ def test_sensitivity_ranks_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyP
     }
     by_parameter = {row["parameter"]: row for row in result["rows"]}
     assert by_parameter["sheet.modulus_ratio"]["fingertip_mm"] == 0.0
-    assert by_parameter["arms.*.servo_lag_s"]["evaluation"] == "not_measured"
-    assert by_parameter["arms.*.servo_lag_s"]["sheet_mm"] is None
+    assert by_parameter[lag]["evaluation"] == "simulated_time"
+    assert by_parameter[lag]["image_mm"] is None
     assert by_parameter["eyes.sway_m"]["evaluation"] == "not_measured"
     assert by_parameter["finger.hand_mass_kg"]["evaluation"] == "not_simulated"
     assert Path(result["figure"]).stat().st_size > 1000
+
+
+def test_parameters_that_matter_in_motion_are_evaluated_in_simulated_time() -> None:
+    trial = {
+        "launch_file": str(DEMO_FILE),
+        "settings": [],
+        "profile": "modern",
+        "calibrated": True,
+        "sigmas": [3.0],
+        "metrics": [],
+        "stroke_seeds": [0],
+        "with_images": False,
+        "seconds": 2.0,
+    }
+
+    def effects(parameter: str) -> dict[str, float]:
+        found = run_sensitivity_trial(trial | {"parameter": parameter})["effects"]["3"]
+        assert isinstance(found, dict)
+        return found
+
+    lag, tremor = effects("arms.*.servo_lag_s"), effects("finger.tremor_rms_m")
+    assert lag["sheet_mm"] != 0.0
+    assert lag["fingertip_mm"] == 0.0  # both apparatuses have the same random numbers
+    assert tremor["sheet_mm"] > 0.02
 
 
 def test_an_unknown_parameter_is_refused() -> None:

@@ -369,7 +369,7 @@ class NodeLoop:
         )
         self.planner = NodeHarness(Planner, PlannerParameters(), self.clock)
         home = SheetTrajectoryPlanner(SCENE, PlannerParameters().trajectory_settings()).motion
-        self.sheet = SimulatedSheet(SCENE, self.apparatus, home, lag_known=False)
+        self.sheet = SimulatedSheet(SCENE, self.apparatus, home, LoopSettings())
         self.sheet.on_edges = self.publish_arms
         self.arms: list[TwinArms] = []
         self.target, self.valid_at_s, self.commanded_s = home, 0.0, 0.0

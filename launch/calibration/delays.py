@@ -24,6 +24,7 @@ from flexsheet.launch.calibration.edge_marks import MarkDetector
 from flexsheet.launch.experiments.lag import estimate_lag_s
 from flexsheet.launch.experiments.simulated_time import (
     CYCLE_S,
+    LoopSettings,
     SimulatedSheet,
     follow_in_simulated_time,
 )
@@ -253,7 +254,7 @@ def swing_sheet(
     Return the true motion of both clamps, and that from measured joint angles.
     """
     start = SheetTrajectoryPlanner(scene, PlannerParameters().trajectory_settings()).motion
-    sheet = SimulatedSheet(scene, apparatus, start, lag_known=False)
+    sheet = SimulatedSheet(scene, apparatus, start, LoopSettings())
     along, rate = start.world_from_sheet[:3, 1], 2.0 * math.pi * frequency_hz
     for now_s in np.arange(1, round((seconds + 1.0) / CYCLE_S)) * CYCLE_S:
         sheet.record(float(now_s))

@@ -165,14 +165,6 @@ def sensitivity(
             help="Parameter in the table of tolerances; repeat the option; default: all.",
         ),
     ] = None,
-    with_graph: Annotated[
-        bool,
-        typer.Option(
-            "--graph",
-            help="Also run a graph for parameters that have an effect only in motion, such as "
-            "delays: four strokes per parameter.",
-        ),
-    ] = False,
     profile: ProfileOption = "modern",
     calibrated: CalibratedOption = False,
     seconds: StrokeOption = 10.0,
@@ -186,9 +178,9 @@ def sensitivity(
 ) -> None:
     """Measure the errors that each inaccurate hardware parameter causes alone.
 
-    Each parameter deviates by 1 and 3 standard deviations in both directions. Without --graph, the
-    errors are computed at rest only. To continue an interrupted command, repeat it with the same
-    --output.
+    Each parameter deviates by 1 and 3 standard deviations in both directions. Delays and tremor
+    are evaluated by strokes in simulated time, all others with the sheet at rest. To continue an
+    interrupted command, repeat it with the same --output.
     """
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments import sensitivity as experiment
@@ -207,7 +199,6 @@ def sensitivity(
             progress,
             profile=Profile(profile),
             calibrated=calibrated,
-            with_graph=with_graph,
             seconds=seconds,
             workers=workers,
             scheduler=scheduler,

@@ -6,7 +6,7 @@ deviation of a parameter in the tolerance table.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -20,16 +20,9 @@ from flexsheet.launch.experiments.sweep import (
     raise_if_all_failed,
     run_sweep,
 )
-from flexsheet.launch.plans.apparatus import format_apparatus
 from flexsheet.launch.plans.plan import load_graph
-from flexsheet.messages.apparatus import nominal_apparatus
-from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.twin.tolerance_table import (
-    NOT_SIMULATED,
-    Profile,
-    deviate_apparatus,
-)
+from flexsheet.nodes.twin.tolerance_table import NOT_SIMULATED, Profile
 
 SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 
@@ -37,13 +30,14 @@ SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 class EvaluationKind(StrEnum):
     """The method by which the effect of a parameter was evaluated.
 
-    offline: without running nodes; errors of sheet and fingertip at the working speed, errors of
-    image and force at rest. graph: in motion, with running nodes. not_measured: the effect occurs
-    only in motion, and no graph was run. not_simulated: no simulator node uses the parameter.
+    offline: errors of sheet and fingertip at the working speed, errors of image and force at rest.
+    simulated_time: errors of sheet and fingertip during strokes in simulated time. not_measured:
+    the parameter affects only images of a moving sheet or eye, which are not evaluated.
+    not_simulated: no simulator node uses the parameter.
     """
 
     OFFLINE = "offline"
-    GRAPH = "graph"
+    SIMULATED_TIME = "simulated_time"
     NOT_MEASURED = "not_measured"
     NOT_SIMULATED = "not_simulated"
 
@@ -70,11 +64,13 @@ TIMING = frozenset(
         "projector.latency_offset_s",
     }
 )
-"""The parameters without effect at rest, or on a noise-free image of the marker.
+"""The parameters without effect at rest, or on a noise-free image of the marker."""
 
-Errors of sheet and fingertip in a running graph show their effects, except for those of eyes and
-projector.
-"""
+STROKE_SEEDS = (0, 1, 2)
+"""The random seeds of the strokes; the nominal and the changed apparatus have the same."""
+
+WITH_IMAGES = frozenset({"finger.marker_shape", "finger.marker_tilt_rad"})
+"""The parameters that affect the detection of the marker, so that strokes need rendered images."""
 
 AFFECTED: dict[str, frozenset[Metric]] = {
     "camera": frozenset(Metric),
@@ -88,14 +84,14 @@ AFFECTED: dict[str, frozenset[Metric]] = {
 """The metrics that each section of the apparatus affects at rest."""
 
 
-def evaluation_of(parameter: str, *, with_graph: bool) -> EvaluationKind:
+def evaluation_of(parameter: str) -> EvaluationKind:
     """Return the method by which the effect of a parameter is evaluated."""
     if parameter in NOT_SIMULATED:
         return EvaluationKind.NOT_SIMULATED
     if parameter not in TIMING:
         return EvaluationKind.OFFLINE
-    in_motion = with_graph and parameter.partition(".")[0] not in ("eyes", "projector")
-    return EvaluationKind.GRAPH if in_motion else EvaluationKind.NOT_MEASURED
+    moves_image_only = parameter.partition(".")[0] in ("eyes", "projector")
+    return EvaluationKind.NOT_MEASURED if moves_image_only else EvaluationKind.SIMULATED_TIME
 
 
 def run_sensitivity(
@@ -107,15 +103,13 @@ def run_sensitivity(
     *,
     profile: Profile,
     calibrated: bool,
-    with_graph: bool,
     seconds: float,
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
     """Vary the parameters one by one and return the results of `experiment sensitivity --json`.
 
-    folder: where the results of finished trials are stored. with_graph: also run the graph for
-    parameters whose effect occurs only in motion. seconds: duration of a stroke.
+    folder: where the results of finished trials are stored. seconds: duration of a stroke.
     """
     plan = load_graph(launch_file, settings=settings)
     scene = require_scene(plan)
@@ -126,37 +120,29 @@ def run_sensitivity(
         "calibrated": calibrated,
         "seconds": seconds,
     }
-    evaluations = {one: evaluation_of(one, with_graph=with_graph) for one in parameters}
-    folder.mkdir(parents=True, exist_ok=True)
-    trials: dict[str, dict[str, Any]] = {}
-    for parameter, evaluation in evaluations.items():
-        if evaluation is EvaluationKind.OFFLINE:
-            trials[_trial_name(parameter)] = {
-                **common,
-                "kind": "sensitivity",
-                "parameter": parameter,
-                "sigmas": SIGMAS,
-                "metrics": sorted(AFFECTED[parameter.partition(".")[0]]),
-            }
-        elif evaluation is EvaluationKind.GRAPH:
-            for sigma in SIGMAS:
-                name = _trial_name(parameter, sigma)
-                apparatus = deviate_apparatus(
-                    scene, parameter, sigma, profile=profile, calibrated=calibrated
-                )
-                file = folder / f"{name}.yaml"
-                write_file(file, format_apparatus(apparatus))
-                trials[name] = _stroke_trial(common, file)
-    if EvaluationKind.GRAPH in evaluations.values():
-        file = folder / "nominal.yaml"
-        write_file(file, format_apparatus(nominal_apparatus(scene)))
-        trials["nominal"] = _stroke_trial(common, file)
+    evaluations = {one: evaluation_of(one) for one in parameters}
+    trials = {
+        parameter.replace("*", "both"): {
+            **common,
+            "kind": "sensitivity",
+            "parameter": parameter,
+            "sigmas": SIGMAS,
+            "metrics": sorted(AFFECTED[parameter.partition(".")[0]]),
+            "stroke_seeds": STROKE_SEEDS if evaluation is EvaluationKind.SIMULATED_TIME else (),
+            "with_images": parameter in WITH_IMAGES,
+        }
+        for parameter, evaluation in evaluations.items()
+        if evaluation in (EvaluationKind.OFFLINE, EvaluationKind.SIMULATED_TIME)
+    }
     found = run_sweep(folder, common, trials, progress, workers=workers, scheduler=scheduler)
     raise_if_all_failed(found, folder)
+    effects = {
+        row["parameter"]: row["effects"] for row in found.values() if row.get("effects") is not None
+    }
     rows = [
-        row
+        _make_row(parameter, sigma, evaluation, effects.get(parameter))
         for parameter, evaluation in evaluations.items()
-        for row in _make_rows(parameter, evaluation, found)
+        for sigma in SIGMAS
     ]
     return {
         "profile": profile.value,
@@ -171,42 +157,25 @@ def run_sensitivity(
     }
 
 
-def _trial_name(parameter: str, sigma: float | None = None) -> str:
-    name = parameter.replace("*", "both")
-    return name if sigma is None else f"{name}-at-{sigma:+g}"
+def _make_row(
+    parameter: str,
+    sigma: float,
+    evaluation: EvaluationKind,
+    effects: Mapping[str, Mapping[str, float | None]] | None,
+) -> Row:
+    """Return the effects of one deviation; a metric that was not evaluated is None.
 
-
-def _stroke_trial(common: dict[str, Any], apparatus_file: Path) -> dict[str, Any]:
-    return {**common, "kind": "stroke", "apparatus": str(apparatus_file.resolve())}
-
-
-def _make_rows(parameter: str, evaluation: EvaluationKind, found: dict[str, Row]) -> list[Row]:
-    """Return the results of a parameter, one row per deviation; a metric without value is None.
-
-    Without a graph, an effect is the mean change of single vectors, pixels and pushes. With a graph
-    it is the mean error minus the mean error with the nominal apparatus.
+    At rest, an effect is the mean change of single vectors, pixels and pushes. In simulated time it
+    is the mean error minus the mean error with the nominal apparatus.
     """
-    rows = []
-    for sigma in SIGMAS:
-        row: Row = {"parameter": parameter, "sigma": sigma, "evaluation": evaluation.value}
-        row |= dict.fromkeys(Metric)
-        if evaluation is EvaluationKind.OFFLINE:
-            effects = found[_trial_name(parameter)].get("effects")
-            if effects is not None:
-                row |= dict.fromkeys(Metric, 0.0)
-                row |= {
-                    key: value for key, value in effects[f"{sigma:g}"].items() if value is not None
-                }
-        elif evaluation is EvaluationKind.GRAPH:
-            nominal, one = found["nominal"], found[_trial_name(parameter, sigma)]
-            if "error" not in nominal and "error" not in one:
-                for metric, key in (
-                    (Metric.SHEET, "true_delta_d_mm"),
-                    (Metric.FINGERTIP, "fingertip_mm"),
-                ):
-                    row[metric] = one[key]["mean"] - nominal[key]["mean"]
-        rows.append({getattr(key, "value", key): value for key, value in row.items()})
-    return rows
+    row: Row = {"parameter": parameter, "sigma": sigma, "evaluation": evaluation.value}
+    row |= {metric.value: None for metric in Metric}
+    if effects is None:
+        return row
+    if evaluation is EvaluationKind.OFFLINE:
+        row |= {metric.value: 0.0 for metric in Metric}
+    changes = effects[f"{sigma:g}"]
+    return row | {key: value for key, value in changes.items() if value is not None}
 
 
 def rank(scene: Scene, rows: Sequence[Row]) -> list[Row]:

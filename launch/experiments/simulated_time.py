@@ -228,7 +228,14 @@ class SimulatedArm:
     """A simulated arm: the control methods of its bridge, and the simulator's servo."""
 
     def __init__(
-        self, scene: Scene, side: Side, truth: ArmTruth, sheet: SheetMotion, *, lag_known: bool
+        self,
+        scene: Scene,
+        side: Side,
+        truth: ArmTruth,
+        sheet: SheetMotion,
+        *,
+        lag_known: bool,
+        seed: int = 0,
     ) -> None:
         self._geometry = ArmGeometry(scene, side)
         self._truth, self._sheet = truth, sheet
@@ -245,6 +252,7 @@ class SimulatedArm:
             waits_s = 0.5 * (truth.controller_period_s or 0.0)
             self._known_lag_s = lag_s + truth.command_latency_s + waits_s
         self._pending: deque[tuple[float, Floats]] = deque()
+        self._random = np.random.default_rng((seed, ("left", "right").index(side)))
         self._now_s = 0.0
 
     def sheet_to(self, other: SimulatedArm) -> SheetMotion:
@@ -309,6 +317,9 @@ class SimulatedArm:
         due_s, period_s = now_s + self._truth.command_latency_s, self._truth.controller_period_s
         if period_s:
             due_s = math.ceil(due_s / period_s) * period_s
+            if self._truth.controller_jitter_s:
+                due_s += self._truth.controller_jitter_s * float(self._random.standard_normal())
+                due_s = max(due_s, self._pending[-1][0] if self._pending else self._now_s)
         self._pending.append((due_s, self._commanded_rad))
         self._lag.on_command(now_s, self._commanded_rad)
         self._lag.on_measurement(now_s, self._servo.joints_rad)
@@ -318,12 +329,13 @@ class SimulatedSheet:
     """The simulated arms with the sheet between them."""
 
     def __init__(
-        self, scene: Scene, apparatus: Apparatus, sheet: SheetMotion, *, lag_known: bool
+        self, scene: Scene, apparatus: Apparatus, sheet: SheetMotion, settings: LoopSettings
     ) -> None:
         true_scene, truth = apply_apparatus(scene, apparatus), apparatus.arms
+        known, seed = settings.lag_known, settings.seed
         self.arms = (
-            SimulatedArm(scene, "left", truth.left, sheet, lag_known=lag_known),
-            SimulatedArm(scene, "right", truth.right, sheet, lag_known=lag_known),
+            SimulatedArm(scene, "left", truth.left, sheet, lag_known=known, seed=seed),
+            SimulatedArm(scene, "right", truth.right, sheet, lag_known=known, seed=seed),
         )
         self._models = ArmModel.of(true_scene.arms.left), ArmModel.of(true_scene.arms.right)
         self._pull = SheetPull.of(true_scene.sheet, apparatus)
@@ -365,9 +377,7 @@ class SimulatedLoop:
         self._truth, self._compliance = apparatus, compliance
         parameters = PlannerParameters.model_validate(dict(settings.planner))
         self.planner = SheetTrajectoryPlanner(scene, parameters.trajectory_settings())
-        self.sheet = SimulatedSheet(
-            scene, apparatus, self.planner.motion, lag_known=settings.lag_known
-        )
+        self.sheet = SimulatedSheet(scene, apparatus, self.planner.motion, settings)
         track = FilmedFinger if settings.with_images else MeasuredFinger
         self._tracked = track(scene, apparatus, settings)
         self._fixed_horizon_s = parameters.prediction_horizon_s

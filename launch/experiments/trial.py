@@ -24,14 +24,16 @@ from flexsheet.launch.experiments.run import (
     require_scene,
     run_experiment,
 )
+from flexsheet.launch.experiments.simulated_time import LoopSettings, stroke_in_simulated_time
 from flexsheet.launch.experiments.system_errors import ErrorEvaluator
 from flexsheet.launch.experiments.system_run import run_system
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.plans.plan import load_graph, load_scene
-from flexsheet.messages.apparatus import nominal_apparatus
+from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import Methods
+from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Status, SuspectedCause
 from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
 
@@ -168,26 +170,64 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the effects of deviations of one apparatus parameter, without a graph."""
-    plan = load_graph(Path(trial["launch_file"]))
-    scene = require_scene(plan)
-    evaluator = OfflineEvaluator(scene, NodeCalibrations.of(plan))
-    metrics = frozenset(Metric(name) for name in trial["metrics"])
+    """Return the effects of deviations of one apparatus parameter, without a graph.
 
-    speed_m_per_s = scene.working_range.speed_m_per_s
-    nominal = evaluator.evaluate(nominal_apparatus(scene), metrics, speed_m_per_s)
-    effects: dict[str, Any] = {}
-    for sigma in trial["sigmas"]:
-        apparatus = deviate_apparatus(
+    With `stroke_seeds`, strokes in simulated time are evaluated; otherwise the sheet at rest.
+    """
+    plan = load_graph(Path(trial["launch_file"]), settings=trial["settings"])
+    scene, calibrations = require_scene(plan), NodeCalibrations.of(plan)
+    apparatuses = {
+        f"{sigma:g}": deviate_apparatus(
             scene,
             trial["parameter"],
             sigma,
             profile=Profile(trial["profile"]),
             calibrated=trial["calibrated"],
         )
-        found = evaluator.evaluate(apparatus, metrics, speed_m_per_s)
-        effects[f"{sigma:g}"] = found.change_from(nominal)
+        for sigma in trial["sigmas"]
+    }
+    effects: dict[str, Any]
+    if trial["stroke_seeds"]:
+
+        def mean_errors(apparatus: Apparatus) -> dict[Metric, float]:
+            return _mean_stroke_errors(scene, apparatus, calibrations, trial)
+
+        before = mean_errors(nominal_apparatus(scene))
+        effects = {
+            key: {metric: value - before[metric] for metric, value in mean_errors(one).items()}
+            for key, one in apparatuses.items()
+        }
+    else:
+        evaluator = OfflineEvaluator(scene, calibrations)
+        metrics = frozenset(Metric(name) for name in trial["metrics"])
+        speed_m_per_s = scene.working_range.speed_m_per_s
+        nominal = evaluator.evaluate(nominal_apparatus(scene), metrics, speed_m_per_s)
+        effects = {
+            key: evaluator.evaluate(one, metrics, speed_m_per_s).change_from(nominal)
+            for key, one in apparatuses.items()
+        }
     return {"parameter": trial["parameter"], "effects": effects}
+
+
+def _mean_stroke_errors(
+    scene: Scene, apparatus: Apparatus, calibrations: NodeCalibrations, trial: Mapping[str, Any]
+) -> dict[Metric, float]:
+    """Return the mean errors (mm) of sheet and fingertip over strokes in simulated time."""
+    strokes = [
+        stroke_in_simulated_time(
+            scene,
+            apparatus,
+            LoopSettings(
+                seed=seed, calibrations=calibrations, with_images=bool(trial["with_images"])
+            ),
+            float(trial["seconds"]),
+        )
+        for seed in trial["stroke_seeds"]
+    ]
+    return {
+        metric: sum(one[key]["mean"] for one in strokes) / len(strokes)
+        for metric, key in ((Metric.SHEET, "true_delta_d_mm"), (Metric.FINGERTIP, "fingertip_mm"))
+    }
 
 
 def run_system_trial(trial: Mapping[str, Any]) -> Row:
