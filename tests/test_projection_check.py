@@ -226,3 +226,71 @@ def test_another_bright_point_and_a_mark_beside_the_sheet_are_ignored() -> None:
     results = check.results(camera_checked=True)
     assert set(results) == {"projector_moved", "arm_base_moved"}
     assert results["projector_moved"].value == pytest.approx(0.0, abs=1e-9)
+
+
+def check_heights(
+    heights_m: Any, ratios: Any, *, turning_rad_per_s: float = 0.0
+) -> ProjectionCheck:
+    """Return the check after 12 s in which the marks are seen above the expected surface.
+
+    heights_m, ratios (n,): heights of the marks, and their displacement ratios. turning_rad_per_s:
+    angular velocity of the expected sheet about its y axis.
+    """
+    check = ProjectionCheck(PROJECTOR)
+    flat = np.array([(x, y, 0.0) for x, y in PLACES])
+    for number in range(60):
+        light_ns = 1 + round(1e9 * FRAME_S * number)
+        expected = flat + np.array([0.0, 0.0, 1.0]) * (
+            turning_rad_per_s * FRAME_S * number * flat[:, :1]
+        )
+        check.on_frame(
+            Frame.model_construct(
+                light_ns=light_ns,
+                world_from_sheet=np.eye(4),
+                marks_world_m=expected,
+                marks_finger_ratio=np.asarray(ratios),
+            )
+        )
+        seen = expected + np.outer(heights_m, [0.0, 0.0, 1.0])
+        check.on_points(list(seen), np.zeros(3), light_ns + 100_000_000)
+    return check
+
+
+def test_heights_are_not_checked_while_the_sheet_turns() -> None:
+    heights = np.full(len(PLACES), 0.002)
+    still = check_heights(heights, np.zeros(len(PLACES))).results(camera_checked=True)
+    assert still["arm_base_moved"].suspected
+    turning = check_heights(heights, np.zeros(len(PLACES)), turning_rad_per_s=0.1)
+    assert set(turning.results(camera_checked=True)) == {"projector_moved"}
+
+
+def test_the_finger_depth_is_not_estimated_from_marks_far_from_the_finger() -> None:
+    far = np.array([0.05, 0.15, 0.03, 0.02, 0.01, 0.0])
+    near = np.array([0.05, 0.6, 0.03, 0.5, 0.01, 0.0])
+    heights = 0.003 * near
+    assert "marker_offset" not in check_heights(heights, far).results(camera_checked=True)
+    found = check_heights(heights, near).results(camera_checked=True)["marker_offset"]
+    assert found.suspected
+    assert found.value == pytest.approx(0.003)
+
+
+def test_a_point_belongs_to_one_mark_only() -> None:
+    check = ProjectionCheck(
+        PROJECTOR.model_copy(
+            update={"check_marks_sheet_m": ((0.0, 0.0), (0.0, 0.003), (0.05, 0.0))}
+        )
+    )
+    world = np.array([(0.0, 0.0, 0.0), (0.0, 0.003, 0.0), (0.05, 0.0, 0.0)])
+    for number in range(60):
+        light_ns = 1 + round(1e9 * FRAME_S * number)
+        check.on_frame(
+            Frame.model_construct(
+                light_ns=light_ns,
+                world_from_sheet=np.eye(4),
+                marks_world_m=world,
+                marks_finger_ratio=np.zeros(3),
+            )
+        )
+        hidden = world[[0, 2]]
+        check.on_points(list(hidden), np.zeros(3), light_ns + 1)
+    assert check.results(camera_checked=True)["projector_moved"].value == pytest.approx(0.0)

@@ -48,14 +48,20 @@ MAX_SPREAD_M = 0.004
 """The maximum deviation of a mark's offset from the median offset of all marks.  A point with a
 larger deviation is not a mark."""
 
-MAX_AGE_NS = 2_000_000_000
+MAX_AGE_NS = 300_000_000
+"""The maximum age of the newest frame at the exposure: with an older one, frames are missing."""
+
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
 """The maximum speed of the marks at which positions are checked, and the minimum speed at which the
 latency is checked."""
 
-MIN_RATIO_RANGE = 0.1
-"""The minimum difference between the displacement ratios of the marks.  The finger's depth is
-estimated only if their difference is larger."""
+MAX_DRIFT_M = 3e-4
+"""The maximum motion of a mark along the sheet's normal between the frame and the exposure.  With a
+larger motion, heights above the expected surface are not checked."""
+
+MAX_GAIN = 4.0
+"""The maximum standard deviation of the finger's estimated depth as a multiple of that of a mark's
+height.  With a larger gain, which marks far from the finger cause, the depth is not estimated."""
 
 
 class ProjectionCheck:
@@ -108,7 +114,8 @@ class ProjectionCheck:
         distances = np.where(np.isfinite(offsets).all(axis=2), np.linalg.norm(offsets, axis=2), 1.0)
         nearest = distances.argmin(axis=1)
         rows = np.arange(self._count)
-        found = distances[rows, nearest] <= MATCH_RADIUS_M
+        is_own = distances[:, nearest].argmin(axis=0) == rows  # a point belongs to one mark only
+        found = is_own & (distances[rows, nearest] <= MATCH_RADIUS_M)
         if found.sum() < 2:
             return
         offset = offsets[rows, nearest] - camera_shift_m
@@ -116,37 +123,40 @@ class ProjectionCheck:
         rays /= np.linalg.norm(rays, axis=1)[:, None]
         aside = offset - (offset * rays).sum(axis=1)[:, None] * rays
         found &= np.linalg.norm(aside - np.median(aside[found], axis=0), axis=1) <= MAX_SPREAD_M
-        velocity = self._velocity(shown[-1])
-        if velocity is None or found.sum() < 2:
+        velocities = self._velocities(shown[-1])
+        if velocities is None or found.sum() < 2:
             return
+        drifts_m = np.abs(velocities @ normal) * (at_ns - light_ns) * 1e-9
+        velocity = np.nanmean(velocities, axis=0)
+        ray = np.nanmean(rays, axis=0)
+        ray /= np.linalg.norm(ray)
+        velocity = velocity - (velocity @ ray) * ray
         speed = float(np.linalg.norm(velocity))
         if speed <= STILL_M_PER_S:
             scale = 1.0 / np.sqrt(self._count)
             last = self._ray.mean.reshape(-1, 3)
             self._ray.add(np.where(found[:, None], scale * aside, last).ravel(), at_ns)
-            self._add_surface((offset @ normal)[found], ratios[found], at_ns)
+            if np.nanmax(drifts_m) <= MAX_DRIFT_M:
+                self._add_surface((offset @ normal)[found], ratios[found], at_ns)
         elif speed >= MOVING_M_PER_S:
             # A frame that appears later than expected shows each mark where it was before.
             constant = np.sqrt(self._count) * self._ray.mean.reshape(-1, 3)
             late = -(aside - constant)[found].mean(axis=0) @ velocity / speed**2
             self._latency.add(np.array([late]), at_ns)
 
-    def _velocity(self, number: int) -> Floats | None:
-        """Return the marks' mean velocity (3,) m/s in a frame, perpendicular to their rays.
+    def _velocities(self, number: int) -> Floats | None:
+        """Return the velocities (n, 3) of the marks in a frame, m/s; NaN for marks off the sheet.
 
-        number: index of the frame in `_frames`.  Returns None if the velocity is unknown.
+        number: index of the frame in `_frames`.  Returns None if no velocity is known.
         """
         if number == 0:
             return None
         (before_ns, before, *_), (now_ns, now, *_) = self._frames[number - 1], self._frames[number]
         step_s = (now_ns - before_ns) * 1e-9
-        on_sheet = np.isfinite(now - before).all(axis=1)
+        on_sheet = np.asarray(np.isfinite(now - before).all(axis=1))
         if step_s <= 0.0 or not on_sheet.any():
             return None
-        velocity = (now - before)[on_sheet].mean(axis=0) / step_s
-        ray = now[on_sheet].mean(axis=0) - self._projector_m
-        ray /= np.linalg.norm(ray)
-        return np.asarray(velocity - (velocity @ ray) * ray)
+        return np.asarray(np.where(on_sheet[:, None], (now - before) / step_s, np.nan))
 
     def _add_surface(self, heights_m: Floats, ratios: Floats, at_ns: int) -> None:
         """Add the heights (n,) m of the marks above the expected surface of the sheet.
@@ -155,12 +165,15 @@ class ProjectionCheck:
         """
         if not ratios.any():
             self._surface.add(np.array([heights_m.mean()]), at_ns)
-        elif len(ratios) >= 3 and float(np.ptp(ratios)) >= MIN_RATIO_RANGE:
-            # heights = height of the sheet + ratio * height of the true finger pad
-            design = np.column_stack([np.ones(len(ratios)), ratios])
-            (height_m, finger_m), *_ = np.linalg.lstsq(design, heights_m, rcond=None)
-            self._surface.add(np.array([height_m]), at_ns)
-            self._finger.add(np.array([finger_m]), at_ns)
+            return
+        spread = float(((ratios - ratios.mean()) ** 2).sum())
+        if len(ratios) < 3 or spread < 1.0 / MAX_GAIN**2:
+            return
+        # heights = height of the sheet + ratio * height of the true finger pad
+        design = np.column_stack([np.ones(len(ratios)), ratios])
+        (height_m, finger_m), *_ = np.linalg.lstsq(design, heights_m, rcond=None)
+        self._surface.add(np.array([height_m]), at_ns)
+        self._finger.add(np.array([finger_m]), at_ns)
 
     def results(self, *, camera_checked: bool) -> dict[SuspectedCause, SelfCheck]:
         """Return the results of all checks that have data, by cause.
