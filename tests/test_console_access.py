@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gzip
 import logging
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -102,7 +103,7 @@ def test_beyond_loopback_there_is_no_page_without_a_token(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_the_page_is_served_with_our_style_and_script(packed: bool) -> None:
+def test_the_page_is_served_with_our_title_style_and_script(packed: bool) -> None:
     def answer(page: bytes, kind: str = "text/html; charset=utf-8") -> Response:
         body = gzip.compress(page) if packed else page
         headers = Headers({"Content-Type": kind, "Content-Length": str(len(body))})
@@ -113,6 +114,7 @@ def test_the_page_is_served_with_our_style_and_script(packed: bool) -> None:
     assert served.headers.get_all("Content-Length") == [str(len(served.body))]
     page = gzip.decompress(served.body) if packed else bytes(served.body)
     head, _, rest = page.partition(b"</head>")
+    assert re.findall(rb"<title>(.*?)</title>", head) == [b"flexsheet console"]
     assert b"--fs-text" in head
     assert b"E-STOP" in head
     assert rest == b"<body></body></html>"

@@ -50,6 +50,7 @@ INKED_POINTS = """() => {
 class PageVisit:
     """Results of one visit to the page."""
 
+    title: str = ""
     ran: list[Any] = field(default_factory=list)
     texts: dict[str, str] = field(default_factory=dict)
     options: list[str] = field(default_factory=list)
@@ -193,6 +194,7 @@ async def visit() -> PageVisit:
         async with browser_tab() as tab:
             await tab.goto(url)
             await expect(tab.get_by_role("button", name="E-STOP")).to_be_visible()
+            found.title = await tab.title()
             await show_names_with_markup(page, tab, found)
             await measure_layout(page, tab, found)
             await draw_a_single_sample(page, tab, found)
@@ -205,6 +207,10 @@ async def visit() -> PageVisit:
 @pytest.fixture(scope="module")
 def found() -> PageVisit:
     return asyncio.run(visit())
+
+
+def test_the_browser_shows_the_title_of_the_console(found: PageVisit) -> None:
+    assert found.title == "flexsheet console"
 
 
 def test_markup_in_names_is_shown_as_text_and_not_run(found: PageVisit) -> None:

@@ -1,13 +1,15 @@
-"""Add the console's style and script to the head of viser's page.
+"""Add the console's title, style and script to the head of viser's page.
 
-viser's page has sliders without names, folders that no key opens, labels with too little contrast,
-and only a red dot for a lost connection. The files page.css and page.js correct these defects. A
-page without a head element is served unchanged.
+viser's page has the title "Viser", sliders without names, folders that no key opens, labels with
+too little contrast, and only a red dot for a lost connection. This module replaces the title. The
+files page.css and page.js correct the other defects. A page without a head element is served
+unchanged.
 """
 
 from __future__ import annotations
 
 import gzip
+import re
 from functools import lru_cache
 from pathlib import Path
 
@@ -16,10 +18,12 @@ from websockets.http11 import Response
 
 HERE = Path(__file__).resolve().parent
 HEAD_END = b"</head>"
+VISER_TITLE = re.compile(rb"<title>[^<]*</title>")
+TITLE = b"<title>flexsheet console</title>"
 
 
 def inject_assets(response: Response) -> Response:
-    """Add style and script to the response of an HTML page. Return other responses unchanged."""
+    """Change title, style and script of an HTML page. Return other responses unchanged."""
     kind = response.headers.get("Content-Type", "")
     if response.status_code != 200 or not kind.startswith("text/html"):
         return response
@@ -39,5 +43,5 @@ def _with_head(body: bytes, packed: bool) -> bytes:
         return body
     style, script = ((HERE / name).read_bytes() for name in ("page.css", "page.js"))
     ours = b"<style>" + style + b"</style><script>" + script + b"</script>"
-    page = before + ours + end + after
+    page = VISER_TITLE.sub(TITLE, before) + ours + end + after
     return gzip.compress(page) if packed else page
