@@ -26,6 +26,7 @@ from flexsheet.launch.health.compliance import (
     find_loop_risk,
 )
 from flexsheet.launch.plans.plan import load_graph, load_scene
+from flexsheet.launch.running.precompute import report_time_left
 from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.types import SoftBody
 from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel, SheetPush
@@ -279,6 +280,18 @@ def test_the_doctor_reports_whether_a_scenes_object_can_be_presented(
     shown = CliRunner().invoke(app, command)
     assert shown.exit_code == code
     assert "stretch" in shown.stdout
+    assert "computing the rendered force" in shown.stderr
+
+
+def test_progress_is_reported_again_when_another_computation_starts() -> None:
+    """The force curve needs the soft body and then its table, which takes minutes."""
+    reports: list[str] = []
+    on_progress = report_time_left("computing", reports.append)
+    for total, last in ((2, 2), (500, 60)):
+        for done in range(last + 1):
+            on_progress(done, total)
+    percents = [one.removeprefix("computing: ").split(",")[0] for one in reports]
+    assert percents == ["0 %", "50 %", "100 %", "0 %", "10 %"]
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,8 @@ def compliance(
     with progress_words() as progress:
         on_progress = report_time_left("computing the object's force curve (only once)", progress)
         curve = ObjectCurve.from_rows(compute_front_curve(scene, on_progress=on_progress))
-    result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms)
+        progress("computing the rendered force")
+        result = compliance_result(scene, law, curve, delay_s=1e-3 * delay_ms)
     if as_json:
         print_json(result)
     else:

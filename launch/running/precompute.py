@@ -72,13 +72,19 @@ def precompute_deflection_shapes(
 
 
 def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
-    """Return a function (done, total) that reports progress and remaining time in steps."""
+    """Return a function (done, total) that reports progress and remaining time in steps.
+
+    If `total` changes, or `done` decreases, the reports start again.
+    """
     from flexsheet.nodes.cache import EtaEstimator
 
-    eta, next_ratio = EtaEstimator(), 0.0
+    eta, next_ratio, last = EtaEstimator(), 0.0, (0, 0)
 
     def on_progress(done: int, total: int) -> None:
-        nonlocal next_ratio
+        nonlocal next_ratio, last
+        if done < last[0] or total != last[1]:
+            next_ratio = 0.0
+        last = done, total
         progress_text = eta.text(done, total, time.monotonic())
         if done >= next_ratio * total:
             progress(f"{what}: {progress_text}")
