@@ -10,10 +10,13 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+from pydantic import Field
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.types import ArmState, EStop, Fingertip, ParameterChange, Side, TwinFinger
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.recorder.node import Recorder
+from flexsheet.nodes.recorder.parameters import RecorderParameters
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 
@@ -147,6 +150,22 @@ class StandInBridge(Node):
         self.arm.publish(
             arm_state(side, mode=mode, faults=faults, estop_engaged=stopped is not None)
         )
+
+
+class SlowRecorderParameters(RecorderParameters):
+    closes_after: Path = Field(description="file that must exist before the bag is closed")
+
+
+class SlowRecorder(Recorder):
+    """Record topics, and close the bag when a file exists."""
+
+    parameters: SlowRecorderParameters
+
+    async def close(self) -> None:
+        self.log.info("waiting before the bag is closed")
+        while not self.parameters.closes_after.exists():  # noqa: ASYNC110  # a test creates it
+            await asyncio.sleep(0.01)
+        await super().close()
 
 
 class CrashParameters(NodeParameters):

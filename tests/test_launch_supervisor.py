@@ -21,7 +21,9 @@ from typing import Any
 import psutil
 import pytest
 import zmq
+from mcap.writer import MCAP0_MAGIC
 
+from flexsheet.launch.commands.launching import run_graph
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -554,6 +556,51 @@ def test_an_interrupt_that_is_ignored_by_inheritance_ends_a_graph(
     process.communicate(timeout=DEADLINE_S)
     assert process.returncode == (0 if ready else -signal.SIGINT)
     assert_nothing_left(runs_root)
+
+
+@pytest.mark.parametrize(
+    ("signals", "grace_s", "complete"),
+    [(1, DEADLINE_S, True), (2, DEADLINE_S, True), (3, DEADLINE_S, False), (1, 0.2, False)],
+)
+async def test_an_unfinished_bag_is_reported_before_its_recorder_is_killed(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    signals: int,
+    grace_s: float,
+    complete: bool,
+) -> None:
+    monkeypatch.setattr(supervisor, "STOP_GRACE_S", grace_s)
+    bag, mark = tmp_path / "run.mcap", tmp_path / "mark"
+    recorder = {
+        "type": "tests.launch_nodes:SlowRecorder",
+        "parameters": {"bag": str(bag), "closes_after": str(mark)},
+    }
+    started: list[runs.Run] = []
+    plan = plan_of(tmp_path, beacon=beacon(), recorder=recorder)
+    graph = asyncio.create_task(run_graph(plan, None, None, when_ready=started.append))
+    await until(lambda: started, "the nodes to be ready")
+    log, own_log = (started[0].logs / f"{name}.log" for name in ("launch", "recorder"))
+
+    async def interrupt(log: Path, words: str) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        await until(lambda: words in log.read_text(), words)
+
+    unfinished = f"flexsheet bag recover {bag} -o NEW"
+    if grace_s < DEADLINE_S:
+        await interrupt(log, unfinished)
+    else:
+        await interrupt(own_log, "waiting before the bag is closed")
+    if signals >= 2:
+        await interrupt(log, f"the bag {bag} is not closed yet")
+        assert "still stopping: recorder; Ctrl-C again kills them" in log.read_text()
+        assert not graph.done()
+    if signals >= 3:
+        await interrupt(log, unfinished)
+    if complete:
+        mark.touch()
+    assert await graph == 0
+    assert (unfinished in log.read_text()) is not complete
+    assert bag.read_bytes().endswith(MCAP0_MAGIC) is complete
 
 
 @pytest.mark.alone

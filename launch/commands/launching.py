@@ -191,6 +191,8 @@ async def run_graph(
 ) -> int:
     """Run a graph until a signal arrives, and return the exit code.
 
+    The second signal reports the nodes that have not exited, and the third kills them.
+
     duration_s: time after all nodes are ready when the graph is stopped; None for no limit.
     without: names of nodes that are not started.
     """
@@ -199,10 +201,16 @@ async def run_graph(
     stop_requested = asyncio.Event()
     graph = RunningGraph(plan, host=host, without=without, report=_print_log_line)
 
+    signals = 0
+
     def on_signal() -> None:
-        if stop_requested.is_set():
-            graph.kill_all()
+        nonlocal signals
+        signals += 1
         stop_requested.set()
+        if signals == 2:
+            graph.warn_of_running_nodes()
+        elif signals > 2:
+            graph.kill_all()
 
     with handle_signals(on_signal, *_list_end_signals()):
         return await _run_until(graph, stop_requested, duration_s, when_ready)

@@ -17,9 +17,11 @@ import asyncio
 import json
 import os
 import signal
+import stat
 import subprocess
 from collections import deque
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -410,10 +412,38 @@ class RunningGraph:
         """Send a signal to the process of a node, to simulate a fault."""
         os.kill(self.pids[node], number)
 
+    def warn_of_running_nodes(self) -> None:
+        """Report the nodes that have not exited, and the bags that are not closed."""
+        if names := list(self.pids):
+            self._report(LAUNCHER, f"still stopping: {', '.join(names)}; Ctrl-C again kills them")
+        for bag in self._list_open_bags(self._children.values()):
+            self._report(LAUNCHER, f"the bag {bag} is not closed yet; wait for it")
+
     def kill_all(self) -> None:
         """Kill all nodes immediately, without the grace periods of `stop`."""
-        for child in self._children.values():
-            child.signal(signal.SIGKILL)
+        self._send(signal.SIGKILL, self._children.values())
+
+    def _send(self, number: int, children: Collection[Child]) -> None:
+        """Send a signal to processes. Before SIGKILL, report the bags that it may truncate."""
+        for bag in self._list_open_bags(children) if number == signal.SIGKILL else ():
+            self._report(
+                LAUNCHER,
+                f"the bag {bag} may be incomplete, because its recorder is killed; write its "
+                f"readable messages to a new bag: flexsheet bag recover {bag} -o NEW",
+            )
+        for child in children:
+            child.signal(number)
+
+    def _list_open_bags(self, children: Collection[Child]) -> list[Path]:
+        """Return the bags to which the recorders in these processes write."""
+        pids = {child.pid for child in children}
+        recorders = {one.name for one in self.nodes if one.role is NodeRole.RECORDER}
+        return [
+            file
+            for name, pid in self.pids.items()
+            if name in recorders and pid in pids
+            for file in list_written_files(pid)
+        ]
 
     async def stop(self) -> None:
         """End all nodes by SIGINT, SIGTERM and SIGKILL, and remove sockets; may be called twice."""
@@ -461,7 +491,17 @@ class RunningGraph:
         }
         others = self._children.keys() - readers - arms
         for names in (others, arms, readers):
-            await _terminate([self._children[name] for name in names if name in self._children])
+            await self._terminate(
+                [self._children[name] for name in names if name in self._children]
+            )
+
+    async def _terminate(self, children: list[Child]) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            alive = [child for child in children if not child.exited.done()]
+            if not alive:
+                return
+            self._send(number, alive)
+            await asyncio.wait([child.exited for child in alive], timeout=STOP_GRACE_S)
 
     def _start(self) -> None:
         _check_network(self.plan, self._host)
@@ -797,14 +837,21 @@ def _describe_process(process: ResolvedProcess) -> str:
     return f"{process.name} ({', '.join(names)}) is"
 
 
-async def _terminate(children: list[Child]) -> None:
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-        alive = [child for child in children if not child.exited.done()]
-        if not alive:
-            return
-        for child in alive:
-            child.signal(number)
-        await asyncio.wait([child.exited for child in alive], timeout=STOP_GRACE_S)
+def list_written_files(pid: int) -> list[Path]:
+    """Return the regular files that a process has open for writing; none if it has ended."""
+    try:
+        entries = list(Path(f"/proc/{pid}/fd").iterdir())
+    except OSError:
+        # The process has ended.
+        return []
+    files = []
+    for entry in entries:
+        # The process may have closed the file since.
+        with suppress(OSError):
+            # The permissions of an entry are the access mode of its descriptor.
+            if entry.lstat().st_mode & stat.S_IWUSR:
+                files.append(entry.readlink())
+    return [file for file in files if file.is_file()]
 
 
 def node_config(plan: ResolvedGraph, node: ResolvedNode, run: Run) -> NodeConfig:
