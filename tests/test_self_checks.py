@@ -29,6 +29,7 @@ from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.self_checks import CameraCheck
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt
+from flexsheet.nodes.twin.arms import Servo
 from flexsheet.nodes.twin.clutter import CLUTTER, FixedPoint, SecondMarker
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.tolerance_table import sample_apparatus
@@ -239,7 +240,7 @@ def move_arm(
     half = 0.5 * pace * truth.servo_lag_s
     amplitude, delay = size / (1.0 + half**2), 2.0 * np.arctan(half)
     estimator = ServoLagEstimator(CONFIGURED_LAG_S, LagBounds(0.002, 0.1))
-    check, now_s = ServoCheck("left", CONFIGURED_LAG_S), 0.0
+    check, now_s = ServoCheck("left", CONFIGURED_LAG_S, 1.0 / 70.0), 0.0
     results: tuple[SelfCheck, ...] = ()
     number = 0
     while now_s < seconds:
@@ -249,7 +250,7 @@ def move_arm(
         read_s, answer_s = now_s + 0.0001, now_s + 0.5 * round_trip_s
         moved = (amplitude * np.sin(pace * (read_s - late_s) + phase - delay)).sum(axis=0)
         estimator.on_measurement(answer_s, moved + 5e-6 * random.standard_normal(6))
-        results = check.update(estimator.estimate, round_trip_s, round(1e9 * answer_s))
+        results = check.update(estimator.estimate, round(1e9 * answer_s))
         if number % 35 == 0:
             yield results
 
@@ -275,6 +276,59 @@ def test_late_answers_of_an_overloaded_computer_are_not_a_shorter_lag() -> None:
     assert suspected(last) == set()
     *_, last = move_arm(110, 10.0, 0.03, round_trip_s=0.008)
     assert suspected(last) == {"servo_lag"}
+
+
+MOTION_S = 10.0
+
+
+def move_arm_on_overloaded_computer(
+    seed: int, *, stall_ratio: float, stall_s: float, extra_lag_s: float
+) -> list[tuple[SelfCheck, ...]]:
+    """Return the checks of an arm that moves for MOTION_S and then rests for the same time.
+
+    During the motion, bridge and simulator wait for a processor core. stall_ratio: fraction of
+    their steps that wait. stall_s: mean waiting time.
+    """
+    random, period_s = np.random.default_rng((seed, 24)), 1.0 / 140.0
+    pace = 2.0 * np.pi * random.uniform(0.2, 1.2, (3, 6))
+    phase, size = random.uniform(0.0, 2.0 * np.pi, (3, 6)), random.uniform(0.005, 0.03, (3, 6))
+    servo = Servo((size * np.sin(phase)).sum(axis=0), CONFIGURED_LAG_S + extra_lag_s)
+    configured_s = CONFIGURED_LAG_S + 0.5 * period_s
+    estimator = ServoLagEstimator(configured_s, LagBounds(0.002, 0.1))
+    check = ServoCheck("left", configured_s, period_s)
+
+    def wait_s() -> float:
+        is_stalled = sent_s < MOTION_S and random.random() < stall_ratio
+        return 1e-4 + (float(random.exponential(stall_s)) if is_stalled else 0.0)
+
+    results = []
+    active, servo_s, sent_s, received_s, checked_s = servo.joints_rad, 0.0, 0.0, 0.0, 0.0
+    while sent_s < 2.0 * MOTION_S:
+        sent_s = max(sent_s + period_s, received_s) + wait_s()
+        command = (size * np.sin(pace * min(sent_s, MOTION_S) + phase)).sum(axis=0)
+        arrived_s = sent_s + wait_s()
+        servo.advance(active, arrived_s - servo_s)
+        servo_s, active = arrived_s, command
+        received_s = arrived_s + wait_s()
+        estimator.on_command(sent_s, command)
+        estimator.on_measurement(0.5 * (sent_s + received_s), servo.joints_rad)
+        if received_s > checked_s + 0.1:
+            checked_s = received_s
+            results.append(check.update(estimator.estimate, round(1e9 * received_s)))
+    return results
+
+
+@pytest.mark.parametrize(("seed", "stall_ratio"), [(100, 0.3), (101, 0.3), (102, 0.4)])
+@pytest.mark.parametrize(("extra_lag_s", "causes"), [(0.0, set()), (0.02, {"servo_lag"})])
+def test_an_overloaded_computer_is_not_a_longer_lag(
+    seed: int, stall_ratio: float, extra_lag_s: float, causes: set[str]
+) -> None:
+    results = move_arm_on_overloaded_computer(
+        seed, stall_ratio=stall_ratio, stall_s=0.01, extra_lag_s=extra_lag_s
+    )
+    lag = next(one for one in results[-1] if one.cause == "servo_lag")
+    assert lag.value - lag.expected == pytest.approx(extra_lag_s, abs=0.005)
+    assert set().union(*map(suspected, results)) == causes
 
 
 async def test_the_triangulator_names_a_moved_camera_from_images() -> None:

@@ -158,7 +158,7 @@ def test_the_tracking_error_of_a_servo_is_the_expected_one() -> None:
 def feed(delay: ActuationDelayEstimator, sent_ms: float, *, is_measured: bool = True) -> None:
     """Pass 600 fingertips of age 10 ms, and the reports of an arm with a lag of 60 ms."""
     lag, latency, last = ServoLagEstimator(0.06, BOUNDS), LatencyMean(), LastExchange()
-    lag.estimate = LagEstimate(0.06, 0.001, 0.0, 0.0) if is_measured else None
+    lag.estimate = LagEstimate(0.06, 0.001, 0.0, 0.0, 0.0, 0.0) if is_measured else None
     for number in range(1, 601):
         source_ns = 16_000_000 * number
         delay.on_fingertip(0.01)

@@ -94,7 +94,7 @@ class ArmBridge(Node):
                 max(given.max_servo_lag_s, given.servo_lag_s),
             ),
         )
-        self._servo_check = ServoCheck(given.side, given.servo_lag_s)
+        self._servo_check = ServoCheck(given.side, given.servo_lag_s, 1.0 / given.rate_hz)
         self._geometry: ArmGeometry | None = None
         self._last, self._cycle_ns, self._failures = LastExchange(), 0, 0
         self._latency, self._checked_ns = LatencyMean(), 0
@@ -245,10 +245,7 @@ class ArmBridge(Node):
             self._lag.on_measurement(0.5e-9 * (last.sent_ns + last.measured_ns), status.joints_rad)
             if last.measured_ns - self._checked_ns >= CHECK_PERIOD_NS:
                 self._checked_ns = last.measured_ns
-                round_trip_s = (last.measured_ns - last.sent_ns) * 1e-9
-                self.self_checks = self._servo_check.update(
-                    self._lag.estimate, round_trip_s, last.measured_ns
-                )
+                self.self_checks = self._servo_check.update(self._lag.estimate, last.measured_ns)
         if self._control.mode == "follow" and (latency_s := self._latency.add(last, self._lag)):
             self.arm_latency.publish(ArmLatency(side=self.parameters.side, latency_s=latency_s))
 

@@ -21,26 +21,27 @@ per joint)."""
 class ServoCheck:
     """The self-checks of one arm that use estimates of the arm's lag.
 
-    configured_lag_s: lag of the arm in the parameters.
+    configured_lag_s: lag of the arm in the parameters. command_period_s: period of its commands.
+
+    An overloaded computer sends commands late and reads answers late, which changes the measured
+    lag of a correct arm. A deviation that both delays together explain is ignored.
     """
 
-    def __init__(self, side: Side, configured_lag_s: float) -> None:
+    def __init__(self, side: Side, configured_lag_s: float, command_period_s: float) -> None:
         self._side, self._configured_lag_s = side, configured_lag_s
+        self._command_period_s = command_period_s
         self._lag = ResidualMonitor(1, threshold=LAG_THRESHOLD_S)
         self._tracking = ResidualMonitor(1, threshold=TRACKING_THRESHOLD_RAD)
         self._expected_rad = 0.0
 
-    def update(
-        self, estimate: LagEstimate | None, round_trip_s: float, at_ns: int
-    ) -> tuple[SelfCheck, ...]:
-        """Add the newest estimate of the lag, and return the checks that have enough data.
-
-        round_trip_s: time from a command to its answer. The estimate may be wrong by half of this
-        time, because the arm reads its joint angles at an unknown time in between.
-        """
+    def update(self, estimate: LagEstimate | None, at_ns: int) -> tuple[SelfCheck, ...]:
+        """Add the newest estimate of the lag, and return the checks that have enough data."""
         if estimate is not None:
             deviation_s = estimate.lag_s - self._configured_lag_s
-            error_s = 0.5 * max(round_trip_s, 0.0)
+            # The arm holds a command until the next one, on average half an interval too long. It
+            # reads its joint angles at an unknown time between the command and the answer.
+            late_s = max(estimate.command_interval_s - self._command_period_s, 0.0)
+            error_s = 0.5 * late_s + estimate.answer_delay_s
             excess_s = deviation_s - min(max(deviation_s, -error_s), error_s)
             self._lag.add(np.array([excess_s]), at_ns)
             self._expected_rad = estimate.expected_error_rad

@@ -85,12 +85,17 @@ class LagEstimate:
     tracking_error_rad: standard deviation of measured minus commanded joint angles at this lag
         (norm over the joints).
     expected_error_rad: tracking error of a critically damped servo with this lag and motion.
+    answer_delay_s: mean time from a command to the measurement.
+    command_interval_s: mean interval between commands. Both means are weighted by the square of the
+        speed, because faster motion determines the lag more.
     """
 
     lag_s: float
     uncertainty_s: float
     tracking_error_rad: float
     expected_error_rad: float
+    answer_delay_s: float
+    command_interval_s: float
 
 
 class ServoLagEstimator:
@@ -121,6 +126,8 @@ class ServoLagEstimator:
         self._speed_mean, self._speed_square = np.zeros(6), 0.0
         self._position_mean, self._position_square = np.zeros(6), 0.0
         self._bend_square = 0.0
+        # Answer delay and command interval, and the weight of these means.
+        self._timing_s, self._timing_weight = np.zeros(2), 0.0
         self._last_s: float | None = None
 
     def on_command(self, at_s: float, joints_rad: Floats) -> None:
@@ -153,7 +160,8 @@ class ServoLagEstimator:
         self._last_s = at_s
         if not 0.0 < step_s <= 2.0 * MAX_GAP_S:
             return
-        self._add(joints_rad, np.asarray(wanted_s, dtype=np.float64), step_s)
+        timing_s = np.array([at_s - times[-1], times[-1] - times[-2]])
+        self._add(joints_rad, np.asarray(wanted_s, dtype=np.float64), timing_s, step_s)
         found = self._solve()
         if found is None:
             return
@@ -162,11 +170,12 @@ class ServoLagEstimator:
         limit_s = MAX_SLEW_S_PER_S * step_s
         self.lag_s = self._bounds.clip(self.lag_s + min(max(change_s, -limit_s), limit_s))
 
-    def _add(self, measured: Floats, wanted_s: Floats, step_s: float) -> None:
+    def _add(self, measured: Floats, wanted_s: Floats, timing_s: Floats, step_s: float) -> None:
         """Add one measurement to the weighted means and variances of all lags.
 
         measured (6,): measured joint angles, rad. wanted_s: times of the commands to compare, one
-            per lag. step_s: weight of the measurement.
+            per lag. timing_s (2,): answer delay and command interval. step_s: weight of the
+            measurement.
         """
         times, joints = self._times_s[: self._count], self._joints[: self._count]
         # For times after the newest command, that command is used.
@@ -191,6 +200,10 @@ class ServoLagEstimator:
             self._position_mean, self._position_square, commanded[1], gain
         )
         self._bend_square += gain * (float(bend @ bend) - self._bend_square)
+        weight = step_s * float(speeds @ speeds)
+        self._timing_weight = kept * self._timing_weight + weight
+        if weight > 0.0:
+            self._timing_s += weight / self._timing_weight * (timing_s - self._timing_s)
 
     def _solve(self) -> LagEstimate | None:
         """Return the lag with the smallest variance, or None if the motion is insufficient."""
@@ -218,7 +231,14 @@ class ServoLagEstimator:
         uncertainty_s = math.sqrt(noise / (samples * self._speed_square))
         if not uncertainty_s <= MAX_UNCERTAINTY_S:
             return None
-        return LagEstimate(lag_s, uncertainty_s, math.sqrt(smallest), expected)
+        return LagEstimate(
+            lag_s,
+            uncertainty_s,
+            math.sqrt(smallest),
+            expected,
+            answer_delay_s=float(self._timing_s[0]),
+            command_interval_s=float(self._timing_s[1]),
+        )
 
 
 def _are_joints(joints_rad: Floats) -> bool:
