@@ -185,7 +185,12 @@ def test_help_and_the_table_of_topics_load_no_heavy_library() -> None:
 def test_topic_list_is_the_table(flexsheet: Command) -> None:
     rows = flexsheet("topic", "list", "--json").json()
     assert [row["topic"] for row in rows] == list(TOPICS)
-    assert "twin/finger_path" in flexsheet("topic", "list").out
+    assert {row["topic"]: row["expected_rate_hz"] for row in rows}["stereo"] == [30, 130]
+    heading, *lines = flexsheet("topic", "list").out.splitlines()
+    assert heading.split()[:4] == ["topic", "message", "delivery", "expected_rate_hz"]
+    shown = {line.split()[0]: line.split()[3:5] for line in lines}
+    assert shown["stereo"][0] == "30-130"
+    assert shown["twin/finger_path"] == ["on", "change"]
 
 
 def test_node_types_and_info(flexsheet: Command) -> None:

@@ -30,7 +30,7 @@ def render_topics() -> str:
         )
         for topic in TOPICS.values()
     ]
-    heads = ("topic", "type", "delivery", "rate", "writers", "recorded", "at most", "what")
+    heads = ("topic", "type", "delivery", "expected rate", "writers", "recorded", "at most", "what")
     return format_table(heads, rows)
 
 

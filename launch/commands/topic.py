@@ -53,7 +53,11 @@ SHORT_ARRAY = 36
     epilog=examples("flexsheet topic list", "flexsheet topic list --json"),
 )
 def list_topics(as_json: JsonOption = False) -> None:
-    """List all topics with message type, delivery, rate and description."""
+    """List all topics with message type, delivery, expected rate and description.
+
+    The expected rate is a fixed range for health checks, or "on change" for a topic without one.
+    `flexsheet topic hz TOPIC` measures the rate in the running graph.
+    """
     from flexsheet.messages.topics import TOPICS
 
     rows = [_describe(topic) for topic in TOPICS.values()]
@@ -61,10 +65,10 @@ def list_topics(as_json: JsonOption = False) -> None:
         print_json(rows)
         return
     for row in rows:
-        rate = row["rate_hz"]
-        row["rate_hz"] = "on change" if rate is None else "{:g}-{:g}".format(*rate)
+        rate = row["expected_rate_hz"]
+        row["expected_rate_hz"] = "on change" if rate is None else "{:g}-{:g}".format(*rate)
         row["logged"] = "yes" if row["logged"] else ""
-    names = ("topic", "message", "delivery", "rate_hz", "logged", "about")
+    names = ("topic", "message", "delivery", "expected_rate_hz", "logged", "about")
     print_rows([{name: row[name] for name in names} for row in rows], as_json=False)
 
 
@@ -405,7 +409,7 @@ def _describe(topic: Topic) -> dict[str, Any]:
         "topic": topic.name,
         "message": topic.message.__name__,
         "delivery": str(topic.delivery),
-        "rate_hz": topic.rate_hz,
+        "expected_rate_hz": topic.rate_hz,
         "logged": topic.logged,
         "many_writers": topic.many_writers,
         "max_bytes": topic.max_bytes,
