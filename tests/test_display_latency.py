@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from flexsheet.launch.calibration.commission import StepName
+from flexsheet.launch.calibration.commission import REPORT_FILE, StepName, list_doubts
 from flexsheet.launch.calibration.delays import MeasuredDelays, MeasuredLag
 from flexsheet.launch.calibration.display_latency import (
     MIN_SWITCHES,
@@ -19,6 +20,7 @@ from flexsheet.launch.calibration.display_latency import (
     read_switch_images,
     simulate_switch_images,
 )
+from flexsheet.launch.commands.commission import summarize
 from flexsheet.launch.commands.commission_steps import open_laboratory
 from flexsheet.launch.experiments.run import SWITCH_INTERVAL_S
 from flexsheet.launch.plans.documents import edit_yaml
@@ -217,6 +219,19 @@ def test_the_latency_goes_to_the_renderer_in_a_common_clock(
     written = load_graph(lab.launch_copy).nodes["renderer"].parameters["display_latency_s"]
     assert written == pytest.approx(1e-3 * expected_ms, abs=1e-3)
     images.clear()
-    with pytest.raises(DisplayLatencyError, match="0 switches") as caught:
-        lab.run(StepName.DELAYS, devices.steps[StepName.DELAYS])
-    assert "--switches 60" in caught.value.remedy
+    result = lab.run(StepName.DELAYS, devices.steps[StepName.DELAYS])
+    (missing,) = result.missing
+    assert missing.quantity == "display_latency"
+    assert "0 switches" in missing.reason
+    assert "--switches 60" in missing.reason
+    assert result.uncertainty.keys() == {"left_lag_ms", "stamp_offset_ms"}
+    nodes = load_graph(lab.launch_copy).nodes
+    assert nodes["arm_left_bridge"].parameters["servo_lag_s"] == 0.04
+    before = load_graph(tmp_path / "launch.yaml").nodes["renderer"].parameters
+    assert nodes["renderer"].parameters["display_latency_s"] == before["display_latency_s"]
+    figures: dict[str, Any] = {"predicted": {}, "flagged": []}
+    doubts = list_doubts(lab.state.steps, figures, (0.2, 0.5))
+    assert doubts == [f"step delays: display_latency was not measured: {missing.reason}"]
+    assert missing.reason in (lab.folder / REPORT_FILE).read_text()
+    (row,) = summarize(lab)["steps"]
+    assert row["missing"] == [missing.model_dump()]

@@ -73,6 +73,16 @@ class NodeValue(LimitedModel):
     side: Side | None = None
 
 
+class MissingQuantity(LimitedModel):
+    """A quantity that a finished step could not measure, and the reason."""
+
+    quantity: Literal["display_latency"]
+    reason: str
+
+    def describe(self) -> str:
+        return f"{self.quantity} was not measured: {self.reason}"
+
+
 class StepResult(LimitedModel):
     """The result of one step of a commissioning.
 
@@ -81,6 +91,7 @@ class StepResult(LimitedModel):
     the scene by dotted path. parameters: names of calibration files in the folder, by node type and
     parameter (TYPE.PARAMETER). figures: further results. covariances: covariance matrices by name,
     from which errors are predicted. node_values: further measured values of node parameters.
+    missing: quantities that were not measured.
     """
 
     residual: float
@@ -91,6 +102,7 @@ class StepResult(LimitedModel):
     scene_values: dict[str, Any] = Field(default_factory=dict)
     parameters: dict[str, str] = Field(default_factory=dict)
     node_values: tuple[NodeValue, ...] = ()
+    missing: tuple[MissingQuantity, ...] = ()
     figures: dict[str, Any] = Field(default_factory=dict)
     covariances: dict[str, list[list[float]]] = Field(default_factory=dict)
 
@@ -328,6 +340,7 @@ def format_report(state: State) -> str:
             )
             if not result.within_limit:
                 advice.append(f"- {name}: above the limit. {result.advice}")
+            advice += [f"- {name}: {one.describe()}" for one in result.missing]
     verification = state.steps.get(StepName.VERIFICATION)
     if verification is not None and verification.result is not None:
         lines += _format_verdict(verification.result.figures)
@@ -369,7 +382,9 @@ def list_doubts(
             continue
         if record.result is None:
             doubts.append(f"step {name} was skipped: {record.skipped_because}")
-        elif not record.result.within_limit:
+            continue
+        doubts += [f"step {name}: {one.describe()}" for one in record.result.missing]
+        if not record.result.within_limit:
             doubts.append(
                 f"step {name}: residual {record.result.residual:.3g} {record.result.unit}, limit "
                 f"{record.result.limit:g} {record.result.unit}"

@@ -239,6 +239,7 @@ def summarize(lab: Commissioning) -> dict[str, Any]:
                 "limit": None if result is None else result.limit,
                 "within_limit": None if result is None else result.within_limit,
                 "uncertainty": {} if result is None else result.uncertainty,
+                "missing": [] if result is None else [one.model_dump() for one in result.missing],
                 "advice": None if result is None or result.within_limit else result.advice,
                 "skipped_because": record.skipped_because,
             }
@@ -272,7 +273,8 @@ def _print_result(lab: Commissioning, missing: Any, as_json: bool) -> None:
                 f"{one['seconds']:.0f} s",
                 f"{one['residual']:.3g} {one['unit']}",
                 f"{one['limit']:g} {one['unit']}",
-                one["advice"] or "",
+                one["advice"]
+                or ", ".join(f"{each['quantity']} was not measured" for each in one["missing"]),
             ]
             for one in result["steps"]
         ],

@@ -24,6 +24,7 @@ from flexsheet.launch.calibration.commission import (
     CommissionError,
     Commissioning,
     MissingDataError,
+    MissingQuantity,
     NodeValue,
     Step,
     StepName,
@@ -480,6 +481,7 @@ class Laboratory:
 
     def measure_delays(self, lab: Commissioning) -> StepResult:
         from flexsheet.launch.calibration.delays import measure_in_simulation, read_delays
+        from flexsheet.launch.calibration.display_latency import DisplayLatencyError
         from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 
         scene, stereo = load_scene(lab.scene_copy), lab.find_file(STEREO)
@@ -505,13 +507,19 @@ class Laboratory:
             measured["stamp_offset"] = stamp
             value = round(stamp.lag_s, 5)
             values.append(NodeValue(node_type="camera", parameter="stamp_offset_s", value=value))
+        missing: tuple[MissingQuantity, ...] = ()
         if scene.projector is not None and graph.nodes_of_type("renderer"):
-            latency = self._measure_display_latency(scene, graph, stamp, added_s)
-            measured["display_latency"] = latency
-            value = round(max(latency.lag_s, 0.0), 4)
-            values.append(
-                NodeValue(node_type="renderer", parameter="display_latency_s", value=value)
-            )
+            try:
+                latency = self._measure_display_latency(scene, graph, stamp, added_s)
+            except DisplayLatencyError as error:
+                reason = f"{error}. {error.remedy}"
+                missing = (MissingQuantity(quantity="display_latency", reason=reason),)
+            else:
+                measured["display_latency"] = latency
+                value = round(max(latency.lag_s, 0.0), 4)
+                values.append(
+                    NodeValue(node_type="renderer", parameter="display_latency_s", value=value)
+                )
         return StepResult(
             residual=1e3 * max(one.uncertainty_s for one in measured.values()),
             unit="ms",
@@ -519,6 +527,7 @@ class Laboratory:
             advice="Repeat the stroke at the speed of use, and check that both arms follow it.",
             uncertainty={f"{name}_ms": 1e3 * one.uncertainty_s for name, one in measured.items()},
             node_values=tuple(values),
+            missing=missing,
             figures={f"{name}_ms": 1e3 * one.lag_s for name, one in measured.items()},
             covariances={} if stamp is None else {"stamp_s2": [[stamp.uncertainty_s**2]]},
         )
