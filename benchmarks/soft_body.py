@@ -5,7 +5,8 @@ spacings.
 
 With --table, the nonlinear table of the demo's mesh is measured instead: the time to compute it
 (minutes, if it is not cached), its error and the linear method's against Newton solutions on finer
-meshes at points that it was not computed from, and the same slides.
+meshes at points that it was not computed from, and the same slides. First the errors of the force
+are printed for all methods, against the stored force of an independent solver.
 
 The fingertip moves 6 mm in each of three directions at constant depth, 0.02 mm per step. Prints for
 every mesh and depth the force (beside Hertz's), its ripple, the largest jump of any skin node in a
@@ -14,17 +15,20 @@ step, the stiffness, and the time of a step. Takes about a minute and 1.5 GiB.
 
 from __future__ import annotations
 
+import contextlib
 import resource
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.experiments.compliance import POSITIONS_M
+from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_cylinder, require_material
 from flexsheet.nodes.cache import default_cache_dir
@@ -41,6 +45,11 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cyl
 DEMO_SPACING_M = 0.0045
 JUDGED_AT = ((0.004, 0.1), (0.021, 0.55))
 """The positions along the axis (m) and angles (rad) of points that are no samples of a table."""
+JUDGED_M = (0.0005, 0.001, 0.0015, 0.002, 0.003, 0.004, 0.005, 0.007, 0.010)
+"""The depths at which forces are compared with those of the independent solver."""
+RANDOM_POINTS, RANDOM_WITHIN_M = 300, (0.03, 0.025)
+"""The number of random points, and their maximum distances from the front along and around the
+axis."""
 JUDGE_RATIO = 0.3
 """The spacing of the reference mesh at the push in finger radii, finer than that of the table."""
 SPACINGS_M = (0.006, 0.0045, 0.003, 0.0022)
@@ -92,6 +101,7 @@ def evaluate_table(scene: Scene, spacing_m: float) -> None:
             f"{len(best.method.reach_m)} places reach {least:.1f} mm at least, nine in ten "
             f"{tenth:.1f} mm, half {half:.1f} mm; {deep} reach 20 mm"
         )
+    print_force_errors(scene, {"linear": linear, "quick": make_quick(scene, linear), "table": best})
     mesh, radius_m = build_mesh(best.spec.mesh), require_cylinder(scene).radius_m
     for along, angle in JUDGED_AT:
         normal = np.array([0.0, np.sin(angle), np.cos(angle)])
@@ -99,6 +109,75 @@ def evaluate_table(scene: Scene, spacing_m: float) -> None:
         evaluate_push(scene, mesh, sample, best, linear)
     for depth_m in DEPTHS_M:
         print_slides(scene, slide(best, radius_m, depth_m), depth_m)
+
+
+def make_quick(scene: Scene, linear: body.SceneBody) -> body.SceneBody:
+    """Compute the quick table of a scene, without the complete one."""
+    made: list[body.SceneBody] = []
+
+    def stop(quick: body.SceneBody) -> None:
+        made.append(quick)
+        raise precompute.Interrupted
+
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.suppress(precompute.Interrupted),
+    ):
+        factory = SoftBodyFactory(linear.spec.mesh.skin_spacing_m, Path(folder))
+        factory.build_table(scene, linear, print_progress, stop)
+    return made[0]
+
+
+def print_force_errors(scene: Scene, bodies: Mapping[str, body.SceneBody]) -> None:
+    """Print the relative error of the force of each method by depth, in percent.
+
+    The reference is the stored force of an independent solver at three positions. At random points,
+    it is the force at the first position, or that of the last method.
+    """
+    curves = [find_reference_curve(scene, *position) for position in POSITIONS_M]
+    stored = np.array(
+        [
+            [
+                force.force_n if curve and (force := curve.force(depth)) else np.nan
+                for depth in JUDGED_M
+            ]
+            for curve in curves
+        ]
+    )
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (RANDOM_POINTS, 2)) * RANDOM_WITHIN_M
+    forces = {
+        name: (normal_forces(scene, one, POSITIONS_M), normal_forces(scene, one, points))
+        for name, one in bodies.items()
+    }
+    best_n = [*forces.values()][-1][1]
+    print("depth [mm]:", *(f"{1e3 * depth:g}" for depth in JUDGED_M))
+    for name, (at_positions, at_points) in forces.items():
+        rows = {
+            "at the reference's positions, from": (at_positions / stored - 1.0).min(axis=0),
+            "at the reference's positions, to": (at_positions / stored - 1.0).max(axis=0),
+            "at random points, 95 %": np.quantile(
+                np.abs(at_points / stored[0] - 1.0), 0.95, axis=0
+            ),
+            "from the last method, 95 %": np.quantile(
+                np.abs(at_points / best_n - 1.0), 0.95, axis=0
+            ),
+        }
+        for label, row in rows.items():
+            print(f"{name}, {label}:", *(f"{100.0 * ratio:.1f}" for ratio in row))
+
+
+def normal_forces(
+    scene: Scene, one: body.SceneBody, points: Sequence[tuple[float, float]] | Floats
+) -> Floats:
+    """Return the normal forces (n, k) at points (along and around the axis, m) and depths."""
+    radius_m = require_cylinder(scene).radius_m
+    forces = []
+    for along, around in points:
+        normal = np.array([0.0, np.sin(around / radius_m), np.cos(around / radius_m)])
+        point = radius_m * normal + np.array([along, 0.0, 0.0])
+        queries = [ContactQuery(point, normal, depth) for depth in JUDGED_M]
+        forces.append([float(one.method.respond(query).force_n @ normal) for query in queries])
+    return np.array(forces)
 
 
 def print_progress(done: int, total: int, need: precompute.WorkBudget) -> None:

@@ -299,8 +299,12 @@ class SoftBody(Message):
     )
     force_error_ratio: NonNegative = Field(
         default=0.0,
-        description="relative error of the force at depths above 1 mm, as stated by the method; "
-        "the larger error while one method replaces another; 0: unknown",
+        description="relative error of the force at `push_depth_m`, as stated by the method; the "
+        "larger error while one method replaces another; 0: unknown",
+    )
+    in_transition: bool = Field(
+        default=False,
+        description="true: `method` gradually replaces another one, which still contributes",
     )
     displacement_world_m: Points3
 

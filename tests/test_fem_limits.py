@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,8 +18,12 @@ from benchmarks.soft_body_limits import (
     make_scene,
     newton,
 )
+from flexsheet.messages.scene import BaseSupport, Sphere
+from flexsheet.nodes.fem_solver.body import state_force_error_ratio
 from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
+from flexsheet.nodes.fem_solver.mesh import MeshSpec
 from flexsheet.nodes.models import rigid
+from tests.soft_bodies import cylinder_spec
 
 ENDS = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 0.008]}
 
@@ -68,3 +74,33 @@ def test_a_finger_that_jumps_is_answered_where_it_is(body: Body) -> None:
         assert np.array_equal(answer.displacement, fresh.displacement)
         assert answer.in_range == fresh.in_range
         assert count_inverted(body, answer.displacement) == 0
+
+
+ON_STRIP = cylinder_spec(0.03, 0.1, touch_angle_rad=1.0, skin_spacing_m=0.0045).mesh
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        ON_STRIP,
+        replace(ON_STRIP, support=BaseSupport(height_m=0.01)),
+        replace(ON_STRIP, geometry=Sphere(radius_m=0.03)),
+    ],
+    ids=["cylinder on a strip", "cylinder on a base", "sphere"],
+)
+def test_the_stated_error_decreases_with_depth_and_precision(mesh: MeshSpec) -> None:
+    depths = np.linspace(0.0, 0.02, 81)
+    stated = np.array(
+        [
+            [state_force_error_ratio(method, mesh, depth) for depth in depths]
+            for method in ("linear", "quick_table", "nonlinear_table")
+        ]
+    )
+    assert (np.diff(stated, axis=0) <= 0.0).all()
+    assert (np.diff(stated, axis=1) <= 0.0).all()
+    assert (np.diff(stated[:, -1]) < 0.0).all()
+    # Light pushes are least precise; beyond the last depth the error is constant.
+    assert (stated[:, 0] > 1.5 * stated[:, -1]).all()
+    assert (stated[:, depths > 0.005] == stated[:, -1:]).all()
+    # Without a strip the forces of tables are not corrected.
+    assert (stated[2, 0] < 0.2) == (mesh is ON_STRIP)

@@ -26,6 +26,7 @@ from flexsheet.nodes.fem_solver.elasticity import (
     shape_gradients,
 )
 from flexsheet.nodes.fem_solver.mesh import (
+    SAME_M,
     Focus,
     MeshSpec,
     SolidMesh,
@@ -310,6 +311,22 @@ def test_about_a_focus_a_cylinders_mesh_leans_to_no_side(angle_rad: float) -> No
     _, determinants = jacobians(mesh.nodes, mesh.elements, shape_gradients(points))
     assert (determinants * weights).sum() == pytest.approx(whole, rel=1e-3)
     assert min_jacobian_ratios(mesh.nodes, mesh.elements).min() > MIN_JACOBIAN_RATIO
+
+
+@pytest.mark.parametrize("x_m", [-0.5 * SAME_M, 0.0, 0.5 * SAME_M])
+def test_a_mesh_begins_in_the_plane_of_its_focus_despite_rounding(x_m: float) -> None:
+    mesh = cylinder_mesh(
+        radius_m=CYLINDER["radius_m"],
+        length_m=CYLINDER["length_m"],
+        support_angle_rad=1.5,
+        touch_angle_rad=2.0,
+        skin_spacing_m=0.003,
+        focus=Focus(x_m, 0.3, 0.011),
+        mirror_axes=(0,),
+    )
+    stations = np.unique(mesh.nodes[:, 0].round(9))
+    assert (stations[0], stations[-1]) == pytest.approx((0.0, 0.5 * CYLINDER["length_m"]))
+    assert np.diff(stations).max() < 0.25 * CYLINDER["radius_m"]
 
 
 @pytest.mark.parametrize("name", long_except(SHAPES, "sphere", "cylinder", "mesh"))

@@ -40,6 +40,7 @@ from flexsheet.nodes.fem_solver.table import (
     Table,
     TableSoftBody,
     count_valid_levels,
+    find_mirror_images,
 )
 from tests.soft_bodies import InlineExecutor, cylinder_spec
 from tests.waiting import wait_until
@@ -298,9 +299,16 @@ def test_an_interrupted_table_resumes(model: SoftBodyModel, table: Table, tmp_pa
     assert load_cached(make_table_cache(SPEC), tmp_path) is None
     kept = len(list(make_table_cache(SPEC).checkpoints(tmp_path).folder.iterdir()))
     assert kept >= 2
-    seen: list[int] = []
-    compute_table(SPEC, model, tmp_path, CachingExecutor(), lambda done, *_: seen.append(done))
-    assert seen[1] == precompute_table.SNAPSHOT_STEPS * kept
+    seen: list[tuple[int, int]] = []
+    compute_table(
+        SPEC, model, tmp_path, CachingExecutor(), lambda done, total, _: seen.append((done, total))
+    )
+    assert seen[1][0] == precompute_table.SNAPSHOT_STEPS * kept
+    # The progress ends at 100 %, although mirror images of nodes are not interpolated.
+    mirrors = snapshots.find_mirror_planes(build_mesh(SPEC.body.mesh))
+    rest = model.response.rest
+    assert find_mirror_images(rest[model.response.contact_nodes], rest, mirrors)
+    assert seen[-1][0] == seen[-1][1]
     again = load_cached(make_table_cache(SPEC), tmp_path)
     assert again is not None
     assert np.allclose(again.fields, table.fields, atol=1e-9)

@@ -122,7 +122,7 @@ def touches(penalty: tuple[float, float]) -> list[Touch]:
     for depth, state in zip(DEPTHS, list(body.solve_load_steps(centres))[1:], strict=True):
         assert state.reached
         positions = nodes + state.displacement
-        push = body.obstacle.forces(positions, state.centre, newton.NO_STICK)[surface, 2]
+        push = body.obstacle.forces(positions, state.centre)[surface, 2]
         down = -state.displacement[surface, 2]
         found.append(
             Touch(

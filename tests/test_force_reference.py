@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -22,15 +23,21 @@ from benchmarks.hexahedra import OFFSETS, HexMesh, cylinder_hexahedra
 from flexsheet.launch.experiments.compliance import POSITIONS_M
 from flexsheet.launch.experiments.force_reference import find_reference_curve
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.nodes.fem_solver.body import make_soft_body_spec
+from flexsheet.messages.scene import Cylinder
+from flexsheet.nodes.fem_solver import precompute_table
+from flexsheet.nodes.fem_solver.body import SceneBody, make_soft_body_spec
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.precompute import Interrupted
 from flexsheet.nodes.fem_solver.snapshots import (
     SamplePoint,
     make_fine_job,
     make_snapshot_job,
     solve_snapshot,
 )
+from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from flexsheet.nodes.fem_solver.table import compute_force_factors
+from tests.soft_bodies import InlineExecutor
 
 Floats = NDArray[np.float64]
 RADIUS, LENGTH, SUPPORT_RAD = 5.0, 17.0, 1.6
@@ -153,3 +160,43 @@ def test_corrected_pushes_of_the_demos_table_are_within_three_percent() -> None:
             assert modulus * factor * one @ sample.normal == pytest.approx(
                 reference.force_n, rel=0.03
             ), (place, depth)
+
+
+@pytest.mark.long
+def test_the_stated_errors_hold_at_the_references_positions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The quick table uses the shipped pushes of the demo."""
+    monkeypatch.setattr(
+        precompute_table, "local_processes", lambda count: nullcontext(InlineExecutor())
+    )
+    scene, bodies = load_scene(SCENE_FILE), []
+    factory = SoftBodyFactory(0.0045, tmp_path)
+    bodies += factory.bodies(scene, "linear", lambda *_: None)
+
+    def stop(quick: SceneBody) -> None:
+        bodies.append(quick)
+        raise Interrupted
+
+    with pytest.raises(Interrupted):
+        factory.build_table(scene, bodies[0], lambda *_: None, stop)
+    geometry = scene.object.geometry
+    assert isinstance(geometry, Cylinder)
+    for along, around in POSITIONS_M:
+        angle = around / geometry.radius_m
+        normal = np.array([0.0, np.sin(angle), np.cos(angle)])
+        point = geometry.radius_m * normal + [along, 0.0, 0.0]
+        curve = find_reference_curve(scene, along, around)
+        assert curve is not None
+        for depth in (0.0005, 0.001, 0.0015, 0.002, 0.003, 0.004, 0.005, 0.007, 0.010):
+            reference = curve.force(depth)
+            assert reference is not None
+            linear, quick = (
+                float(one.method.respond(ContactQuery(point, normal, depth)).force_n @ normal)
+                for one in bodies
+            )
+            stated = [one.force_error_ratio(depth) for one in bodies]
+            assert linear == pytest.approx(reference.force_n, rel=stated[0]), (along, depth)
+            assert quick == pytest.approx(reference.force_n, rel=stated[1]), (along, depth)
+            # The linear method is not stated to be much worse than it is, either.
+            assert linear > (1.0 + 0.6 * stated[0]) * reference.force_n, (along, depth)

@@ -10,7 +10,7 @@ import asyncio
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Literal, Self
+from typing import Literal, Self, get_args
 
 import numpy as np
 
@@ -36,11 +36,12 @@ from flexsheet.messages.types import (
     TwinFinger,
 )
 from flexsheet.nodes import node_class
-from flexsheet.nodes.fem_solver.body import state_force_error_ratio
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from flexsheet.nodes.fem_solver.soft_body_factory import choose_method
 
 TableMethod = Literal["quick_table", "nonlinear_table"]
+TABLE_METHODS: tuple[TableMethod, ...] = get_args(TableMethod)
+"""The methods that use a table, in order of increasing precision."""
 
 READ = (
     "twin/finger",
@@ -211,13 +212,13 @@ class Driver:
         solvers = {name: p for name, p in self._solvers() if _computes_table(p, scene)}
         if not solvers:
             return
-        max_error_ratio = state_force_error_ratio(method, scene.object.geometry)
+        accepted = TABLE_METHODS[TABLE_METHODS.index(method) :]
         failures: list[str] = []
         reported_s = -PROGRESS_PERIOD_S
 
         def is_precise() -> bool:
             body = self._newest.get("soft_body")
-            return isinstance(body, SoftBody) and 0.0 < body.force_error_ratio <= max_error_ratio
+            return isinstance(body, SoftBody) and body.method in accepted and not body.in_transition
 
         def watch(message: Message) -> None:
             nonlocal reported_s
@@ -233,9 +234,8 @@ class Driver:
         try:
             await self.wait_for(
                 lambda: is_precise() or bool(failures),
-                f"the soft body by the {method.replace('_', ' ')}, with a force error of at most "
-                f"{100 * max_error_ratio:.0f} %; compute the table before the experiment "
-                "(flexsheet precompute SCENE), or choose the linear method in the scene",
+                f"the soft body by the {method.replace('_', ' ')}; compute the table before the "
+                "experiment (flexsheet precompute SCENE), or choose the linear method in the scene",
                 MAX_TABLE_WAIT_S,
             )
         finally:

@@ -206,6 +206,7 @@ class SoftBodyBenchmark:
             poisson_ratio=job.poisson_ratio,
             finger_radius_m=job.finger_radius_m,
             tolerance=snapshots.TOLERANCE,
+            finger_axis=job.sample.normal,
         )
         skin = np.unique(boundary_faces(job.elements))
 

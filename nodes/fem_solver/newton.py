@@ -6,17 +6,15 @@ sphere and touches the shaft. A penalty pressure acts on contact points of the s
 the body). It first grows with the square of the penetration, so forces have a continuous slope, and
 then linearly. Under a pressure equal to Young's modulus the penetration is about a hundredth of the
 radius. Newton's method with a line search minimises the sum of elastic and contact energy. An
-inverted element has infinite energy, so it is never accepted.
-
-Without friction the solution depends only on the position of the finger. If the finger sticks, it
-also depends on the path: tangential springs connect each contact point to where it was touched.
+inverted element has infinite energy, so it is never accepted. The contact has no friction, so the
+solution depends only on the position of the finger.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +25,6 @@ from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_ad
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from flexsheet.nodes.fem_solver.mesh import FACES, SUBTRIANGLES, nodes_in_planes, skin_faces
 from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, NestedDissection
-
-Friction = Literal["none", "stick"]
 
 PENALTY_RATIO = 200.0
 """The ratio of the penalty stiffness (Pa/m) to Young's modulus per finger radius."""
@@ -70,23 +66,6 @@ class EquilibriumState:
     centre: Floats
     min_volume_ratio: float
     reached: bool
-
-
-@dataclass(frozen=True, slots=True)
-class _StickState:
-    """The contact points that stick to the finger.
-
-    points (k,): indices of the contact points. offsets (k, 3): positions (m) on the finger at which
-    the points stick, relative to its centre. normals (k, 3): unit normals of the sphere at the
-    points.
-    """
-
-    points: Ints
-    offsets: Floats
-    normals: Floats
-
-
-NO_STICK = _StickState(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3)))
 
 
 class FingerObstacle:
@@ -143,8 +122,8 @@ class FingerObstacle:
         away = distance[inner]
         return inner, self.radius_m - away, offset[inner] / away[:, None], away
 
-    def energy(self, positions: Floats, centre: Floats, stick: _StickState) -> float:
-        """Return the energy (J) of the penalty pressure and of the tangential springs.
+    def energy(self, positions: Floats, centre: Floats) -> float:
+        """Return the energy (J) of the penalty pressure.
 
         positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
         """
@@ -152,13 +131,9 @@ class FingerObstacle:
         d = self._rounding
         low = depth < d
         density = np.where(low, depth**3 / (6 * d), 0.5 * depth * (depth - d) + d * d / 6)
-        total = float(self._penalty[inner] @ density)
-        if len(stick.points):
-            slip = self._slip(positions, centre, stick)
-            total += 0.5 * float(self._penalty[stick.points] @ np.square(slip).sum(axis=1))
-        return total
+        return float(self._penalty[inner] @ density)
 
-    def forces(self, positions: Floats, centre: Floats, stick: _StickState) -> Floats:
+    def forces(self, positions: Floats, centre: Floats) -> Floats:
         """Return the force (n, 3), N, of each node on the finger, the gradient of the energy.
 
         positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
@@ -166,10 +141,6 @@ class FingerObstacle:
         inner, depth, normals, _ = self.inside(positions, centre)
         per_point = np.zeros((len(self._penalty), 3))
         per_point[inner] = -(self._penalty[inner] * self._pressure(depth))[:, None] * normals
-        if len(stick.points):
-            per_point[stick.points] += self._penalty[stick.points][:, None] * self._slip(
-                positions, centre, stick
-            )
         contact_forces = np.flatnonzero(per_point.any(axis=1))
         faces = np.unique(contact_forces // len(self._shape))
         blocks = per_point.reshape(len(self._faces), -1, 3)[faces]
@@ -182,7 +153,6 @@ class FingerObstacle:
         matrices: Floats,
         positions: Floats,
         centre: Floats,
-        stick: _StickState,
         *,
         geometric_stiffness_weight: float,
     ) -> None:
@@ -200,11 +170,9 @@ class FingerObstacle:
         if self._axis is not None:
             on_shaft = np.abs(normals @ self._axis) < 1e-9
             curved[on_shaft] -= self._axis[:, None] * self._axis
-        inner_blocks = slope[:, None, None] * outer - turning * curved
-        numbers = np.append(inner, stick.points)
-        along = np.eye(3) - stick.normals[:, :, None] * stick.normals[:, None, :]
-        blocks = np.concatenate([inner_blocks, along]) * self._penalty[numbers][:, None, None]
-        face, point = numbers // len(self._shape), numbers % len(self._shape)
+        blocks = slope[:, None, None] * outer - turning * curved
+        blocks *= self._penalty[inner][:, None, None]
+        face, point = inner // len(self._shape), inner % len(self._shape)
         faces, where = np.unique(face, return_inverse=True)
         shape = self._shape[point]
         weights = shape[:, :, None] * shape[:, None, :]
@@ -216,26 +184,9 @@ class FingerObstacle:
         target = self.parents[faces]
         np.add.at(matrices, (target[:, None, None], rows[:, :, None], rows[:, None, :]), summed)
 
-    def update_stick(self, positions: Floats, centre: Floats, stick: _StickState) -> _StickState:
-        """Return the points that stick to the finger after a new equilibrium was found.
-
-        Points under pressure stick where the finger first touched them. Other points are released.
-        positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
-        """
-        inner, _, normals, _ = self.inside(positions, centre)
-        offsets = self.points(positions)[inner] - centre
-        sticking = np.isin(inner, stick.points)
-        offsets[sticking] = stick.offsets[np.searchsorted(stick.points, inner[sticking])]
-        return _StickState(inner, offsets, normals)
-
     def _pressure(self, depth: Floats) -> Floats:
         d = self._rounding
         result: Floats = np.where(depth < d, depth * depth / (2 * d), depth - 0.5 * d)
-        return result
-
-    def _slip(self, positions: Floats, centre: Floats, stick: _StickState) -> Floats:
-        slip = self.points(positions)[stick.points] - centre - stick.offsets
-        result: Floats = slip - (slip * stick.normals).sum(axis=1)[:, None] * stick.normals
         return result
 
 
@@ -252,7 +203,6 @@ class NeoHookeanBody:
         young_modulus_pa: float,
         poisson_ratio: float,
         finger_radius_m: float,
-        friction: Friction = "none",
         tolerance: float = TOLERANCE,
         min_step_fraction: float = MIN_STEP_FRACTION,
         max_step_ratio: float = MAX_STEP_RATIO,
@@ -282,7 +232,7 @@ class NeoHookeanBody:
             radius_m=finger_radius_m,
             axis=finger_axis,
         )
-        self.fixed, self.friction = fixed, friction
+        self.fixed = fixed
         self.tolerance, self.min_step_fraction = tolerance, min_step_fraction
         self.max_step_ratio = max_step_ratio
         self.factor_dtype = factor_dtype
@@ -302,15 +252,15 @@ class NeoHookeanBody:
     ) -> Iterator[EquilibriumState]:
         """Move the finger to each centre (3,) in a straight line and yield the equilibria.
 
-        start: displacement and sphere centre of a known frictionless equilibrium. Without it, the
-        sphere at the first centre must not touch the body. If a step does not converge, the last
-        equilibrium is yielded with `reached` false for all remaining centres. A step with inverted
-        elements or with the sphere inside the body has not converged. Raise ValueError for a centre
-        that is not finite.
+        start: displacement and sphere centre of a known equilibrium. Without it, the sphere at the
+        first centre must not touch the body. If a step does not converge, the last equilibrium is
+        yielded with `reached` false for all remaining centres. A step with inverted elements or
+        with the sphere inside the body has not converged. Raise ValueError for a centre that is not
+        finite.
         """
         displacement, position = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
-        stick, failed = NO_STICK, False
+        failed = False
         for centre in centres:
             if not np.isfinite(centre).all():
                 raise ValueError(
@@ -326,10 +276,8 @@ class NeoHookeanBody:
                 step = min(fraction / step_count, 1.0 - done)
                 target = start_position + (done + step) * path
                 try:
-                    guess = self._predict(displacement, position, target, stick, factors)
-                    solution, factors = self.solve_equilibrium(
-                        displacement, target, stick, guess=guess
-                    )
+                    guess = self._predict(displacement, position, target, factors)
+                    solution, factors = self.solve_equilibrium(displacement, target, guess=guess)
                     self._check_validity(solution, target)
                 except NewtonNotConvergedError:
                     fraction *= 0.5
@@ -338,22 +286,16 @@ class NeoHookeanBody:
                 displacement, position = solution, target
                 done += step
                 fraction = min(1.0, 2.0 * fraction)
-                if self.friction == "stick":
-                    stick = self.obstacle.update_stick(
-                        self.solid.nodes + displacement, position, stick
-                    )
             yield EquilibriumState(
                 displacement=displacement,
-                force_n=self.obstacle.forces(self.solid.nodes + displacement, position, stick).sum(
-                    axis=0
-                ),
+                force_n=self.obstacle.forces(self.solid.nodes + displacement, position).sum(axis=0),
                 centre=position,
                 min_volume_ratio=self.solid.min_volume_ratio(displacement),
                 reached=not failed,
             )
 
     def solve_equilibrium(
-        self, displacement: Floats, centre: Floats, stick: _StickState, *, guess: Floats
+        self, displacement: Floats, centre: Floats, *, guess: Floats
     ) -> tuple[Floats, Factors | None]:
         """Find the equilibrium with the sphere at `centre` (3,) by Newton's method.
 
@@ -363,24 +305,24 @@ class NeoHookeanBody:
         not converge.
         """
         nodes = self.solid.nodes
-        if self._energy(guess, centre, stick) < self._energy(displacement, centre, stick):
+        if self._energy(guess, centre) < self._energy(displacement, centre):
             displacement = guess
-        energy = self._energy(displacement, centre, stick)
+        energy = self._energy(displacement, centre)
         factors: Factors | None = None
         for iteration in range(MAX_ITERATIONS):
             inner = self.solid.forces(displacement)
-            contact_forces = self.obstacle.forces(nodes + displacement, centre, stick)
+            contact_forces = self.obstacle.forces(nodes + displacement, centre)
             residual = np.where(self._fixed_dofs, 0.0, inner + contact_forces)
             scale = max(np.abs(inner).max(), np.abs(contact_forces).max())
             if np.abs(residual).max() <= self.tolerance * scale:
                 return displacement, factors
-            factors = self._factorize(displacement, centre, stick)
+            factors = self._factorize(displacement, centre)
             step = -factors.solve(residual.ravel()).reshape(-1, 3)
             slope = float((residual * step).sum())
             fraction = 1.0
             while True:
                 trial = displacement + fraction * step
-                now = self._energy(trial, centre, stick)
+                now = self._energy(trial, centre)
                 if now <= energy + 1e-4 * fraction * slope + 1e-14 * abs(energy):
                     break
                 fraction *= 0.5
@@ -404,30 +346,29 @@ class NeoHookeanBody:
         if winding_number(triangles) > self._max_winding:
             raise NewtonNotConvergedError("the centre of the finger is inside the body")
 
-    def _energy(self, displacement: Floats, centre: Floats, stick: _StickState) -> float:
+    def _energy(self, displacement: Floats, centre: Floats) -> float:
         elastic = self.solid.energy(displacement)
         if not np.isfinite(elastic):
             return elastic
-        return elastic + self.obstacle.energy(self.solid.nodes + displacement, centre, stick)
+        return elastic + self.obstacle.energy(self.solid.nodes + displacement, centre)
 
     def _predict(
         self,
         displacement: Floats,
         position: Floats,
         target: Floats,
-        stick: _StickState,
         factors: Factors | None,
     ) -> Floats:
         """Predict the displacement (n, 3) to first order for a finger that moves to `target`."""
         if factors is None:
             return displacement
         positions, fraction = self.solid.nodes + displacement, 1e-3 * (target - position)
-        change = self.obstacle.forces(positions, position + fraction, stick)
-        change -= self.obstacle.forces(positions, position - fraction, stick)
+        change = self.obstacle.forces(positions, position + fraction)
+        change -= self.obstacle.forces(positions, position - fraction)
         change[self._fixed_dofs] = 0.0
         return displacement - factors.solve(500.0 * change.ravel()).reshape(-1, 3)
 
-    def _factorize(self, displacement: Floats, centre: Floats, stick: _StickState) -> Factors:
+    def _factorize(self, displacement: Floats, centre: Floats) -> Factors:
         """Factor the tangent stiffness, regularized if it is not positive definite.
 
         Raise NewtonNotConvergedError if no regularization makes it positive definite.
@@ -440,7 +381,6 @@ class NeoHookeanBody:
                 matrices,
                 positions,
                 centre,
-                stick,
                 geometric_stiffness_weight=geometric_stiffness_weight,
             )
             self.solid.stiffen(matrices, stiffening)

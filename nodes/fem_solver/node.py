@@ -94,12 +94,13 @@ class FemSolver(Node):
     def _describe(self, current: body.SceneBody) -> str:
         """Return the method in use, its force error and its number of skin nodes as a text."""
         nodes = len(current.skin.vertices_world_m)
-        percent = 100.0 * self._force_error_ratio(current)
-        return f"{current.method.name}, force within {percent:.0f} %, {nodes} skin nodes"
-
-    def _force_error_ratio(self, current: body.SceneBody) -> float:
-        """Return the largest stated relative force error of the current and the replaced bodies."""
-        return max(one.force_error_ratio for one in (current, *(old for old, _ in self._replaced)))
+        bodies = (current, *(old for old, _ in self._replaced))
+        errors = " and ".join(
+            f"{max(100.0 * one.force_error_ratio(depth_m) for one in bodies):.0f} % at "
+            f"{1e3 * depth_m:g} mm"
+            for depth_m in body.NOTED_DEPTHS_M
+        )
+        return f"{current.method.name}, force within {errors}, {nodes} skin nodes"
 
     async def close(self) -> None:
         self._stop.set()
@@ -206,7 +207,7 @@ class FemSolver(Node):
         message = current.message(
             response,
             horizon_s=self.parameters.prediction_horizon_s,
-            force_error_ratio=self._force_error_ratio(current),
+            replaced=[old for old, _ in self._replaced],
         )
         self.soft_body.publish(message, source_ns=header.source_ns)
 

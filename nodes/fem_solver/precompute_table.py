@@ -264,7 +264,9 @@ def _compute_table(
             SnapshotSet(some, solved[-len(some) :], mirrors, user, spec.finger_radius_m),
             fine=None if fine_job is None else (samples[0], solved[0]),
             interpolate=partial(
-                _interpolate_by, executor, lambda count: report(solving + NODE_STEPS * count)
+                _interpolate_by,
+                executor,
+                lambda done, total: report(solving + NODE_STEPS * loads * done // total),
             ),
         )
 
@@ -275,14 +277,19 @@ def _compute_table(
 
 
 def _interpolate_by(
-    executor: Executor, on_progress: Callable[[int], None], jobs: Sequence[FillJob]
+    executor: Executor, on_progress: Callable[[int, int], None], jobs: Sequence[FillJob]
 ) -> list[FilledNodes]:
-    """Interpolate the snapshots at the nodes of all jobs in an executor."""
+    """Interpolate the snapshots at the nodes of all jobs in an executor.
+
+    on_progress: function that receives the number of finished nodes and of nodes of all jobs. Nodes
+    that are mirror images of others have no job.
+    """
     filled: dict[int, FilledNodes] = {}
+    total = sum(len(job.samples) for job in jobs)
     _collect(
         {executor.submit(interpolate_nodes, job): number for number, job in enumerate(jobs)},
         filled.__setitem__,
-        lambda: on_progress(sum(len(one.reached) for one in filled.values())),
+        lambda: on_progress(sum(len(one.reached) for one in filled.values()), total),
     )
     return [filled[number] for number in range(len(jobs))]
 

@@ -19,6 +19,7 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.solid import (
     EDGES,
+    SAME_M,
     SUBTRIANGLES,
     SolidMesh,
     add_midside_nodes,
@@ -152,7 +153,8 @@ def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> F
         inner = [x - near, x, x + near]
         stops[1:1] = [stop for stop in inner if abs(stop) < half - sizes.element_m]
     if 0 in mirror_axes:
-        stops = [stop for stop in stops if stop >= 0.0]
+        # The focus is in the plane only within rounding, and its coordinate may be negative.
+        stops = [0.0, *(stop for stop in stops if stop > SAME_M)]
     stations = []
     for start, stop in itertools.pairwise(stops):
         fine = np.linspace(start, stop, 2001)
