@@ -1,1 +1,3 @@
-"""Define the messages between nodes, the table of topics, and the scene and calibration files."""
+"""Define the messages that nodes exchange, the table of topics, and the scene and calibration
+files.
+"""

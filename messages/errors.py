@@ -8,8 +8,9 @@ from typing import ClassVar
 class FlexsheetError(Exception):
     """The base class of errors that a user can correct.
 
-    code: name of the error for `flexsheet explain`. remedy: what the user can do. exit_code: exit
-        status of a command that ends with this error.
+    code: name of the error for the command `flexsheet explain`.
+    remedy: text that states what the user can do.
+    exit_code: exit status of a command that ends with this error.
     """
 
     code: ClassVar[str]
