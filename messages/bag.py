@@ -300,7 +300,9 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class ChannelDecoder:
-    """The data with which the messages of a channel are decoded and converted to the current type.
+    """The data that is needed to decode the messages of one channel.
+
+    migrate: function that converts the decoded fields to the current message type.
     """
 
     topic: Topic

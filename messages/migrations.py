@@ -172,8 +172,7 @@ def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
 
 
 def _literal_schema(model: str, recorded: Schema, current: Schema) -> Schema:
-    """Return a recorded JSON Schema in which text fields that are now literals have the new type.
-    """
+    """Return a recorded JSON Schema in which text fields that became literals have the new type."""
     properties = recorded.get("properties")
     if not isinstance(properties, Mapping):
         return recorded
