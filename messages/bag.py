@@ -1,19 +1,19 @@
-"""Read and write bags: MCAP files that contain serialized messages, their schemas and their times.
+"""Read and write bags: MCAP files that contain encoded messages, their schemas and their times.
 
 This module defines what MCAP leaves to the application:
 
 - The profile is "flexsheet". Each message type has a schema (JSON Schema). Each topic has a channel
-  with the encoding "flexsheet/2" and the type's fingerprint in the channel's metadata.
+  with the encoding "flexsheet/2". The channel's metadata contain the fingerprint of the type.
 - `log_time` is when the recorder received the message, and `publish_time` is the source timestamp
   in the message's header. Both are in ns of a monotonic clock, not since 1970.
-- The data of a message are its frames (byte strings of a ZeroMQ multipart message): a uint32 with
-  the number of frames, four zero bytes, and a uint64 with the length of each frame. The frames
-  follow. Each frame is padded with zeros to a multiple of eight bytes, so that arrays are aligned
-  and can be read without a copy. All numbers are little-endian.
+- The data of a message are its frames (byte strings of a ZeroMQ multipart message). The data begin
+  with the number of frames (uint32), four zero bytes, and the length of each frame (uint64). Then
+  the frames follow. Each frame is padded with zeros to a multiple of eight bytes, so that arrays
+  are aligned and can be read without a copy. All numbers are little-endian.
 
 A writer flushes its data to the disk every second. A reader scans the records from the start, so it
-does not need the index at the end. A file that was truncated by a crash can therefore be read up to
-the truncation; `BagReader.complete` is then false.
+does not need the index at the end. Therefore, a file that was truncated by a crash can be read up
+to the truncation. The attribute `BagReader.complete` is then false.
 """
 
 from __future__ import annotations
@@ -758,7 +758,7 @@ def recover(
 ) -> RecoverReport:
     """Write the readable part of a truncated or damaged bag to a new bag.
 
-    progress: function that is called with the number of processed chunks and the total number.
+    progress: function that is called with the numbers of processed and of all chunks.
 
     Raises BagError if nothing is readable, or if the new file exists or cannot be written.
     """

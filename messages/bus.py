@@ -232,7 +232,7 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Reopen the socket if the key of any host in the key ring has changed."""
+        """Reopen the socket with the new keys if the key of any host has changed."""
         if self._keys is not None and not self._socket.closed and (change.own or change.hosts):
             self._close_socket(unbind=True)
             self._open(self.endpoints)
@@ -252,8 +252,8 @@ class Publisher:
     def send(self, message: Message, header: Header) -> None:
         """Send a message without blocking.
 
-        Large arrays are not copied, so the caller must not change them afterwards. Raises WireError
-        if the message is larger than the topic allows.
+        Large arrays are not copied, so the caller must not change them after this call. Raises
+        WireError if the message is larger than the topic permits.
         """
         if self._channel is not None:
             self._channel.send(self.topic, message, header)
@@ -601,7 +601,7 @@ def _list_writers(sources: Sequence[Source]) -> frozenset[str] | None:
 
 
 class _HostConnection:
-    """A subscriber's socket that receives the messages of one host."""
+    """A socket of a subscriber that receives the messages of one host."""
 
     def __init__(
         self,
@@ -831,7 +831,11 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
 
 
 def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRing | None) -> str:
-    """Bind the socket, and return the endpoint with the assigned port number."""
+    """Bind a publisher's socket to an endpoint.
+
+    Return the endpoint, in which the actual port number replaces "*". Raises BusError if the socket
+    cannot be bound.
+    """
     _check_endpoint(topic, endpoint)
     if keys is None:
         _refuse_beyond_loopback(topic, endpoint)

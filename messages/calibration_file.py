@@ -27,7 +27,7 @@ MAX_CALIBRATION_DEPTH = 12
 
 
 class CalibrationFileError(FlexsheetError, ValueError):
-    """Raised for an invalid calibration file. The text names file, key and remedy."""
+    """Raised if a calibration file is invalid. The text names the file, the key and the remedy."""
 
     code = "calibration-file"
     exit_code = 2
@@ -87,7 +87,7 @@ def _parse_text(text: str) -> Any:
 
 
 class CalibrationComposer(Composer):
-    """A YAML composer that rejects aliases and excessive nesting."""
+    """A YAML composer that rejects aliases and too many nested lists or mappings."""
 
     depth = 0
 

@@ -26,9 +26,9 @@ def read_boot_id() -> str:
 
 
 def read_namespace_offset() -> str:
-    """Return the offset (s) of CLOCK_MONOTONIC in this time namespace, such as "+36000.0".
+    """Return the offset (s) of CLOCK_MONOTONIC in the time namespace of this process.
 
-    Return an empty string if there is no offset.
+    The result is text such as "+36000.0", or an empty string if there is no offset.
     """
     try:
         lines = Path("/proc/self/timens_offsets").read_text().splitlines()

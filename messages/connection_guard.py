@@ -225,7 +225,7 @@ class ConnectionGuard:
         )
 
     def _remove_publisher(self, fd: int, publisher: _Publisher) -> bool:
-        """Stop monitoring a publisher. Return False if no publisher is left."""
+        """Stop monitoring the connections to a publisher. Return False if no publisher is left."""
         self._epoll.unregister(fd)
         for connected_fd, connection in list(self._connections.items()):
             if connection.publisher is publisher:
@@ -244,7 +244,10 @@ class ConnectionGuard:
 
 
 def _ends(opened: socket.socket) -> tuple[tuple[object, ...], tuple[object, ...]]:
-    """Return the local and the remote address of a connection, or empty tuples if it is closed."""
+    """Return the local and the remote address of a connection.
+
+    Return empty tuples if the connection is closed.
+    """
     try:
         local, remote = opened.getsockname(), opened.getpeername()
     except OSError:

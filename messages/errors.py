@@ -18,5 +18,8 @@ class FlexsheetError(Exception):
     exit_code: int = 1
 
     def __str__(self) -> str:
-        """Return the error text. Without this method, a KeyError would return it in quotes."""
+        """Return the error text.
+
+        Without this method, an error that is also a KeyError would return the text in quotes.
+        """
         return Exception.__str__(self)

@@ -73,7 +73,7 @@ def make_write_error(
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the number of bytes that are free for this user on a folder's disk.
+    """Return the free space (bytes) for this user on the disk of a folder.
 
     Raises OSError if the folder does not exist.
     """

@@ -104,7 +104,7 @@ class LocalChannel:
     def send(self, topic: Topic, message: Message, header: Header) -> None:
         """Pass a message to all subscribers in this process.
 
-        Raises WireError if the arrays are larger than the topic allows.
+        Raises WireError if the arrays are larger than the topic permits.
         """
         latched = topic.delivery is Delivery.LATCHED
         if not (self._readers or latched):

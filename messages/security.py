@@ -38,7 +38,7 @@ RefusalHandler = Callable[[str], None]
 
 
 class SecurityError(FlexsheetError, RuntimeError):
-    """Raised for an invalid or missing key. The text names the file or host, and the remedy."""
+    """Raised if a key is invalid or missing. The text names the file or host, and the remedy."""
 
     code = "keys"
     remedy = (
@@ -275,7 +275,7 @@ class ZapAuthenticator:
 
     @classmethod
     def unregister(cls, domain: bytes) -> None:
-        """Remove a ZAP domain. Close the authenticator when no domain is left."""
+        """Remove a ZAP domain. If no domain is left, close the authenticator."""
         if cls._present is None:
             return
         cls._present._domains.pop(domain, None)

@@ -119,7 +119,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ROWS}
 
 
 class UnknownTopicError(FlexsheetError, KeyError):
-    """Raised for an unknown topic name. The text suggests a similar name."""
+    """Raised if a topic name is unknown. The text suggests a similar name."""
 
     code = "unknown-topic"
     exit_code = 2

@@ -746,7 +746,7 @@ class FingerPath(Message):
 
 
 class TwinFinger(Message):
-    """The true position of the simulated fingertip at the source timestamp."""
+    """The true position and velocity of the simulated fingertip at the source timestamp."""
 
     path_label: str
     path_done: bool
