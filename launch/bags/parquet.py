@@ -276,7 +276,7 @@ class TableBuilder:
 
     @property
     def is_full(self) -> bool:
-        """Return whether enough rows are buffered to be written as a row group."""
+        """Return whether enough rows are buffered to write them as a row group."""
         return len(self._rows) >= ROWS_PER_GROUP or self._bytes >= MAX_GROUP_BYTES
 
     def add(self, message: Message, header: Header, log_ns: int) -> None:
@@ -305,7 +305,7 @@ class TableBuilder:
     def drain(self) -> pyarrow.Table:
         """Return the buffered rows as a table, and clear the buffer.
 
-        Raises ExportError for a value that does not fit its column.
+        Raises ExportError if a value does not fit the type of its column.
         """
         arrow = _arrow()
         columns = zip(*self._rows, strict=True) if self._rows else ((),) * len(self.schema)

@@ -133,7 +133,7 @@ class Verification:
 
     @property
     def as_live(self) -> bool:
-        """Return whether the replayed outputs equal the recorded outputs within the tolerance."""
+        """Return whether the replayed outputs equal the recorded outputs within a tolerance."""
         return all(
             one.beyond_tolerance == 0 and (one.compared > 0 or one.recorded == 0)
             for one in self.topics.values()
@@ -439,7 +439,7 @@ class RecordedInputs:
 
 
 class Timers:
-    """A scheduler that calls the periodic methods of a node on a virtual clock."""
+    """A scheduler that calls the periodic methods of a node at due times on a virtual clock."""
 
     def __init__(self, node: Node, start_ns: int) -> None:
         self._node = node

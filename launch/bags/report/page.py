@@ -1,4 +1,4 @@
-"""Render the bag report as one self-contained HTML file for screen and print."""
+"""Create the bag report as one self-contained HTML file for screen and print."""
 
 from __future__ import annotations
 

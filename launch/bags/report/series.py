@@ -203,8 +203,7 @@ class RunningMoments:
 
 @dataclass(slots=True)
 class Events:
-    """A list of the first `limit` events of each kind, and the number of all events of each kind.
-    """
+    """A list of the first `limit` events of each kind, and the number of all events per kind."""
 
     limit: int = 100
     stored: list[tuple[float, str, str]] = field(default_factory=list)
