@@ -3,8 +3,8 @@
 The nodes assume the parameters in the scene file. The apparatus contains how the simulated hardware
 deviates from the scene. Only the simulator and the evaluation of experiments read the apparatus.
 
-An offset is the true value minus the value in the scene, and a ratio is the true value divided by
-the value in the scene. Without deviations, all offsets are zero and all ratios are one. A rotation
+An offset is the true value minus the value in the scene. A ratio is the true value divided by the
+value in the scene. Without deviations, all offsets are zero and all ratios are one. A rotation
 offset is a rotation vector about the world's axes, through the origin of the rotated frame. For the
 clamped edge of the sheet, the rotation vector is about the flange's axes.
 """

@@ -90,8 +90,8 @@ Over ipc, publishers send no heartbeats, because the end of a process is detecte
 heartbeats. A subscriber over ipc that is busy for seconds would not answer and would be
 disconnected.
 
-Subscribers send no heartbeats. libzmq 4.3.5 aborts the process if a heartbeat is due after the
-publisher has disconnected while its messages still fill the queue.
+Subscribers send no heartbeats, because of a fault in libzmq 4.3.5. The process is aborted if a
+heartbeat is due after the publisher has disconnected while its messages still fill the queue.
 """
 
 TCP_KEEPALIVE_OPTIONS = {

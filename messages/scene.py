@@ -87,9 +87,9 @@ class Ellipsoid(Part):
 
 
 class Plane(Part):
-    """A solid half-space below the plane z = 0 of the object frame.
+    """A solid half-space below the plane z = 0. The user can touch a rectangle at the origin.
 
-    The user can touch a rectangle of the plane, centred on the origin.
+    The plane is in the object frame. The rectangle is centred on the origin.
     """
 
     shape: Literal["plane"] = "plane"
@@ -278,7 +278,7 @@ class VirtualObject(Part):
 
 
 class SheetSpec(Part):
-    """The rubber sheet, which is clamped at its left and right edges and free at top and bottom.
+    """The rubber sheet, clamped at its left and right edges and free at its top and bottom edges.
 
     The x axis points from the left to the right edge, and the y axis along the edges.
     """
@@ -498,9 +498,10 @@ class Lens(Part):
 
 
 class StereoCamera(Part):
-    """The parameters of the stereo camera.
+    """The parameters of the stereo camera. Each camera frame has x to the right, y down, z
+    forwards.
 
-    In both camera frames, x points to the right, y down, and z along the optical axis.
+    The z axis is the optical axis of the camera.
     """
 
     device: str

@@ -80,19 +80,25 @@ FingertipReason = Literal[
 ]
 """The reason why no fingertip position was computed from an image pair.
 
-no_marker: no marker was found. marker_in_one_view: only one camera sees the marker. two_markers:
-    there are several possible markers. merged: the marker's image touches another bright spot.
-    blurred: the marker moves too fast for the exposure. saturated: the marker is overexposed.
-    outside_volume: the marker is outside the finger's possible positions. inconsistent: the rays of
-    the two cameras do not intersect. too_fast: the marker is faster than a finger. unconfirmed:
-    there are too few detections for a track.
+no_marker: no marker was found.
+marker_in_one_view: only one camera sees the marker.
+two_markers: there are several possible markers.
+merged: the marker's image touches another bright spot.
+blurred: the marker moves too fast for the exposure.
+saturated: the marker is overexposed.
+outside_volume: the marker is outside the finger's possible positions.
+inconsistent: the rays of the two cameras do not intersect.
+too_fast: the marker is faster than a finger.
+unconfirmed: there are too few detections for a track.
 """
 
 FingertipState = Literal["lost", "acquiring", "tracking", "coasting"]
 """The state of the track of the fingertip.
 
-lost: there is no track. acquiring: a track has begun, but is not yet confirmed. tracking: the
-    current image pair confirms the track. coasting: the position is only predicted.
+lost: there is no track.
+acquiring: a track has begun, but is not yet confirmed.
+tracking: the current image pair confirms the track.
+coasting: the position is only predicted.
 """
 
 
@@ -315,16 +321,17 @@ ForceSource = Literal["gauge", "motor_currents"]
 ForceAxis = Literal["sheet_normal", "left_edge", "right_edge"]
 """The component of a force that a sensor measures, in the sheet frame.
 
-sheet_normal: force of the finger on the sheet, positive away from the user. left_edge, right_edge:
-    force of the sheet on the clamped edge at an arm, positive towards the other edge.
+sheet_normal: force of the finger on the sheet, positive away from the user.
+left_edge, right_edge: force of the sheet on the clamped edge at an arm, positive towards the other
+    edge.
 """
 
 ForceReason = Literal["ok", "no_reading", "overload", "in_motion"]
 """The reason why a measured force is not valid; "ok" if it is valid.
 
-no_reading: the device has sent no readable number for some time. overload: the force exceeds the
-    range of the device. in_motion: the arm moves, so its motor currents also depend on friction and
-    acceleration.
+no_reading: the device has sent no readable number for some time.
+overload: the force exceeds the range of the device.
+in_motion: the arm moves, so its motor currents also depend on friction and acceleration.
 """
 
 
@@ -563,14 +570,17 @@ SuspectedCause = Literal[
 ]
 """The suspected cause of a deviation between a measured and an expected value.
 
-camera_moved: the pose of the stereo camera differs from the scene. cameras_misaligned: one camera
-    has moved relative to the other. marker_offset: the marker is not at the assumed position on the
-    finger. servo_lag: an arm's lag differs from the configured lag. arm_not_following: an arm does
-    not execute the commanded motion. sheet_stiffness: the measured stiffness of the sheet differs
-    from the scene. projector_moved: the pose of the projector differs from the scene.
-    arm_base_moved: the pose of an arm's base or clamp differs from the scene. display_latency:
-    projected images appear later than assumed. With a value that contains "or", the data cannot
-    distinguish the two causes.
+camera_moved: the pose of the stereo camera differs from the scene.
+cameras_misaligned: one camera has moved relative to the other.
+marker_offset: the marker is not at the assumed position on the finger.
+servo_lag: an arm's lag differs from the configured lag.
+arm_not_following: an arm does not execute the commanded motion.
+sheet_stiffness: the measured stiffness of the sheet differs from the scene.
+projector_moved: the pose of the projector differs from the scene.
+arm_base_moved: the pose of an arm's base or clamp differs from the scene.
+display_latency: projected images appear later than assumed.
+
+With a value that contains "or", the data cannot distinguish the two causes.
 """
 
 

@@ -11,9 +11,9 @@ The header frame is one msgpack array of eleven elements:
   type 1       dtype and shape, then the elements (for an array of at most 1 KiB)
   type 2       dtype and shape only; the elements are in the next frame
 
-Dtype and shape are encoded as one byte with the index in `DTYPES`, one byte with the number of
-axes, two zero bytes, and a little-endian uint32 per axis. Zeros up to a multiple of eight bytes
-align the elements. Elements are little-endian and in C order.
+The encoding of dtype and shape is one byte with the index in `DTYPES`, one byte with the number of
+axes, and two zero bytes. Then a little-endian uint32 follows for each axis. Zeros up to a multiple
+of eight bytes align the elements. Elements are little-endian and in C order.
 
 `encode` and `decode` do not copy large arrays. A sender must not change an array that is in a
 message, and a receiver gets read-only views of the memory from the socket. Small arrays are copied,

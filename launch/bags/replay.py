@@ -334,8 +334,8 @@ async def _replay_run(
 class NodeRun:
     """The execution log of a node, from one start of the node to the next start.
 
-    steps: integers (n, 4), one row for each executed step. The columns are the index of the input
-        (or -1 minus the index of the timer), the sequence number, the epoch, and the time in ns.
+    steps: integers (n, 4), one row for each executed step. The columns are input, sequence number,
+        epoch and time (ns). The input is its index, or -1 minus the index of a timer.
     """
 
     clock_id: str

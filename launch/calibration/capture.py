@@ -55,8 +55,8 @@ class Bin:
 def compute_required_counts(pairs: int) -> dict[Bin, int]:
     """Return the required number of image pairs for each condition, for a total of `pairs`.
 
-    Cells at the left edge of the left image and at the right edge of the right image are excluded,
-    because only one camera sees them at most distances.
+    Cells at the outer edges of the two images are excluded, because only one camera sees them at
+    most distances. These are the left edge of the left image and the right edge of the right image.
     """
     count = max(1, round(0.1 * pairs))
     required = {Bin("pairs", ""): pairs}

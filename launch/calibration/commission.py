@@ -42,12 +42,16 @@ class CommissionError(FlexsheetError, ValueError):
 class StepName(StrEnum):
     """The steps of a commissioning (calibration of a whole laboratory), in their order.
 
-    camera: optics of the stereo camera. arms: poses of the arm bases relative to the camera. edges:
-        pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of the
-        flanges. sheet: force model of the sheet. projector: pose and lens of the projector. marker:
-        position of the marker on the finger. eyes: positions of the viewer's eyes. delays: servo
-        lags of the arms, offset of the camera's timestamps, and latency of the projector.
-        verification: errors during a stroke of the finger.
+    camera: optics of the stereo camera.
+    arms: poses of the arm bases relative to the camera.
+    edges: pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of
+        the flanges.
+    sheet: force model of the sheet.
+    projector: pose and lens of the projector.
+    marker: position of the marker on the finger.
+    eyes: positions of the viewer's eyes.
+    delays: servo lags of the arms, offset of the camera's timestamps, and latency of the projector.
+    verification: errors during a stroke of the finger.
     """
 
     CAMERA = "camera"

@@ -76,8 +76,8 @@ MOVING = ("follow", "hold", "relax")
 MAX_END_S = 2.0
 """The maximum time (s) from the loss of an arm to the shutdown of its node at a session's end.
 
-If an arm is lost within this time and does not move again, the loss is reported as the end of the
-session and not as a fault.
+An arm that is lost within this time and does not move again has not failed. Its loss is reported as
+the end of the session.
 """
 
 
