@@ -1,3 +1,1 @@
-"""Define the messages that nodes exchange, the table of topics, and the scene and calibration
-files.
-"""
+"""Define the messages of the nodes, the table of topics, and the scene and calibration files."""

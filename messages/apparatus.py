@@ -169,8 +169,7 @@ class SheetTruth(Part):
 
 
 class FingerTruth(Part):
-    """The deviations of the simulated finger, its marker and its motion from the nodes'
-    assumptions.
+    """The deviations of the simulated finger, its marker and its motion from the scene.
 
     The finger frame has its origin at the contact point of the fingertip's pad. All messages use
     this point as the position of the fingertip. The x axis points along the finger towards the

@@ -186,8 +186,9 @@ class BagWriter:
             self.messages += 1
 
     def add_attachment(self, name: str, data: bytes, media_type: str) -> None:
-        """Add the content of a file to the bag, such as the launch file, the scene or a
-        calibration.
+        """Add the content of a file to the bag, such as the launch file or the scene.
+
+        media_type: MIME type of the file.
         """
         with self._writing():
             self._writer.add_attachment(0, 0, name, media_type, data)
@@ -421,8 +422,9 @@ class BagReader:
     def open_record(
         self, channel: mcap_records.Channel, record: mcap_records.Message
     ) -> tuple[Message, Header]:
-        """Decode a record that `records` or `read_chunk` returned. Raises BagError if it is
-        invalid.
+        """Decode a record that `records` or `read_chunk` returned.
+
+        Raises BagError if the record is invalid.
         """
         try:
             return _decode(split_frames(record.data), self._make_decoder(channel))
@@ -474,7 +476,7 @@ class BagReader:
         return {channel.topic: _find_type_name(channel) for channel in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:
-        """Return the content of the attachment with a name.
+        """Return the content of the attachment with the given name.
 
         If several attachments have this name, return the newest one. Raises BagError if there is
         none.
@@ -492,7 +494,7 @@ class BagReader:
     def info(self) -> BagInfo:
         """Return a summary of the whole bag.
 
-        The summary includes topics and times that this reader was told not to read.
+        The summary includes the topics and times that this reader does not read.
         """
         times: dict[int, list[int]] = {}
         for chunk in self.chunks:

@@ -426,8 +426,9 @@ class Subscriber:
             )
 
     def start(self) -> None:
-        """Connect to the endpoints, and start to deliver messages. This requires a running event
-        loop.
+        """Connect to the endpoints, and start to deliver messages.
+
+        This requires a running event loop.
         """
         if self._started:
             raise BusError(f'topic "{self.topic.name}": start() was called twice; call it once')

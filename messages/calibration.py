@@ -23,7 +23,7 @@ Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", ("numbers", "number
 class Board(Part):
     """A calibration board: a chessboard, or a ChArUco board with markers in its white squares.
 
-    columns, rows: numbers of inner corners of the squares, for both kinds of board.
+    columns, rows: numbers of inner corners along both sides of the board.
     """
 
     kind: Literal["chessboard", "charuco"] = "chessboard"
@@ -57,7 +57,7 @@ class PairResidual(Part):
 
 
 class Uncertainty(Part):
-    """The uncertainty of a stereo calibration, as standard deviations of normal errors.
+    """The uncertainty of a stereo calibration, given as standard deviations.
 
     The uncertainty is an error that all measured fingertip positions have in common. The scatter of
     single measurements is not included.

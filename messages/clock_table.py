@@ -55,8 +55,7 @@ class ClockTable:
         )
 
     def shift_ns(self, clock_id: str, at_ns: int) -> int | None:
-        """Return the time (ns) to add to timestamps near `at_ns` to convert them to the local
-        clock.
+        """Return the time (ns) to add to a timestamp to convert it to the local clock.
 
         Return None if the offset of the clock is unknown. All timestamps of a message get the same
         shift, which preserves their differences.

@@ -119,8 +119,9 @@ class ConnectionGuard:
 
     @classmethod
     def watch(cls, publisher: zmq.Socket[bytes], on_refused: OnRefused) -> None:
-        """Monitor all future connections to a publisher, until the monitor of its socket is
-        disabled.
+        """Monitor all future connections to a publisher until its socket's monitor is disabled.
+
+        on_refused: function that is called with the peer's address and the reason of each refusal.
         """
         publisher.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER_BYTES)
         events = int(zmq.EVENT_ACCEPTED | zmq.EVENT_MONITOR_STOPPED)

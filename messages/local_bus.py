@@ -197,8 +197,9 @@ class LocalConnection:
         self._loop = None
 
     def put(self, envelope: LocalEnvelope) -> None:
-        """Add a message to the queue, and schedule its delivery. Drop the message if the queue is
-        full.
+        """Add a message to the queue, and schedule its delivery.
+
+        If the queue is full, the message is dropped.
         """
         if len(self._waiting) < self._max_waiting:
             self._waiting.append(envelope)

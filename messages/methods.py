@@ -23,9 +23,7 @@ ComplianceMode = Literal["force_curve", "stiffness", "constant_stretch"]
 
 
 class SoftBodyChoice(BaseModel):
-    """The chosen method for the soft body's deformation, and the vertex spacing of its surface
-    mesh.
-    """
+    """The method for the soft body's deformation, and the vertex spacing of its surface mesh."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

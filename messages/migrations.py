@@ -315,8 +315,9 @@ class _Comparison:
 
 
 def _resolve(schema: Any, parts: Schema) -> Any:
-    """Replace a reference in a JSON Schema by the schema that it names. Raises TypeError for a
-    cycle.
+    """Replace a reference in a JSON Schema by the schema that it names.
+
+    Raises TypeError for a cycle of references.
     """
     for _ in range(len(parts) + 1):
         if not (isinstance(schema, Mapping) and "$ref" in schema):

@@ -227,8 +227,7 @@ class Appearance(Part):
 class VirtualObject(Part):
     """The virtual object that the user touches. An object without a material is rigid.
 
-    In a scene file, `support_angle_rad: x` is an abbreviation of `support: {kind: strip, angle_rad:
-    x}`.
+    In a scene file, `support_angle_rad: x` stands for `support: {kind: strip, angle_rad: x}`.
     """
 
     geometry: Geometry
@@ -498,8 +497,7 @@ class Lens(Part):
 
 
 class StereoCamera(Part):
-    """The parameters of the stereo camera. Each camera frame has x to the right, y down, z
-    forwards.
+    """The parameters of the stereo camera. Each camera frame has x to the right, y down, z ahead.
 
     The z axis is the optical axis of the camera.
     """
@@ -647,7 +645,7 @@ class Scene(Message):
 
 
 class UnfitGeometryError(FlexsheetError, ValueError):
-    """Raised if a command or method does not support the shape or support of the object."""
+    """Raised if a command or method does not work with the object's shape or support."""
 
     code = "unfit-geometry"
     exit_code = 2

@@ -127,7 +127,7 @@ class UnknownTopicError(FlexsheetError, KeyError):
 
 
 def find_topic(name: str) -> Topic:
-    """Return the topic with a name.
+    """Return the topic with the given name.
 
     Raises UnknownTopicError, which suggests the most similar name, if there is no such topic.
     """

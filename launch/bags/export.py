@@ -217,9 +217,7 @@ def check_free_space(output: Path) -> None:
 
 @dataclass(slots=True)
 class ViewState:
-    """The newest scene, soft-body surface and flange poses, which are needed to draw later
-    messages.
-    """
+    """The newest scene, soft-body surface and flange poses, needed to draw later messages."""
 
     scene: Scene | None = None
     skin: Skin | None = None
@@ -228,7 +226,7 @@ class ViewState:
     def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
         """Yield the images and the 3D data in a message as (channel, Foxglove message).
 
-        at_ns: time of the message for the Foxglove messages.
+        at_ns: timestamp of the Foxglove messages.
         """
         stamp = make_stamp(at_ns)
         match message:

@@ -402,7 +402,7 @@ class RecordedInputs:
         return [(port, *entry) for port, entry in found.items()]
 
     def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
-        """Return the message of an input port with a sequence number and an epoch.
+        """Return the message of an input port with the given sequence number and epoch.
 
         Return None if the bag does not contain the message.
         """
@@ -464,8 +464,9 @@ class Timers:
 def compare(
     bag: Path, node: ResolvedNode, replayed: ReplayResult, tolerance: float
 ) -> dict[str, Comparison]:
-    """Compare the recorded outputs of a node with its replayed outputs, and return the result by
-    topic.
+    """Compare the recorded outputs of a node with its replayed outputs, topic by topic.
+
+    tolerance: maximum difference of a field that counts as equal.
     """
     outputs = {port.topic for port in node.outputs} - {"status"}
     recorded: dict[str, dict[int, Message]] = {topic: {} for topic in outputs}

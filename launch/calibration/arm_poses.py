@@ -320,8 +320,9 @@ class PoseRecorder:
 
 
 def add_row(folder: Path, names: list[str], joints_rad: Floats) -> None:
-    """Append a pose to the table of joint angles in a folder. Create the table if it does not
-    exist.
+    """Append a pose to the table of joint angles in a folder.
+
+    The table is created if it does not exist.
 
     names: names of the left and right image file.
     joints_rad: joint angles (6,).

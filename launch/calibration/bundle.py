@@ -66,9 +66,7 @@ class RigFit:
     covariance: Floats
 
     def pair_rms_px(self) -> Floats:
-        """Return the rms corner residuals (pairs, 2), in px, of the left and right image of each
-        pair.
-        """
+        """Return the rms corner residuals (pairs, 2), in px, of the left and right images."""
         return np.array([[rms_distance(view) for view in views] for views in self.residuals])
 
     def rms_px(self) -> float:
@@ -109,8 +107,7 @@ def pose_vector(transform: Floats) -> Floats:
 def _project(points: Floats, pose: Floats, lens: Floats) -> tuple[Floats, Floats, Floats]:
     """Project points (n, 3), in m, to pixels (n, 2).
 
-    Return the pixels, their derivatives (2n, 6) by the pose, and their derivatives (2n, 8) by the
-    lens.
+    Return the pixels and their derivatives with respect to the pose (2n, 6) and the lens (2n, 8).
     """
     matrix, distortion = lens_arrays(lens)
     pixels, slope = cv2.projectPoints(points, pose[:3], pose[3:], matrix, distortion)
@@ -121,7 +118,8 @@ def _project(points: Floats, pose: Floats, lens: Floats) -> tuple[Floats, Floats
 def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
     """Transform a board pose (6,) from the left to the right camera's frame.
 
-    Return the pose (6,) in the right camera's frame, and its derivatives (6, 6) by both arguments.
+    Return the pose (6,) in the right camera's frame, and its derivatives (6, 6) with respect to
+    `pose` and `stand`.
 
     stand: pose (6,) of the left camera in the right camera's frame.
     """
@@ -137,8 +135,8 @@ class Linearized:
     """The residuals of one image pair, with derivatives.
 
     shifts: residuals (m,), px.
-    by_rig: derivatives (m, 22) by the parameters of the rig.
-    by_pose: derivatives (m, 6) by the board pose.
+    by_rig: derivatives (m, 22) with respect to the parameters of the rig.
+    by_pose: derivatives (m, 6) with respect to the board pose.
     """
 
     shifts: Floats

@@ -168,8 +168,9 @@ class Capture:
         return "near" if fraction > NEAR else "far" if fraction < FAR else "middle"
 
     def _make_hint(self, prefix: str) -> str:
-        """Return an instruction to the user for the next pose of the board, after the text
-        `prefix`.
+        """Return an instruction to the user for the next pose of the board.
+
+        prefix: text before the instruction.
         """
         missing = self.missing()
         if not missing:

@@ -293,12 +293,12 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Cross-validate a stereo calibration: measure each image pair with a calibration without that
-    pair.
+    """Cross-validate a stereo calibration by measuring image pairs that were not used.
 
-    The calibration is repeated with some pairs left out each time. The pairs i, i+G, i+2G, ... form
-    a group that is left out together, because consecutive images are similar. For chessboards, the
-    calibration of OpenCV's tutorials is evaluated in the same way, for comparison.
+    The calibration is repeated with some pairs left out each time, and these pairs are measured.
+    The pairs i, i+G, i+2G, ... form a group that is left out together, because consecutive images
+    are similar. For chessboards, the calibration of OpenCV's tutorials is evaluated in the same
+    way, for comparison.
 
     leave_out: number of pairs that are left out together.
 

@@ -230,8 +230,9 @@ class Commissioning:
         self._record(StepRecord(name=name, date=_now(), skipped_because=reason))
 
     def run(self, name: StepName, step: Step) -> StepResult:
-        """Run a step with the results of all earlier steps, and discard the results of all later
-        steps.
+        """Run a step with the results of all earlier steps, and return its result.
+
+        The results of all later steps are discarded.
         """
         self._invalidate_from(name)
         started_s, cpu_started_s = time.monotonic(), time.process_time()

@@ -287,7 +287,7 @@ def match_views(
 ) -> BoardPair | str:
     """Combine the detected corners of two images of one board pose.
 
-    Return the reason as text if this is impossible.
+    If this is impossible, return the reason as text.
 
     names: names of the two images, for the reason.
     """

@@ -28,7 +28,7 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 MIN_SWITCHES = 20
 MAX_LATENCY_S = 0.15
-"""The maximum latency (s) that is considered."""
+"""The maximum latency (s) of the projector that the estimation considers."""
 
 STEP_S = 2e-4
 JITTERS_S = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3, 8e-3)

@@ -68,16 +68,16 @@ Poses with larger errors are excluded from the first fit.
 """
 
 MAX_CHI_SQUARE, MEDIAN_CHI_SQUARE = 60.0, 5.348
-"""The squared deviation above which a pose is an outlier, and the median of chi-square.
+"""The limit of the outlier test, and the median of chi-square with six degrees of freedom.
 
-Deviations are scaled by the median, which is that for six degrees of freedom. The maximum was 43 in
-75 simulated sets of 15 poses without outliers. The limit is higher, because the error of an arm
-varies over its workspace.
+A pose is an outlier if its squared deviation exceeds the limit. The squared deviations are scaled
+so that their median is the median of chi-square. The maximum was 43 in 75 simulated sets of 15
+poses without outliers. The limit is higher, because the error of an arm varies over its workspace.
 """
 
 ROUNDING_PX, ROUNDING_RAD, ROUNDING_M = 1e-4, 1e-8, 1e-8
 MIN_SCALE = 0.01
-"""The minimum scale of squared deviations.
+"""The minimum ratio of the median squared deviation to the median of chi-square.
 
 It applies if all poses agree except for rounding errors.
 """
@@ -87,7 +87,7 @@ MAX_READMISSIONS = 5
 MAX_PLAUSIBLE_ARM_M, MAX_PLAUSIBLE_ARM_RAD = 0.01, 0.05
 """The maximum plausible standard deviations of the flange's position (m) and rotation (rad).
 
-Larger values mean that joint angles are assigned to the wrong joints.
+Larger values indicate that joint angles are assigned to the wrong joints.
 """
 
 MAX_OUTLIER_RATIO = 1.0 / 3.0
@@ -249,7 +249,8 @@ class _LinearizedPose:
 
     measured: flange motion (6,), in the flange's frame, that fits the corners best.
     spread: covariance (6, 6) of this motion for corner noise of 1 px.
-    by_unknowns: derivatives (6, 12) of the flange motion by the motions of base and board.
+    by_unknowns: derivatives (6, 12) of the flange motion with respect to the motions of base and
+        board.
     inner_px2: sum of squared pixel residuals after the flange motion.
     count: number of corner coordinates.
     rms_px: rms error of the corners without the flange motion.
@@ -397,9 +398,10 @@ def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
 def _linearize_pixels(
     detection: BoardDetection, rig: LensRig, left_from_flange: Floats, flange_from_board: Floats
 ) -> tuple[Floats, Floats]:
-    """Compute the residuals of the corners and their derivatives by a flange motion.
+    """Compute the residuals of the corners, and their derivatives for a small flange motion.
 
-    Return residuals (m,), in px, and derivatives (m, 6) by rotation (rad) and translation (m).
+    Return residuals (m,), in px, and derivatives (m, 6) with respect to rotation (rad) and
+    translation (m).
     """
     residuals, slopes = [], []
     for view, lens, eye_from_left in (

@@ -46,14 +46,14 @@ They describe the prior distributions of the errors of touches, orientations and
 """
 
 POINT_GRID_M = 1e-6
-"""The grid (m) to which points are rounded to find touches of the same point."""
+"""The spacing (m) of the grid to which points are rounded to find touches of the same point."""
 
 MIN_TOUCHES, MIN_ORIENTATIONS = 4, 3
 MIN_ANGLE_RAD = np.radians(8.0)
 """The minimum angle (rad) between two orientations that count as different."""
 
 MAX_DEVIATION_M = 5e-4
-"""The maximum standard deviation (m) of each component of a valid offset."""
+"""The maximum standard deviation (m) of each coordinate of a valid marker position."""
 
 MAX_RESIDUAL_M = 1e-3
 """The maximum root mean square (m) of the residuals of a valid fit."""

@@ -278,7 +278,7 @@ def _fit_projector(
         return np.asarray((projected.reshape(-1, 2) - pixels).ravel())
 
     def derivatives(x: Floats) -> Floats:
-        """Return the derivatives (2n, 13) of the residuals by the unknowns.
+        """Return the derivatives (2n, 13) of the residuals with respect to the unknowns.
 
         The unknowns are rotation (3), translation (3), focal length, principal point (2), and k1,
         k2, p1, p2.

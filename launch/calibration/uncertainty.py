@@ -59,13 +59,14 @@ def sample_working_plane(rig: Floats, size: tuple[int, int], distance_m: float) 
 
 
 def compute_position_jacobian(rig: Floats, points: Floats) -> Floats:
-    """Return the derivatives (n, 3, 22) of triangulated points (n, 3) by the rig's parameters.
+    """Return the derivatives of triangulated points with respect to the rig's parameters.
 
     The pixels p = f(x, rig) are fixed, and the position x has the least squared image error.
     Therefore, A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig. The
-    derivative is dx/drig = -(A'A)^-1 A'B.
+    derivative is dx/drig = -(A'A)^-1 A'B, with the shape (n, 3, 22).
 
     rig: parameters of the stereo rig (22,).
+    points: triangulated points (n, 3), m.
     """
     count = len(points)
     by_point, by_rig = np.empty((count, 4, 3)), np.zeros((count, 4, len(PARAMETERS)))
@@ -89,7 +90,7 @@ def compute_position_std(slopes: Floats, covariance: Floats) -> tuple[float, flo
 
     Each is a root mean square over the points. The lateral value combines x and y.
 
-    slopes: derivatives (n, 3, 22) of the positions by the rig's parameters.
+    slopes: derivatives (n, 3, 22) of the positions with respect to the rig's parameters.
     covariance: covariance matrix (22, 22) of the rig's parameters.
     """
     variances = np.einsum("nip,pq,niq->ni", slopes, covariance, slopes).mean(axis=0)

@@ -251,8 +251,7 @@ def latencies(session: Session) -> Chart | None:
 
 
 def paths(session: Session) -> Chart | None:
-    """Draw the paths of the finger and of the sheet's centre, seen from the front and from the
-    side.
+    """Draw the paths of the finger and of the sheet's centre, from the front and from the side.
 
     Return None if the bag contains no positions.
     """
@@ -380,8 +379,7 @@ def draw_joint_speeds(session: Session) -> Chart | None:
 
 
 def forces(session: Session) -> Chart | None:
-    """Draw the forces at the sheet's edges, the force of the object and the push depth against
-    time.
+    """Draw the sheet's edge forces, the object's force and the push depth against time.
 
     Return None if the bag contains no edge forces.
     """

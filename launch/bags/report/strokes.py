@@ -206,8 +206,7 @@ class SheetErrors:
             side.edges[name == "right"].append((source_ns, row))
 
     def _is_following(self, at_ns: int) -> float:
-        """Return 1 if the sheet target follows the finger and both arms follow the target,
-        otherwise 0.
+        """Return 1 if the sheet target follows the finger and both arms follow the target, else 0.
         """
         arms = [self._arms.get(side) for side in ("left", "right")]
         both = all(arm is not None and arm[1] and at_ns - arm[0] <= SILENT_NS for arm in arms)
@@ -308,8 +307,9 @@ class SheetErrors:
 
 
 def read_followed(bag: Path) -> list[dict[str, Any]]:
-    """Return a summary for each finger path in a bag of how accurately the sheet followed the
-    finger.
+    """Return a summary of how accurately the sheet followed the finger, for each finger path.
+
+    The simulated finger paths are read from a bag.
     """
     errors = SheetErrors(Grid(0, 1.0, 1))
     for _, message, header, _ in BagReader(bag, topics=TOPICS_READ):
