@@ -206,8 +206,7 @@ class SheetErrors:
             side.edges[name == "right"].append((source_ns, row))
 
     def _is_following(self, at_ns: int) -> float:
-        """Return 1 if the sheet target follows the finger and both arms follow the target, else 0.
-        """
+        """Return 1 if both arms follow a sheet target that follows the finger, otherwise 0."""
         arms = [self._arms.get(side) for side in ("left", "right")]
         both = all(arm is not None and arm[1] and at_ns - arm[0] <= SILENT_NS for arm in arms)
         return float(both and not self._target_holds)
