@@ -552,7 +552,7 @@ class BagReader:
                 break
             if first and opcode != Opcode.HEADER:
                 raise BagError(
-                    f"{self.path}: this is no bag, because its first record is not an MCAP header"
+                    f"{self.path}: this is not a bag; its first record is not an MCAP header"
                 )
             try:
                 self._index_record(file, opcode, offset, length)

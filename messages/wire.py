@@ -201,7 +201,8 @@ def read_envelope(
     unpacked = _unpack(frames)
     if type(unpacked) is not tuple or len(unpacked) not in (10, 11):
         raise WireError(
-            "malformed", "this is no flexsheet message: its header does not have eleven elements"
+            "malformed",
+            "this is not a flexsheet message: its header does not have eleven elements",
         )
     protocol, name, found, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
     if type(protocol) is not str or ELEMENTS.get(protocol) != len(unpacked):
@@ -310,7 +311,7 @@ def _unpack(frames: Sequence[Any]) -> Any:
     # others.
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"[:200]
-        raise WireError("malformed", f"this is no flexsheet message: {reason}") from error
+        raise WireError("malformed", f"this is not a flexsheet message: {reason}") from error
     if used != len(frames) - 1:
         raise WireError(
             "frames", f"the message has {len(frames)} frames, but its header describes {used + 1}"

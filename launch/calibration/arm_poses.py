@@ -144,20 +144,21 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
         ) from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise ArmPosesError(
-            f"{path}: invalid CSV: {error}; save it as comma-separated values"
+            f"{path}: the file is not valid CSV: {error}; save it as comma-separated values"
         ) from error
     unit = next(
         (one for one in ("deg", "rad") if all(f"{j}_{one}" in columns for j in JOINTS)), None
     )
     if unit is None:
         raise ArmPosesError(
-            f"{path}: found columns {', '.join(columns) or 'none'}; add j1_deg to j6_deg, or "
-            "j1_rad to j6_rad"
+            f"{path}: the table has no joint angles (columns: {', '.join(columns) or 'none'}); add "
+            "the columns j1_deg to j6_deg, or j1_rad to j6_rad"
         )
     by_pose = all(name in columns for name in BOARD_COLUMNS)
     if not by_pose and not {"left", "right"} <= set(columns):
         raise ArmPosesError(
-            f"{path}: missing columns; add left and right (images), or {', '.join(BOARD_COLUMNS)}"
+            f"{path}: the table has neither images nor board poses; add the columns left and "
+            f"right, or {', '.join(BOARD_COLUMNS)}"
         )
     rows = []
     for number, line in enumerate(lines, start=2):
@@ -171,7 +172,7 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
             images = (folder / (line["left"] or ""), folder / (line["right"] or ""))
             rows.append(PoseRow(line["left"] or f"row {number}", joints_rad, images, None))
     if not rows:
-        raise ArmPosesError(f"{path}: does not contain rows; add one per pose of the arm")
+        raise ArmPosesError(f"{path}: the table has no rows; add one row per pose of the arm")
     return rows
 
 
@@ -215,7 +216,7 @@ def read_detections(
     )
     if found_size != size:
         raise ArmPosesError(
-            f"{folder}: images of {found_size[0]}x{found_size[1]} px, but the camera's "
+            f"{folder}: the images have {found_size[0]}x{found_size[1]} px, but the camera's "
             f"calibration is for {size[0]}x{size[1]}; capture images of that size"
         )
     detections, missing = [], []

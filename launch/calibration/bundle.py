@@ -262,7 +262,8 @@ def fit_rig(pairs: Sequence[BoardPair], board: Floats, *, rig: Floats, poses: Fl
     freedom = numbers - len(PARAMETERS) - poses.size
     if freedom < 1:
         raise NotDeterminedError(
-            f"{numbers} corner coordinates do not determine {numbers - freedom} unknowns"
+            f"{numbers} corner coordinates do not determine {numbers - freedom} unknowns; add "
+            "image pairs"
         )
     variance = cost / freedom
     return RigFit(

@@ -208,12 +208,15 @@ def check_stereo(
     found, size = find_pairs(left_paths, right_paths, board, progress)
     if size != (calibration.width_px, calibration.height_px):
         raise CalibrationError(
-            f"images of {size[0]}x{size[1]} px, but the calibration of {calibration.device} is for "
-            f"{calibration.width_px}x{calibration.height_px} px; use images of that size"
+            f"the images have {size[0]}x{size[1]} px, but the calibration of {calibration.device} "
+            f"is for {calibration.width_px}x{calibration.height_px} px; use images of that size"
         )
     pairs = [pair for pair in found if isinstance(pair, BoardPair)]
     if not pairs:
-        raise CalibrationError(f"none of the {len(found)} pairs is usable; the first: {found[0]}")
+        raise CalibrationError(
+            f"none of the {len(found)} image pairs is usable (first pair: {found[0]}); capture "
+            "images with the board in both views"
+        )
     used = {pair.digest for pair in calibration.pairs if pair.used}
     reused = [
         left.name
@@ -308,8 +311,8 @@ def cross_check(
     whole = {i: pair for i, pair in enumerate(found) if isinstance(pair, BoardPair)}
     if len(whole) - leave_out < MIN_PAIRS or leave_out < 1:
         raise CalibrationError(
-            f"{len(whole)} of {len(found)} pairs are usable, {leave_out} are excluded at a time; "
-            f"at least {MIN_PAIRS} must remain to calibrate; capture more images"
+            f"{len(whole)} of {len(found)} pairs are usable, and {leave_out} are left out at a "
+            f"time, but at least {MIN_PAIRS} must remain to calibrate; capture more images"
         )
     points = board_points(board)
     plain: dict[int, BoardPair] = {}

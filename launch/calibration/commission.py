@@ -196,7 +196,7 @@ class Commissioning:
             return State.model_validate_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, ValidationError) as error:
             raise CommissionError(
-                f"{path}: not a valid state of a commissioning: {error}; use a new folder"
+                f"{path}: this is not a valid state of a commissioning: {error}; use a new folder"
             ) from error
 
     @property

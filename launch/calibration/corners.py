@@ -128,8 +128,9 @@ def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if board.marker_m is None or number is None:
         raise CalibrationError(
-            f"ChArUco board with markers of {board.marker_m} m, dictionary {board.dictionary!r}: "
-            "give the marker size and an OpenCV dictionary, such as DICT_4X4_50"
+            f"the ChArUco board has the marker size {board.marker_m} m and the dictionary "
+            f"{board.dictionary!r}: give the marker size and an OpenCV dictionary, such as "
+            "DICT_4X4_50"
         )
     if board.marker_m >= board.square_m:
         raise CalibrationError(
@@ -141,8 +142,8 @@ def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     needed, available = squares[0] * squares[1] // 2, len(dictionary.bytesList)
     if needed > available:
         raise CalibrationError(
-            f"a board of {squares[0]}x{squares[1]} squares needs {needed} markers, {name} contains "
-            f"{available}; choose a larger dictionary"
+            f"a board of {squares[0]}x{squares[1]} squares needs {needed} markers, but {name} "
+            f"contains only {available}; choose a larger dictionary"
         )
     return cv2.aruco.CharucoBoard(squares, board.square_m, board.marker_m, dictionary)
 
@@ -307,7 +308,7 @@ def read_gray(path: Path) -> Image:
     """Read an image file as grey levels (h, w). Raises CalibrationError if it cannot be read."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if image is None:
-        raise CalibrationError(f"{path}: cannot read the image; check the path and the format")
+        raise CalibrationError(f"{path}: the image cannot be read; check the path and the format")
     return np.asarray(image, dtype=np.uint8)
 
 
@@ -332,11 +333,13 @@ def find_pairs(
     """
     if len(left_paths) != len(right_paths):
         raise CalibrationError(
-            f"{len(left_paths)} left and {len(right_paths)} right images; give the same number, in "
-            "the same order"
+            f"there are {len(left_paths)} left and {len(right_paths)} right images; give the same "
+            "number, in the same order"
         )
     if not left_paths:
-        raise CalibrationError("no images: the file patterns match no file; check the patterns")
+        raise CalibrationError(
+            "there are no images, because the file patterns match no file; check the patterns"
+        )
     finder = CornerFinder(board)
     results: list[BoardPair | str] = []
     size: tuple[int, int] | None = None
@@ -347,8 +350,8 @@ def find_pairs(
             image_size = (image.shape[1], image.shape[0])
             if size is not None and image_size != size:
                 raise CalibrationError(
-                    f"{path}: {image_size[0]}x{image_size[1]} px, expected "
-                    f"{size[0]}x{size[1]} as the other images"
+                    f"{path}: the image has {image_size[0]}x{image_size[1]} px, but the other "
+                    f"images have {size[0]}x{size[1]} px; give images of one size"
                 )
             size = image_size
             views.append(finder.find(image))

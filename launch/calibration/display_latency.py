@@ -82,7 +82,8 @@ def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
     switches = len({one.switched_s for one in images})
     if switches < MIN_SWITCHES:
         raise DisplayLatencyError(
-            f"{switches} switches of the projected image; at least {MIN_SWITCHES} are required"
+            f"the images contain {switches} switches of the projected image, but at least "
+            f"{MIN_SWITCHES} are required; record more switches"
         )
     start_s, end_s, switched_s = np.array(
         [(one.start_s, one.end_s, one.switched_s) for one in images]

@@ -235,8 +235,9 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
     residual_rms_m = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     if not residual_rms_m <= MAX_RESIDUAL_M:
         raise EdgeFitError(
-            f"the marks are {1e3 * residual_rms_m:.2f} mm (rms) from the fitted edge, maximum "
-            f"{1e3 * MAX_RESIDUAL_M:g} mm; check which mark, arm and joint angles belong together"
+            f"the marks are {1e3 * residual_rms_m:.2f} mm (rms) from the fitted edge, but at most "
+            f"{1e3 * MAX_RESIDUAL_M:g} mm are allowed; check which mark, arm and joint angles "
+            "belong together"
         )
     marks = off.size
     covariance = np.linalg.inv(found.jac.T @ found.jac)

@@ -126,20 +126,22 @@ def fit_eyes(alignments: Sequence[Alignment], guess: Eyes) -> EyesFit:
         given = [one for one in alignments if one.eye == side]
         if len(given) < MIN_ALIGNMENTS:
             raise EyesError(
-                f"{len(given)} alignments of the {side} eye; at least {MIN_ALIGNMENTS} are required"
+                f"there are {len(given)} alignments of the {side} eye, but at least "
+                f"{MIN_ALIGNMENTS} are required; record more alignments"
             )
         start = guess.centre_world_m + sign * guess.interocular_m * np.eye(3)[0]
         position, covariance, rms_rad = _fit_eye(given, start)
         if np.linalg.norm(position - start) > MAX_SHIFT_M:
             raise EyesError(
                 f"the measured {side} eye is {np.linalg.norm(position - start):.2g} m from its "
-                f"position in the scene, at most {MAX_SHIFT_M:g} m are allowed; check "
+                f"position in the scene, but at most {MAX_SHIFT_M:g} m are allowed; check "
                 "eyes.centre_world_m in the scene, and the columns of the CSV file"
             )
         if rms_rad > MAX_ANGLE_RAD:
             raise EyesError(
-                f"{side} eye: the rms angle between bead and cross is {1e3 * rms_rad:.1f} mrad, at "
-                f"most {1e3 * MAX_ANGLE_RAD:.0f} mrad are allowed; check all columns of the CSV"
+                f"{side} eye: the rms angle between bead and cross is {1e3 * rms_rad:.1f} mrad, "
+                f"but at most {1e3 * MAX_ANGLE_RAD:.0f} mrad are allowed; check all columns of the "
+                "CSV file"
             )
         positions.append(position)
         covariances.append(covariance)

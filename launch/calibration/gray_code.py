@@ -82,7 +82,9 @@ def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> D
     bits = [_bits(width_px), _bits(height_px)]
     expected = 2 * sum(bits) + 2
     if len(images) != expected:
-        raise DecodeError(f"expected {expected} images, one per pattern, found {len(images)}")
+        raise DecodeError(
+            f"there are {len(images)} images of {expected} patterns; give one image per pattern"
+        )
     if len({image.shape for image in images}) != 1:
         raise DecodeError(
             "the images have different sizes; capture all images with the same camera"

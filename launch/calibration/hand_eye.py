@@ -306,7 +306,8 @@ def calibrate_base(
 def _check_count(detections: Sequence[BoardDetection]) -> None:
     if len(detections) < MIN_POSES:
         raise HandEyeError(
-            f"{len(detections)} arm poses, at least {MIN_POSES} are required; record 15 to 20 poses"
+            f"there are {len(detections)} arm poses, but at least {MIN_POSES} are required; record "
+            "15 to 20 poses"
         )
     for one in detections:
         if not np.isfinite(one.joints_rad).all() or one.joints_rad.shape != (6,):
@@ -346,15 +347,16 @@ def _check_rotations(flanges: Sequence[Floats]) -> None:
     if spread[2] < MIN_ROTATION_RAD:
         raise HandEyeError(
             f"the flange rotates by only {np.degrees(spread[2]):.1f} degrees rms between the "
-            f"poses, at least {np.degrees(MIN_ROTATION_RAD):.0f} about two axes are required; "
+            f"poses, but at least {np.degrees(MIN_ROTATION_RAD):.0f} about two axes are required; "
             "rotate it by 20 to 40 degrees in both directions"
         )
     if spread[1] < MIN_ROTATION_RAD:
         x, y, z = axes[:, 2]
         raise HandEyeError(
-            f"the flange rotates about one axis only, ({x:.2f}, {y:.2f}, {z:.2f}) in its own frame "
-            f"(about other axes {np.degrees(spread[1]):.1f} degrees rms, at least "
-            f"{np.degrees(MIN_ROTATION_RAD):.0f} required); rotate it about another axis as well"
+            f"the flange rotates about one axis only, ({x:.2f}, {y:.2f}, {z:.2f}) in its own "
+            f"frame; it rotates by {np.degrees(spread[1]):.1f} degrees rms about other axes, but "
+            f"at least {np.degrees(MIN_ROTATION_RAD):.0f} are required; rotate it about another "
+            "axis as well"
         )
 
 
@@ -461,7 +463,7 @@ def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: Lens
             best, min_score = found, score
     if best is None:
         raise HandEyeError(
-            "no initial solution for these poses; rotate the flange more, about two axes"
+            "these poses have no initial solution; rotate the flange more, about two axes"
         )
     return best
 

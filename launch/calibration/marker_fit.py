@@ -131,9 +131,9 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     if len(touches) < MIN_TOUCHES or orientations < MIN_ORIENTATIONS:
         missing = max(MIN_ORIENTATIONS - orientations, MIN_TOUCHES - len(touches))
         raise MarkerFitError(
-            f"{len(touches)} touches in {orientations} orientations; at least {MIN_TOUCHES} "
-            f"touches in {MIN_ORIENTATIONS} orientations are needed: touch in at least {missing} "
-            "more orientations"
+            f"there are {len(touches)} touches in {orientations} orientations, but at least "
+            f"{MIN_TOUCHES} touches in {MIN_ORIENTATIONS} orientations are needed: touch in at "
+            f"least {missing} more orientations"
         )
     rounded = np.rint(np.array([touch.point_m for touch in touches]) / POINT_GRID_M)
     places, point = np.unique(rounded, axis=0, return_inverse=True)
@@ -194,21 +194,22 @@ def _check_fit(fit: MarkerFit) -> None:
     worst = int(np.argmax(fit.residuals_m))
     if fit.residual_rms_m > MAX_RESIDUAL_M:
         raise MarkerFitError(
-            f"the touches contradict each other: rms residual {1e3 * fit.residual_rms_m:.2f} mm, "
-            f"maximum {1e3 * fit.residuals_m[worst]:.2f} mm in touch {worst + 1}; limit of the rms "
-            f"{1e3 * MAX_RESIDUAL_M:g} mm; check units, signs and orientations"
+            f"the touches contradict each other: the rms residual is "
+            f"{1e3 * fit.residual_rms_m:.2f} mm, but at most {1e3 * MAX_RESIDUAL_M:g} mm are "
+            f"allowed; the residual of touch {worst + 1} is {1e3 * fit.residuals_m[worst]:.2f} mm; "
+            "check units, signs and orientations"
         )
     for axis, deviation_m in zip("xyz", fit.standard_deviations_m, strict=True):
         if deviation_m > MAX_DEVIATION_M:
             raise MarkerFitError(
-                f"{axis} of the offset has an uncertainty of {1e3 * deviation_m:.2f} mm, maximum "
-                f"{1e3 * MAX_DEVIATION_M:g} mm; add orientations that differ more"
+                f"{axis} of the offset has an uncertainty of {1e3 * deviation_m:.2f} mm, but at "
+                f"most {1e3 * MAX_DEVIATION_M:g} mm are allowed; add orientations that differ more"
             )
     length_m = float(np.linalg.norm(fit.marker_from_pad_m))
     if length_m > MAX_OFFSET_M:
         raise MarkerFitError(
-            f"the marker would be {1e3 * length_m:.0f} mm from the pad, at most "
-            f"{1e3 * MAX_OFFSET_M:g} mm; check units and touched points"
+            f"the marker would be {1e3 * length_m:.0f} mm from the pad, but at most "
+            f"{1e3 * MAX_OFFSET_M:g} mm are plausible; check units and touched points"
         )
 
 

@@ -176,8 +176,8 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
     coverage = _measure_coverage(points.pixels, guess)
     if poses < MIN_POSES or len(points.world) < MIN_POINTS:
         raise ProjectorError(
-            f"{len(points.world)} points in {poses} poses; capture at least {MIN_POSES} poses "
-            f"and {MIN_POINTS} points that both cameras see"
+            f"there are {len(points.world)} points in {poses} poses; capture at least {MIN_POSES} "
+            f"poses and {MIN_POINTS} points that both cameras see"
         )
     if depth_m < MIN_DEPTH_RANGE_M:
         raise ProjectorError(
@@ -186,7 +186,7 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
         )
     if coverage < MIN_COVERAGE:
         raise ProjectorError(
-            f"the points cover {100 * coverage:.0f} % of the projector's image, at least "
+            f"the points cover {100 * coverage:.0f} % of the projector's image, but at least "
             f"{100 * MIN_COVERAGE:.0f} % are required; move the sheet over the image"
         )
     for _ in range(3):
@@ -201,8 +201,9 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
     rms = _rms(residual_px[inliers])
     if rms > MAX_RMS_PX or inliers.mean() < 0.8:
         raise ProjectorError(
-            f"{rms:.2f} px rms and {int((~inliers).sum())} outliers of {len(inliers)} points; keep "
-            "the sheet still during each pose, and check the cameras (flexsheet calibrate check)"
+            f"the fit has a residual of {rms:.2f} px rms, and {int((~inliers).sum())} of "
+            f"{len(inliers)} points are outliers; keep the sheet still during each pose, and check "
+            "the cameras (flexsheet calibrate check)"
         )
     held_out, shifts = [], []
     for pose in np.unique(points.pose):
@@ -335,7 +336,7 @@ def fit_keystone(
     cross_products = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
     if not ((cross_products > 1.0).all() or (cross_products < -1.0).all()):
         raise ProjectorError(
-            f"corners {corners_px.tolist()} are not a convex quadrangle; give bottom left, "
+            f"the corners {corners_px.tolist()} are not a convex quadrangle; give bottom left, "
             "bottom right, top right, top left, as the user sees them"
         )
     lens, pose = guess.lens, guess.world_from_projector
@@ -360,7 +361,7 @@ def fit_keystone(
     before = np.linalg.norm(project_points(guess, world) - corners_px, axis=1)
     if _rms(residual_px) > MAX_RMS_PX:
         raise ProjectorError(
-            f"no projector pose near the scene's fits these corners (residual "
+            f"no projector near the pose in the scene fits these corners (residual "
             f"{_rms(residual_px):.1f} px rms); check their order and the pose in the scene"
         )
     distance_m = float(np.linalg.norm(fitted.world_from_projector.position_m))

@@ -194,8 +194,8 @@ class PairSelection:
         if len(self.good) < MIN_PAIRS:
             listed = "".join(f"\n  {self._names[i]}: {text}" for i, text in self.reasons.items())
             raise CalibrationError(
-                f"{len(self.good)} of {len(self.found)} pairs are usable, at least {MIN_PAIRS} are "
-                f"required; capture more images with the board in both views{listed}"
+                f"{len(self.good)} of {len(self.found)} pairs are usable, but at least {MIN_PAIRS} "
+                f"are required; capture more images with the board in both views{listed}"
             )
         return list(self.good.values())
 

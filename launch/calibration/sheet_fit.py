@@ -199,8 +199,8 @@ def fit_sheet_model(
     names = NAMES if with_mooney else NAMES[:3]
     if len(pushes) < 2 * len(names):
         raise SheetModelFitError(
-            f"{len(pushes)} measured pushes; fitting {', '.join(names)} requires "
-            f"{2 * len(names)}; measure more"
+            f"there are {len(pushes)} measured pushes, but fitting {', '.join(names)} requires "
+            f"{2 * len(names)}; measure more pushes"
         )
     start = np.array([np.log(nominal.young_modulus_pa * nominal.thickness_m), 0.0, 0.0, 0.1])
     low = np.array([start[0] - 7.0, -0.1, -2.0, 0.0])
@@ -362,9 +362,10 @@ def tabulate_pushes(
         (s, x, y) for s in axes[0] for x in axes[1] for y in axes[2] if (s, x, y) not in cells
     ]
     if not cells or missing:
-        what = f"no rows at stretch, x, y {missing[0]}" if missing else "no usable rows"
+        where = f" at stretch, x, y {missing[0]}" if missing else ""
         raise SheetModelFitError(
-            f"{what}; a table requires all combinations of stretch and position"
+            f"there are no usable rows{where}; a table requires all combinations of stretch and "
+            "position"
         )
     shallowest = max(min(depth for depth, _ in rows) for rows in cells.values())
     deepest = min(max(depth for depth, _ in rows) for rows in cells.values())
