@@ -202,7 +202,7 @@ class BagWriter:
         """Write all buffered data to the disk, and wait until the disk has stored it."""
         with self._writing():
             self._writer.flush()
-        # Outside the lock: a slow disk must not delay the next message.
+        # Flush outside the lock, so that a slow disk does not delay the next message.
         try:
             os.fsync(self._file.fileno())
         except OSError as error:
@@ -681,7 +681,7 @@ class BagReader:
             recorded, fingerprint = json.loads(schema.data), channel.metadata["fingerprint"]
             bytes.fromhex(fingerprint)
         except (ValueError, KeyError, RecursionError):
-            return None  # damaged
+            return None  # The recorded schema or fingerprint is damaged.
         return find_migration(topic.message, fingerprint, recorded)
 
     def _make_decoder(self, channel: mcap_records.Channel) -> ChannelDecoder:

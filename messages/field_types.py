@@ -23,7 +23,7 @@ def describe_field_type(field: FieldInfo) -> str:
 
 def describe_field(field: FieldInfo) -> dict[str, str]:
     """Return the type (as plain text), the default value and the description of a field."""
-    # Links keep their text only.
+    # Replace Markdown links by their text.
     kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
     return {
         "type": re.sub(r"[`\\]", "", kind),

@@ -266,7 +266,7 @@ def is_compatible(recorded: Schema, current: Schema) -> bool:
             recorded, current
         )
     except (KeyError, TypeError, AttributeError, RecursionError):
-        return False  # The schema is damaged: not a JSON Schema, or without end.
+        return False  # The schema is not a valid JSON Schema, or contains itself.
 
 
 def _unchanged(fields: Fields) -> Fields:

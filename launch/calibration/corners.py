@@ -215,7 +215,7 @@ class CornerFinder:
         ids, pixels = ids[sound], pixels[sound]
         columns, rows = np.unique(ids % self.board.columns), np.unique(ids // self.board.columns)
         if len(ids) < MIN_CORNERS or min(len(columns), len(rows)) < 2:
-            return None  # corners in one line do not determine a pose
+            return None  # Corners in one line do not determine a pose.
         return BoardView(ids, pixels)
 
 

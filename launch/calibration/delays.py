@@ -218,7 +218,7 @@ def _estimate_block(
         return None  # The marks were hidden for most of this time.
     if lag_s is None:
         return None
-    # Backlash displaces the marks against the direction of motion, which resembles a lag. Fit it.
+    # Backlash displaces the marks against the direction of motion, as a lag does, so fit both.
     motion = CubicSpline(known_s, centres)
     for _ in range(3):
         at_s = times_s - lag_s

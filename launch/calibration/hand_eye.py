@@ -417,7 +417,7 @@ def _linearize_pixels(
         rotation = eye_from_flange[:3, :3]
         by_point = np.empty((len(in_eye), 2, 3))
         for axis in range(3):
-            # A step of half a micrometre: the projection is so smooth that ten digits remain.
+            # With a step of half a micrometre, the derivatives are accurate to ten digits.
             nudge = np.zeros(3)
             nudge[axis] = 5e-7
             ahead, behind = (
