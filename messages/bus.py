@@ -271,7 +271,7 @@ class Publisher:
                 self._serve_late_subscribers()
 
     def _send(self, frames: list[Any]) -> None:
-        # If a subscriber's queue is full, ZeroMQ drops the message, and the subscriber counts a gap.
+        # If a subscriber's queue is full, ZeroMQ drops the message. The subscriber counts a gap.
         send = self._socket.send
         if len(frames) == 1:
             send(frames[0], NOBLOCK)

@@ -366,7 +366,7 @@ class RecordedInputs:
     """A reader that finds the recorded inputs of a node in the order of the execution log."""
 
     LOOK_AHEAD = 5000
-    """The number of further messages to search before a logged message counts as missing."""
+    """The maximum number of further messages that are searched for a logged message."""
 
     def __init__(self, bag: Path, node: Node) -> None:
         self._bag, self._node = bag, node

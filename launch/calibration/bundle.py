@@ -187,7 +187,7 @@ class _Reduced:
 def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
     """Return the Levenberg-Marquardt equations of the rig, with the board poses eliminated.
 
-    damping: factor minus 1 by which the diagonal is multiplied.
+    damping: number that is added to 1 to give the factor of the diagonal.
     """
     matrix, side = np.zeros((22, 22)), np.zeros(22)
     poses = []

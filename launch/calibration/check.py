@@ -201,7 +201,7 @@ def check_stereo(
     """Evaluate a stereo calibration with images of a board that were not used to calibrate.
 
     Return the values of `summarize`. The value `used_to_calibrate` lists the left images that were
-    used to calibrate in spite of this, so that their errors are underestimated.
+    also used to calibrate. The errors of these images are underestimated.
 
     Raises CalibrationError if the images have a wrong size or if no pair shows the board.
     """

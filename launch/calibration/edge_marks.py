@@ -133,7 +133,7 @@ class MarkDetector:
     ) -> Floats | None:
         """Return the position (3,), in m, of the mark near an expected position.
 
-        Return None if no mark, or no unambiguous mark, is found.
+        Return None if there is no mark, or if several marks are possible.
 
         near_world_m: expected position (3,).
         left_origin_px, right_origin_px: column and row of the first pixel of a cropped image.

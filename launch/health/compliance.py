@@ -106,9 +106,9 @@ def compute_compliance(
 class LoopRisk(StrEnum):
     """The risk that the control loop of sheet and hand is unstable or renders a wrong force.
 
-    OSCILLATION: a hand of low damping can oscillate, because the sheet moves away too late. DELAY:
-    because of the delay, the sheet cannot render the object's force with a stable offset. SHEET:
-    the sheet cannot render the object's force, even without delay.
+    OSCILLATION: a hand of low damping can oscillate, because the sheet moves away too late.
+    DELAY: because of the delay, the sheet cannot render the object's force with a stable offset.
+    SHEET: the sheet cannot render the object's force, even without delay.
     """
 
     OSCILLATION = "oscillation"

@@ -54,7 +54,11 @@ class Album:
     _at_bookmarks: list[Shot] = field(default_factory=list)
 
     def add(self, seconds: float, title: str, pictures: Sequence[tuple[str, Image]]) -> None:
-        """Consider a set of images, and encode and store the images if the set is selected."""
+        """Add a set of images. The images are encoded and stored only if the set is selected.
+
+        seconds: time since the start of the bag.
+        pictures: (title, image) of each image.
+        """
         passed = [label for at_s, label in self.bookmarks if at_s <= seconds]
         self.bookmarks = self.bookmarks[len(passed) :]
         if passed and len(self._at_bookmarks) >= MAX_BOOKMARK_SHOTS:
