@@ -1,1 +1,1 @@
-"""Define the messages between nodes, the table of topics, and the scene and calibration files."""
+"""Define the messages of the nodes, the table of topics, and the scene and calibration files."""

@@ -1,9 +1,12 @@
-"""Define the apparatus: the true parameters of the simulated hardware, relative to the scene.
+"""Define the apparatus: the true parameters of the simulated hardware.
 
-The nodes assume the scene. Only the simulator and the evaluation of experiments read the apparatus.
-If the true parameters equal the scene's, all offsets are zero and all ratios are one. An offset is
-the true value minus the scene's value. A rotation offset is a rotation vector about the world's
-axes, through the frame's own origin. For the clamped edge, it is about the flange's axes.
+The nodes assume the parameters in the scene file. The apparatus contains how the simulated hardware
+deviates from the scene. Only the simulator and the evaluation of experiments read the apparatus.
+
+An offset is the true value minus the value in the scene. A ratio is the true value divided by the
+value in the scene. Without deviations, all offsets are zero and all ratios are one. A rotation
+offset is a rotation vector about the world's axes, through the origin of the rotated frame. For the
+clamped edge of the sheet, the rotation vector is about the flange's axes.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ ZERO_6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class LensTruth(Part):
-    """The deviations of a lens from the scene's lens, or from the lens of the simulated device."""
+    """The deviations of a simulated lens from the lens in the scene."""
 
     focal_ratio: NearOne = Field(
         default=1.0, description="true focal length divided by the scene's focal length"
@@ -55,7 +58,7 @@ class LensTruth(Part):
 
 
 class CameraTruth(Part):
-    """The deviations of the simulated stereo camera from the scene's camera."""
+    """The deviations of the simulated stereo camera from the stereo camera in the scene."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
@@ -87,7 +90,7 @@ class CameraTruth(Part):
 
 
 class ArmTruth(Part):
-    """The deviations of one arm from the scene's arm, and the behaviour of its controller."""
+    """The deviations of a simulated arm from the scene, and the behaviour of its controller."""
 
     base_position_offset_m: SmallTriple = ZERO_3
     base_rotation_offset_rad: SmallTriple = ZERO_3
@@ -121,7 +124,10 @@ class ArmTruth(Part):
 
     @classmethod
     def of(cls, arm: ArmSpec) -> Self:
-        """Return the parameters of an arm that does not deviate from the scene's arm."""
+        """Return the parameters of a simulated arm that does not deviate from the scene.
+
+        arm: description of the arm in the scene.
+        """
         return cls(
             joint_offsets_rad=arm.joint_offsets_rad,
             flange_compliance_m_per_n=arm.flange_compliance_m_per_n,
@@ -134,7 +140,7 @@ class ArmsTruth(Part):
 
 
 class SheetTruth(Part):
-    """The deviations of the true sheet from the scene's sheet, and properties not in the scene."""
+    """The deviations of the simulated rubber sheet from the sheet in the scene."""
 
     modulus_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
     thickness_ratio: Annotated[float, Field(ge=0.1, le=10)] = 1.0
@@ -163,11 +169,12 @@ class SheetTruth(Part):
 
 
 class FingerTruth(Part):
-    """The deviations of the finger, its marker and its motion from the nodes' assumptions.
+    """The deviations of the simulated finger, its marker and its motion from the scene.
 
-    Finger frame: origin at the contact point of the fingertip's pad (the fingertip of all
-        messages), x along the finger towards the hand, z from the pad to the nail. The y axis is
-        the cross product of the z axis and the x axis.
+    The finger frame has its origin at the contact point of the fingertip's pad. All messages use
+    this point as the position of the fingertip. The x axis points along the finger towards the
+    hand, and the z axis from the pad to the nail. The y axis is the cross product of the z axis and
+    the x axis.
     """
 
     radius_offset_m: Small = 0.0
@@ -227,7 +234,10 @@ class GaugeTruth(Part):
 
 
 class EyesTruth(Part):
-    """The deviations of the true eye positions from the tracked positions, or from the scene's."""
+    """The deviations of the true eye positions from the positions that the renderer assumes.
+
+    The renderer assumes the positions from a head tracker or, without a tracker, from the scene.
+    """
 
     centre_offset_m: SmallTriple = ZERO_3
     interocular_offset_m: Small = 0.0
@@ -240,11 +250,14 @@ class EyesTruth(Part):
 
 
 NOMINAL_DISPLAY_LATENCY_S = 0.008
-"""The time from the swap of an image to the middle of its display, to which deviations refer."""
+"""The nominal display latency, in seconds, from which `latency_offset_s` is the deviation.
+
+The display latency is the time from the swap of an image to the middle of its display.
+"""
 
 
 class ProjectorTruth(Part):
-    """The deviations of the projector from the scene's projector."""
+    """The deviations of the simulated projector from the projector in the scene."""
 
     position_offset_m: SmallTriple = ZERO_3
     rotation_offset_rad: SmallTriple = ZERO_3
@@ -256,7 +269,7 @@ class ProjectorTruth(Part):
 
 
 class Devices(Part):
-    """The devices of the scene to which the deviations refer."""
+    """The parameters of all devices in a scene, without the virtual object."""
 
     camera: StereoCamera
     arms: Arms
@@ -267,7 +280,7 @@ class Devices(Part):
 
 
 class Apparatus(Message):
-    """The true parameters of the simulated hardware, as deviations from a scene."""
+    """The true parameters of the simulated hardware, given as deviations from a scene."""
 
     scene: str = Field(description="name of the scene to which the deviations refer")
     scene_id: str | None = Field(
@@ -289,9 +302,10 @@ class Apparatus(Message):
 
 
 def identify_scene(scene: Scene) -> str:
-    """Return a hash (16 hexadecimal digits) that identifies a scene's object and devices.
+    """Return a hash (16 hexadecimal digits) that identifies the object and the devices of a scene.
 
-    Values that a calibration replaces are not included, so a calibrated scene keeps its hash.
+    The hash does not depend on values that a calibration replaces. A calibrated scene therefore has
+    the same hash as the original scene.
     """
     values = {
         "name": scene.name,
@@ -307,7 +321,7 @@ def identify_scene(scene: Scene) -> str:
 
 
 def devices_of(scene: Scene) -> Devices:
-    """Return the devices of a scene."""
+    """Return the parameters of the camera, arms, sheet, projector, eyes and finger of a scene."""
     return Devices(
         camera=scene.camera,
         arms=scene.arms,
@@ -319,7 +333,7 @@ def devices_of(scene: Scene) -> Devices:
 
 
 def nominal_apparatus(scene: Scene) -> Apparatus:
-    """Return an apparatus without deviations from the scene."""
+    """Return the true parameters of simulated hardware that does not deviate from a scene."""
     return Apparatus(
         scene=scene.name,
         scene_id=identify_scene(scene),

@@ -1,4 +1,4 @@
-"""Define the calibration file of the arms' bases, which `flexsheet calibrate arms` writes."""
+"""Define the file with the calibrated poses of the arm bases (`flexsheet calibrate arms`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexsheet.messages.scene import NonNegative, Part, Pose
 
 
 class ArmPoseFit(Part):
-    """The residual of one pose of the arm."""
+    """The error of the calibration for one measured pose of an arm."""
 
     name: str
     used: bool
@@ -28,7 +28,7 @@ class ArmPoseFit(Part):
 
 
 class ArmBase(Part):
-    """The pose of one arm's base, with its uncertainty as standard deviations."""
+    """The calibrated pose of the base of an arm, with standard deviations."""
 
     world_from_base: Pose
     flange_from_board: Pose
@@ -61,7 +61,10 @@ class ArmBase(Part):
 
 
 class ArmsCalibration(Part):
-    """The calibration of the poses of both arms' bases. An arm that was not measured is null."""
+    """The calibrated poses of the bases of both arms.
+
+    An arm that was not calibrated is null.
+    """
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
@@ -74,11 +77,19 @@ class ArmsCalibration(Part):
 
 
 def save_arms_calibration(calibration: ArmsCalibration, path: Path, *, comment: str = "") -> None:
-    """Write an arms calibration to a file. Raises FileWriteError if it cannot be written."""
+    """Write the calibration of the arm bases to a YAML file.
+
+    comment: comment line at the start of the file; empty for none.
+
+    Raises FileWriteError if the file cannot be written.
+    """
     title = f"Bases of the arms of scene {calibration.scene}, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_arms_calibration(path: Path) -> ArmsCalibration:
-    """Read an arms calibration from a file. Raises CalibrationFileError if it is invalid."""
+    """Read the calibration of the arm bases from a YAML file.
+
+    Raises CalibrationFileError if the file is invalid.
+    """
     return read_calibration(ArmsCalibration, path, command="flexsheet calibrate arms")

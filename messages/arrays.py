@@ -1,8 +1,8 @@
-"""Define array fields whose element type and shape are part of the message type.
+"""Define types of message fields that contain numpy arrays of a fixed element type and shape.
 
 A field is declared as ``Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]``. The common types
-have names (``Vector3``, ``Transform``, ...). Validation does not copy a valid array, so a
-subscriber reads the memory that was received from the socket.
+have names, such as ``Vector3`` and ``Transform``. Validation does not copy a valid array, so a
+subscriber can read the memory that was received from the socket.
 """
 
 from __future__ import annotations
@@ -19,16 +19,19 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
 Dimension = int | str
-"""The length of an axis, or the name of a variable length. Equal names mean equal lengths."""
+"""The length of an array axis, or a name for a variable length.
+
+Axes with the same name must have the same length.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class ArraySpec:
-    """The element type and shape of an array field.
+    """The required element type and shape of an array field.
 
     dtype: numpy type string with little-endian byte order ("<f8", "|u1").
-    shape: length of each axis; a name means any length.
-    finite: whether NaN and infinity are rejected (only for floating-point types).
+    shape: length of each axis. A name stands for any length.
+    finite: whether NaN and infinity are rejected. This applies only to floating-point types.
     """
 
     dtype: str
@@ -36,11 +39,12 @@ class ArraySpec:
     finite: bool = True
 
     def validate(self, value: object) -> NDArray[Any]:
-        """Return `value` as an array. Raises ValueError if its type, shape or an element is
-        invalid.
+        """Convert `value` to an array, and check its element type, shape and elements.
 
-        An array must have the exact dtype, because a silent conversion from float64 to float32
+        A numpy array must have the exact dtype, because a silent conversion from float64 to float32
         would lose digits. Nested lists, as in a scene file, are converted.
+
+        Raises ValueError if a check fails.
         """
         expected = _dtype(self.dtype)
         if isinstance(value, np.ndarray):
@@ -129,10 +133,11 @@ def _convert_lists(value: list[Any] | tuple[Any, ...], expected: np.dtype[Any]) 
 
 
 def _all_finite(array: NDArray[Any], few: int = 64, isfinite: Any = math.isfinite) -> bool:
-    """Return whether no element is NaN or infinite.
+    """Return whether all elements of an array are finite.
 
-    For at most `few` elements, their sum is tested, which is faster than numpy's test. If the sum
-    is not finite, numpy's test decides, because a sum of finite elements may overflow.
+    For an array of at most `few` elements, the function tests the sum of the elements, which is
+    faster than numpy's test. Because a sum of finite elements may overflow, numpy's test decides if
+    the sum is not finite.
     """
     if array.size <= few and isfinite(sum(array.ravel().tolist())):
         return True
@@ -144,7 +149,7 @@ Vector3 = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
 Vector6 = Annotated[NDArray[np.float64], ArraySpec("<f8", (6,))]
 Matrix6 = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
 Transform = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
-"""The homogeneous matrix of a rigid transform ``a_from_b``, with positions in metres."""
+"""A matrix (4, 4) of a rigid transform ``a_from_b`` in homogeneous coordinates, in metres."""
 Points3 = Annotated[NDArray[np.float32], ArraySpec("<f4", ("points", 3))]
 Vertices = Annotated[NDArray[np.float64], ArraySpec("<f8", ("vertices", 3))]
 Triangles = Annotated[NDArray[np.int32], ArraySpec("<i4", ("triangles", 3))]

@@ -1,19 +1,19 @@
-"""Read and write bags: MCAP files that contain serialized messages, their schemas and their times.
+"""Read and write bags: MCAP files that contain encoded messages, their schemas and their times.
 
 This module defines what MCAP leaves to the application:
 
 - The profile is "flexsheet". Each message type has a schema (JSON Schema). Each topic has a channel
-  with the encoding "flexsheet/2" and the type's fingerprint in the channel's metadata.
+  with the encoding "flexsheet/2". The channel's metadata contain the fingerprint of the type.
 - `log_time` is when the recorder received the message, and `publish_time` is the source timestamp
   in the message's header. Both are in ns of a monotonic clock, not since 1970.
-- The data of a message are its frames (byte strings of a ZeroMQ multipart message): a uint32 with
-  the number of frames, four zero bytes, and a uint64 with the length of each frame. The frames
-  follow. Each frame is padded with zeros to a multiple of eight bytes, so that arrays are aligned
-  and can be read without a copy. All numbers are little-endian.
+- The data of a message are its frames (byte strings of a ZeroMQ multipart message). The data begin
+  with the number of frames (uint32), four zero bytes, and the length of each frame (uint64). Then
+  the frames follow. Each frame is padded with zeros to a multiple of eight bytes, so that arrays
+  are aligned and can be read without a copy. All numbers are little-endian.
 
 A writer flushes its data to the disk every second. A reader scans the records from the start, so it
-does not need the index at the end. A file that was truncated by a crash can therefore be read up to
-the truncation; `BagReader.complete` is then false.
+does not need the index at the end. Therefore, a file that was truncated by a crash can be read up
+to the truncation. The attribute `BagReader.complete` is then false.
 """
 
 from __future__ import annotations
@@ -51,7 +51,10 @@ CHUNK_BYTES = 1 << 20
 FLUSH_PERIOD_S = 1.0
 MAX_SUMMARY_RECORD_BYTES = 64 << 20
 MAX_CHUNK_BYTES = 256 << 20
-"""The maximum uncompressed size of a chunk. A writer starts a new chunk after 1 MiB."""
+"""The maximum uncompressed size of a chunk, in bytes, that a reader accepts.
+
+A writer starts a new chunk after 1 MiB.
+"""
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQ")
@@ -68,9 +71,10 @@ class BagError(FlexsheetError):
 
 
 def join_frames(frames: Sequence[Any]) -> bytes:
-    """Encode the frames of a message as the data of an MCAP record.
+    """Encode the frames of a message as the data of one MCAP record.
 
-    The module's docstring specifies the layout.
+    The layout is the number of frames, their lengths, and the frames, as the module's docstring
+    specifies.
     """
     lengths = [len(frame) for frame in frames]
     parts: list[Any] = [struct.pack(f"<II{len(lengths)}Q", len(lengths), 0, *lengths)]
@@ -80,7 +84,10 @@ def join_frames(frames: Sequence[Any]) -> bytes:
 
 
 def split_frames(data: bytes) -> list[memoryview]:
-    """Return views of the frames that `join_frames` encoded. Raises WireError for invalid data."""
+    """Return views of the frames of a message that `join_frames` has encoded.
+
+    Raises WireError for invalid data.
+    """
     view = memoryview(data)
     count = struct.unpack_from("<I", view)[0] if len(view) >= 8 else 0
     offset = 8 + 8 * count
@@ -98,14 +105,15 @@ def split_frames(data: bytes) -> list[memoryview]:
 
 
 class BagWriter:
-    """A writer of one bag, usable as a context manager. Its methods must be called from one thread.
+    """A writer of one bag file, usable as a context manager.
+
+    All methods must be called from one thread. A separate thread flushes the file to the disk every
+    second (fsync). If the process is killed, at most the last second of messages is lost. After a
+    power failure, slightly more may be lost.
 
     metadata: named tables of text that identify the recording (clock, hosts, git state).
     compress: whether to compress chunks of about 1 MiB by zstd. Without compression, images are
         written faster but need more disk space.
-
-    A separate thread flushes the file to the disk every second (fsync). If the process is killed,
-    at most the last second is lost; after a power failure slightly more.
 
     Raises BagError if the file exists or cannot be created.
     """
@@ -153,7 +161,7 @@ class BagWriter:
         self._flusher.start()
 
     def write(self, topic: Topic, message: Message, header: Header, log_time_ns: int) -> None:
-        """Serialize a message and write it to the bag.
+        """Encode a message and write it to the bag.
 
         log_time_ns: time when the message was received, ns of the recorder's clock.
         """
@@ -162,9 +170,9 @@ class BagWriter:
     def write_frames(
         self, topic: Topic, frames: Sequence[Any], header: Header, log_time_ns: int
     ) -> None:
-        """Write a message that is already serialized into frames.
+        """Write a message that has already been encoded as frames.
 
-        For `log_time_ns`, see `write`.
+        log_time_ns: time when the message was received, ns of the recorder's clock.
         """
         data = join_frames(frames)
         with self._writing():
@@ -178,7 +186,10 @@ class BagWriter:
             self.messages += 1
 
     def add_attachment(self, name: str, data: bytes, media_type: str) -> None:
-        """Add a file to the bag, such as the launch file, the scene or a calibration."""
+        """Add the content of a file to the bag, such as the launch file or the scene.
+
+        media_type: MIME type of the file.
+        """
         with self._writing():
             self._writer.add_attachment(0, 0, name, media_type, data)
 
@@ -188,10 +199,10 @@ class BagWriter:
             self._writer.add_metadata(name, dict(values))
 
     def flush(self) -> None:
-        """Write all buffered data, and wait until the disk has stored them."""
+        """Write all buffered data to the disk, and wait until the disk has stored it."""
         with self._writing():
             self._writer.flush()
-        # Outside the lock: a slow disk must not delay the next message.
+        # Flush outside the lock, so that a slow disk does not delay the next message.
         try:
             os.fsync(self._file.fileno())
         except OSError as error:
@@ -199,7 +210,10 @@ class BagWriter:
             raise BagError(str(make_write_error(self.path, error))) from error
 
     def close(self) -> None:
-        """Write the index and close the file. Raises BagError if any data could not be written."""
+        """Write the index and close the file.
+
+        Raises BagError if any data could not be written.
+        """
         if self._file.closed:
             return
         self._closing.set()
@@ -237,7 +251,10 @@ class BagWriter:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        """Hold the lock of the open file, and convert disk errors to BagError."""
+        """Lock the file while the context is active, and convert disk errors to BagError.
+
+        Raises BagError if the file is closed.
+        """
         with self._lock:
             if self._file.closed:
                 raise BagError(f"{self.path}: cannot write, because the bag is closed")
@@ -269,10 +286,10 @@ class BagWriter:
 
 @dataclass(slots=True)
 class Chunk:
-    """The position and time range of a chunk in the file.
+    """The position of a chunk in the bag file, and the times of its messages.
 
-    offset, length: position and size (bytes) of the chunk. times_ns: log times of the messages by
-    channel number.
+    offset, length: position and size of the chunk, in bytes.
+    times_ns: times when the messages were recorded, as a list for each channel number.
     """
 
     offset: int
@@ -284,7 +301,10 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class ChannelDecoder:
-    """The topic of a channel, its recorded message type, and the migration to the current type."""
+    """The data that is needed to decode the messages of one channel.
+
+    migrate: function that converts the decoded fields to the current message type.
+    """
 
     topic: Topic
     recorded_type: str
@@ -294,9 +314,9 @@ class ChannelDecoder:
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """A summary of one topic in a bag.
+    """A summary of the messages of one topic in a bag.
 
-    readable: whether the recorded message type is the current type or can be migrated to it.
+    readable: whether this version of flexsheet can decode the messages.
     """
 
     name: str
@@ -308,7 +328,7 @@ class TopicInfo:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentInfo:
-    """A description of a file that is attached to a bag.
+    """The name, type and position of a file that is attached to a bag.
 
     offset, length: position and size (bytes) of the attachment's record in the bag.
     """
@@ -322,7 +342,7 @@ class AttachmentInfo:
 
 @dataclass(frozen=True, slots=True)
 class BagInfo:
-    """A summary of a bag. Times are on the recorder's clock.
+    """A summary of a bag. All times are on the recorder's clock.
 
     problem: reason why the bag is incomplete; empty for a complete bag.
     """
@@ -342,13 +362,13 @@ class BagInfo:
 class BagReader:
     """A reader of a complete or truncated bag.
 
-    Iterating over the reader yields (topic name, message, header, log time in ns) in the order of
-    log time.
+    Iteration yields (topic name, message, header, log time in ns), in the order of log time. The
+    log time is the time when the recorder received the message.
 
     topics: names of the topics to read; None: all topics.
     start_ns, end_ns: range of log time to read. A message at `end_ns` is not included.
 
-    Raises BagError if the file cannot be read, is not a bag, or if a topic name is unknown.
+    Raises BagError if the file cannot be read or is not a bag, or if a topic name is unknown.
     """
 
     def __init__(
@@ -382,9 +402,10 @@ class BagReader:
         self._check_topics()
 
     def __iter__(self) -> Iterator[tuple[str, Message, Header, int]]:
-        """Yield decoded messages. Messages of older types are migrated to the current types.
+        """Yield decoded messages in the order of recording.
 
-        Raises BagError for invalid messages, and for a recorded type that has no migration.
+        Messages of older types are converted to the current types. Raises BagError for an invalid
+        message, and for a recorded type that cannot be converted.
         """
         decoders = {
             channel.topic: self._make_decoder(channel) for channel in self._selected().values()
@@ -401,7 +422,10 @@ class BagReader:
     def open_record(
         self, channel: mcap_records.Channel, record: mcap_records.Message
     ) -> tuple[Message, Header]:
-        """Decode a record from `records` or `read_chunk`. Raises BagError for an invalid record."""
+        """Decode a record that `records` or `read_chunk` returned.
+
+        Raises BagError if the record is invalid.
+        """
         try:
             return _decode(split_frames(record.data), self._make_decoder(channel))
         except WireError as error:
@@ -410,7 +434,7 @@ class BagReader:
             ) from error
 
     def frames(self) -> Iterator[tuple[str, list[memoryview], int]]:
-        """Yield (topic name, frames, log time in ns) of each message, as recorded."""
+        """Yield (topic name, frames, log time in ns) of each message without decoding it."""
         for channel, record in self.records():
             try:
                 frames = split_frames(record.data)
@@ -419,7 +443,7 @@ class BagReader:
             yield channel.topic, frames, record.log_time
 
     def records(self) -> Iterator[tuple[mcap_records.Channel, mcap_records.Message]]:
-        """Yield the MCAP channel and message of each record in the order of log time."""
+        """Yield the MCAP channel and the MCAP message of each record, in the order of log time."""
         selected = self._selected()
         start = self._start_ns if self._start_ns is not None else -1
         end = self._end_ns if self._end_ns is not None else 1 << 64
@@ -448,13 +472,14 @@ class BagReader:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Return the message types of the recorded topics, by topic name."""
+        """Return a mapping from the name of each recorded topic to the name of its message type."""
         return {channel.topic: _find_type_name(channel) for channel in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:
-        """Return the content of the newest attachment of this name.
+        """Return the content of the attachment with the given name.
 
-        Raises BagError if there is none.
+        If several attachments have this name, return the newest one. Raises BagError if there is
+        none.
         """
         for one in reversed(self.attachments):
             if one.name == name:
@@ -467,7 +492,10 @@ class BagReader:
         )
 
     def info(self) -> BagInfo:
-        """Return a summary of the whole bag, including topics and times that are not selected."""
+        """Return a summary of the whole bag.
+
+        The summary includes the topics and times that this reader does not read.
+        """
         times: dict[int, list[int]] = {}
         for chunk in self.chunks:
             for channel_id, stamps in chunk.times_ns.items():
@@ -501,7 +529,7 @@ class BagReader:
         )
 
     def _scan(self, file: IO[bytes]) -> None:
-        """Index the records of the file, up to the first truncated or invalid record."""
+        """Build an index of the file's records, up to the first truncated or invalid record."""
         size = os.fstat(file.fileno()).st_size
         magic = file.read(len(MCAP0_MAGIC))
         if magic != MCAP0_MAGIC:
@@ -524,7 +552,7 @@ class BagReader:
                 break
             if first and opcode != Opcode.HEADER:
                 raise BagError(
-                    f"{self.path}: this is no bag, because its first record is not an MCAP header"
+                    f"{self.path}: this is not a bag; its first record is not an MCAP header"
                 )
             try:
                 self._index_record(file, opcode, offset, length)
@@ -587,15 +615,15 @@ class BagReader:
             self.chunks[-1].times_ns[index.channel_id] = [time for time, _ in index.records]
 
     def _add_channel(self, channel: mcap_records.Channel) -> None:
-        """Store a channel under the current name of its topic, which may have been renamed."""
+        """Store a recorded channel. If its topic has been renamed since, use the current name."""
         channel.topic = RENAMED_TOPICS.get(channel.topic, channel.topic)
         self.channels[channel.id] = channel
 
     def _index_remaining_chunks(self, file: IO[bytes]) -> None:
-        """Index the chunks of a truncated bag whose channels or message times are unknown.
+        """Index the chunks of a truncated bag that the bag's own index does not cover.
 
-        These include the last chunk, because the message index after it may be truncated. A damaged
-        chunk raises an error only when its messages are read.
+        The last chunk is always indexed, because the index record after it may be truncated. A
+        damaged chunk is added to `problem`, and raises an error only when its messages are read.
         """
         for chunk in self.chunks:
             last = chunk is self.chunks[-1]
@@ -653,11 +681,14 @@ class BagReader:
             recorded, fingerprint = json.loads(schema.data), channel.metadata["fingerprint"]
             bytes.fromhex(fingerprint)
         except (ValueError, KeyError, RecursionError):
-            return None  # damaged
+            return None  # The recorded schema or fingerprint is damaged.
         return find_migration(topic.message, fingerprint, recorded)
 
     def _make_decoder(self, channel: mcap_records.Channel) -> ChannelDecoder:
-        """Make the decoder of a channel. Raises BagError if its message type has no migration."""
+        """Make the decoder of a channel.
+
+        Raises BagError if the recorded message type cannot be converted to the current type.
+        """
         if channel.topic not in TOPICS:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" does not exist any more in this version; '
@@ -681,13 +712,16 @@ class BagReader:
 
 
 def _find_type_name(channel: mcap_records.Channel) -> str:
-    """Return the current name of a channel's message type, which may have been renamed."""
+    """Return the name of a channel's message type, or the current name if the type was renamed."""
     recorded = channel.metadata.get("type", "")
     return RENAMED_TYPES.get(recorded, recorded)
 
 
 def _decode(frames: list[memoryview], decoder: ChannelDecoder) -> tuple[Message, Header]:
-    """Decode a message and migrate it to the current type. Raises WireError if it is invalid."""
+    """Decode a message and convert it to the current message type.
+
+    Raises WireError if the message is invalid.
+    """
     envelope = read_envelope(
         frames, decoder.topic, fingerprint=decoder.fingerprint, type_name=decoder.recorded_type
     )
@@ -702,10 +736,11 @@ def info(path: Path | str) -> BagInfo:
 
 @dataclass(frozen=True, slots=True)
 class RecoverReport:
-    """The result of `recover`.
+    """The result of the function `recover`.
 
     messages, attachments: numbers of recovered messages and attachments.
-    was_complete, problem: whether the original bag was complete, and if not, the reason.
+    was_complete: whether the original bag was complete.
+    problem: reason why the original bag was incomplete; empty if it was complete.
     orphan_messages: number of messages that were lost because their channel is unknown.
     """
 
@@ -725,7 +760,7 @@ def recover(
 ) -> RecoverReport:
     """Write the readable part of a truncated or damaged bag to a new bag.
 
-    progress: function that is called with the number of processed chunks and the total number.
+    progress: function that is called with the numbers of processed and of all chunks.
 
     Raises BagError if nothing is readable, or if the new file exists or cannot be written.
     """
@@ -808,10 +843,10 @@ def _read_at(file: IO[bytes], offset: int, length: int) -> bytes:
 
 
 def _decompress(chunk: mcap_records.Chunk) -> bytes:
-    """Decompress a chunk. At most the size that its header states is decompressed.
+    """Decompress a chunk up to the size that its header states.
 
-    This limits the memory, because a few compressed bytes can expand to a huge amount. Raises
-    ValueError if the stated size is too large or wrong.
+    The limit protects the memory, because a few compressed bytes can expand to a huge amount.
+    Raises ValueError if the stated size is too large or wrong.
     """
     stated = chunk.uncompressed_size
     if stated > MAX_CHUNK_BYTES:

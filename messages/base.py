@@ -13,22 +13,22 @@ from pydantic import BaseModel, ConfigDict
 
 @dataclass(frozen=True, slots=True)
 class StampMark:
-    """The annotation of a field that is a time on the clock of the header's timestamps."""
+    """A marker for message fields that contain a timestamp on the clock of the message's header."""
 
 
 Stamp = Annotated[int, StampMark()]
-"""A timestamp in ns on the clock of the message's header; 0: none.
+"""A timestamp, in ns, on the clock of the message's header. The value 0 means no timestamp.
 
-A subscriber on another host receives these fields converted to its own clock. A field that is a
-duration has the type `int`.
+When a message arrives from another host, these fields are converted to the clock of the receiving
+host. A field that contains a duration has the type `int` instead.
 """
 
 
 class Message(BaseModel):
-    """The base class of messages. Messages are typed and immutable.
+    """The base class of messages, which are typed and immutable.
 
-    Numbers are in SI units and radians. Names contain units and frames (`age_s`,
-    `world_from_sheet`). `flexsheet.messages.arrays` defines array types. A type's validator is
+    Numbers are in SI units and radians. Field names contain units and frames, such as `age_s` and
+    `world_from_sheet`. `flexsheet.messages.arrays` defines array types. The validator of a type is
     built on its first use, because a node uses only a few types.
     """
 
@@ -49,15 +49,16 @@ class MessagePart(BaseModel):
 class Header:
     """The header of one message.
 
-    sequence: sequence number of the message among those of its writer, from 1. A gap means a loss.
+    sequence: number of the message among the messages of its writer, starting at 1. A gap in the
+        numbers means that messages were lost.
     source_ns: time of the measurement on the clock `clock_id`. For all values that are derived from
         an image, it is the midpoint of the exposure.
     publish_ns: time when the message was passed to the socket, on the same clock.
     clock_id: clock of both timestamps. Timestamps of different clocks must not be subtracted.
     writer: name of the node that published the message.
-    epoch: time when the writer started, ns on the same clock. It distinguishes a restart from a
-        loss, and is used to reject older messages.
-    plan: hash of the writer's plan; empty in bags of the first wire protocol.
+    epoch: time when the writer started, in ns, on the same clock. It distinguishes a restart of the
+        writer from a loss of messages, and is used to reject messages from before a restart.
+    plan: hash of the resolved launch file of the writer; empty in bags of the first wire protocol.
     """
 
     sequence: int
@@ -71,7 +72,7 @@ class Header:
 
 @cache
 def find_stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
-    """Return the names of a message type's fields that are timestamps (of the type `Stamp`)."""
+    """Return the names of a message type's fields that have the type `Stamp` (timestamp)."""
     return tuple(
         name
         for name, field in message_type.model_fields.items()
@@ -81,16 +82,20 @@ def find_stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
 
 @cache
 def compute_fingerprint(message_type: type[Message]) -> bytes:
-    """Return the first 8 bytes of the SHA-256 of a type's JSON Schema without descriptions.
+    """Return a hash of a message type: the first 8 bytes of the SHA-256 of its JSON Schema.
 
-    The fingerprint depends on the names, types, ranges, dtypes and shapes of the fields.
+    The hash depends on the names, types, ranges, dtypes and shapes of the fields, but not on their
+    descriptions.
     """
     schema = json.dumps(_remove_descriptions(message_type.model_json_schema()), sort_keys=True)
     return hashlib.sha256(schema.encode()).digest()[:8]
 
 
 def _remove_descriptions(schema: object) -> object:
-    """Return a JSON Schema without titles and descriptions. Fields with these names remain."""
+    """Return a copy of a JSON Schema without titles and descriptions.
+
+    Message fields that are named "title" or "description" remain.
+    """
     if isinstance(schema, dict):
         return {
             key: _remove_descriptions(value)

@@ -1,17 +1,17 @@
 """Publish and subscribe by ZeroMQ sockets in the asyncio event loop.
 
-A publisher binds and subscribers connect, in any order; either side may be restarted. A subscriber
-reads plain (not asyncio) sockets in a callback of the event loop and calls the handler there, which
-has the smallest latency of the designs in `benchmarks/messaging.py`. No `recv` is ever pending, so
-no cancelled `recv` can lose a message.
+A publisher binds its socket and subscribers connect to it, in any order. Either side may be
+restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and calls
+the handler there. This design has the smallest latency of those in `benchmarks/messaging.py`. No
+`recv` is ever pending, so no cancelled `recv` can lose a message.
 
-A subscriber has one socket per host, which identifies the host of each message.  From each host it
-accepts only messages of the writers that run there.  Sockets that other computers can reach are
-bound and connected with keys only (`flexsheet.messages.security`).
+A subscriber has one socket per host, which identifies the host of each message. From each host, the
+subscriber accepts only messages of the nodes that run there. Sockets that other computers can reach
+are bound and connected with keys only (`flexsheet.messages.security`).
 
-ZeroMQ's file descriptor is edge-triggered: it signals that a state changed, not that a message is
-ready, and any call on the socket can clear the signal.  So each callback reads until the socket is
-empty or schedules itself again, and no other code uses a socket that is being read.
+The file descriptor of a ZeroMQ socket is edge-triggered: it signals that a state changed, not that
+a message is ready. Any call on the socket can clear the signal. Each callback therefore reads until
+the socket is empty, or schedules itself again. No other code uses a socket that is being read.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
 Handler = Callable[[Any, Header], None]
 Problem = Callable[[str], None]
 MessageFilter = Callable[[Any, Header], str | None]
-"""A function that returns why a valid message is rejected, or None to accept the message."""
+"""A function that returns the reason to reject a message, or None to accept the message."""
 
 QUEUE_S = 0.5
 MAX_QUEUE_LENGTH = 1000
@@ -58,18 +58,21 @@ BIND_TIMEOUT_S = 1.0
 IPC_CLOSING_S = 0.02
 MAX_EXCESS_BYTES = 256 << 20
 MAX_SUBSCRIPTION_BYTES = 512
-"""The maximum size of a frame that a publisher receives.
+"""The maximum size (bytes) of a frame that a publisher receives.
 
-The largest such frame is the last one of a CURVE handshake.
+The largest such frame is the last frame of a CURVE handshake.
 """
 
 HANDSHAKE_MS = 5000
 REOPEN_DELAY_S = 0.5
 RECONNECT_MS = 100
-"""Maximum period of reconnection attempts; it delays all readers after the restart of a node."""
+"""The maximum period (ms) of attempts to reconnect to a publisher.
+
+After a node restarts, its subscribers receive no messages for up to this time.
+"""
 
 WATCHED_RECONNECT_MS = 50
-"""The maximum reconnection period for subscribers that report the end of a connection."""
+"""The maximum reconnection period (ms) of subscribers that report the end of a connection."""
 
 MAX_PAST_CLOCKS = 16
 
@@ -81,12 +84,14 @@ _log = logging.getLogger("flexsheet.bus")
 
 
 HEARTBEATS = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TIMEOUT: 5000, zmq.HEARTBEAT_TTL: 5000}
-"""The socket options of publishers on tcp. With ipc, the end of a process is detected without
-heartbeats.
+"""The socket options for heartbeats (ms) from a publisher over tcp.
 
-Subscribers send no heartbeats: libzmq 4.3.5 aborts the process if a heartbeat is due after the
-    publisher has disconnected while its messages still fill the queue. Publishers send none over
-    ipc: a subscriber that is busy for seconds does not answer and would be disconnected.
+Over ipc, publishers send no heartbeats, because the end of a process is detected without
+heartbeats. A subscriber over ipc that is busy for seconds would not answer and would be
+disconnected.
+
+Subscribers send no heartbeats, because of a fault in libzmq 4.3.5. The process is aborted if a
+heartbeat is due after the publisher has disconnected while its messages still fill the queue.
 """
 
 TCP_KEEPALIVE_OPTIONS = {
@@ -97,11 +102,10 @@ TCP_KEEPALIVE_OPTIONS = {
     zmq.TCP_MAXRT: 5000,
     zmq.CONNECT_TIMEOUT: 2000,
 }
-"""The options with which a subscriber detects within 5 s that the publisher's host does not
-respond.
+"""The socket options with which a subscriber detects within 5 s that a host is unreachable.
 
-A restart of that host is detected at once. The publisher's heartbeats are not enough: libzmq 4.3.5
-stops waiting for the next heartbeat as soon as a message arrives.
+The subscriber detects a restart of the host at once. The heartbeats of the publisher are not
+enough, because libzmq 4.3.5 stops waiting for the next heartbeat as soon as a message arrives.
 """
 
 HANDSHAKE_FAILED: dict[int, str] = {
@@ -121,7 +125,7 @@ class BusError(FlexsheetError, RuntimeError):
 
 
 class Counts(Protocol):
-    """The interface of the counters of messages that a subscriber does not pass to its handler."""
+    """The interface of an object that counts the messages not passed to a subscriber's handler."""
 
     dropped: int
     gaps: int
@@ -129,11 +133,11 @@ class Counts(Protocol):
 
 
 def compute_queue_length(topic: Topic) -> int:
-    """Return the maximum number of messages in the queue at each end of a connection.
+    """Return the maximum number of queued messages at each end of a connection.
 
-    A full queue drops the newest message. On `latest` topics, the queue therefore holds only the
-    messages of half a second at the topic's maximum rate. On other topics, the queue is limited by
-    its memory use.
+    A full queue drops the newest message. On topics with the delivery `latest`, the queue therefore
+    holds only the messages of half a second at the topic's maximum rate. On other topics, memory
+    limits the length of the queue.
     """
     if topic.delivery is Delivery.LATEST and topic.rate_hz is not None:
         length = round(QUEUE_S * topic.rate_hz[1])
@@ -147,7 +151,8 @@ class Source:
     """An endpoint to which a subscriber connects.
 
     writer: name of the node that publishes at the endpoint; None: any node.
-    host: name of the host whose key the endpoint must prove if keys are used.
+    host: name of the host at the endpoint. If keys are used, the endpoint must have the key of this
+        host.
     """
 
     endpoint: str
@@ -158,14 +163,15 @@ class Source:
 class Publisher:
     """A publisher of one topic.
 
-    It needs a running event loop if the topic is latched, or if `keys` or `local` is given.
+    A publisher requires a running event loop if the topic is latched, or if `keys` or `local` is
+    given.
 
     bind: endpoints, "ipc:///path" or "tcp://address:port". "tcp://127.0.0.1:*" selects a free port.
     keys: keys of the hosts that may connect over tcp; None: tcp is bound to the loopback interface.
     on_refused: function that is called with a text for each refused or closed connection. Without a
-        running loop, it is called on a separate thread.
-    local: bus of this process, whose readers get messages without serialization. The socket is then
-        used only while another process has subscribed.
+        running loop, a separate thread calls the function.
+    local: bus that passes messages to subscribers in this process without encoding. The socket is
+        then used only while another process has subscribed.
     """
 
     def __init__(
@@ -226,7 +232,7 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Reopen the socket if the key of any host in the key ring has changed."""
+        """Reopen the socket with the new keys if the key of any host has changed."""
         if self._keys is not None and not self._socket.closed and (change.own or change.hosts):
             self._close_socket(unbind=True)
             self._open(self.endpoints)
@@ -234,7 +240,8 @@ class Publisher:
     def interrupt(self) -> None:
         """Disconnect all subscribers, as if this process had ended.
 
-        They reconnect automatically. Messages that were sent before are still delivered.
+        The subscribers reconnect automatically. Messages that were sent earlier are still
+        delivered.
         """
         if self._channel is not None:
             self._channel.interrupt()
@@ -245,8 +252,8 @@ class Publisher:
     def send(self, message: Message, header: Header) -> None:
         """Send a message without blocking.
 
-        Large arrays are not copied, so the caller must not change them afterwards. Raises WireError
-        if the message is larger than the topic allows.
+        Large arrays are not copied, so the caller must not change them after this call. Raises
+        WireError if the message is larger than the topic permits.
         """
         if self._channel is not None:
             self._channel.send(self.topic, message, header)
@@ -264,7 +271,7 @@ class Publisher:
                 self._serve_late_subscribers()
 
     def _send(self, frames: list[Any]) -> None:
-        # If a subscriber's queue is full, ZeroMQ drops the message for it; it counts a gap.
+        # If a subscriber's queue is full, ZeroMQ drops the message. The subscriber counts a gap.
         send = self._socket.send
         if len(frames) == 1:
             send(frames[0], NOBLOCK)
@@ -274,10 +281,10 @@ class Publisher:
             send(frames[-1], NOBLOCK, copy=False)
 
     def _serve_late_subscribers(self) -> None:
-        """Read a batch of subscriptions, and resend the last message if there is a new
-        subscription.
+        """Read a batch of subscriptions, and send the stored message again to new subscribers.
 
-        An XPUB socket reports only the first subscription and the end of the last one.
+        For a topic that is not latched, the socket reports only the first subscription and the end
+        of the last one.
         """
         if self._socket.closed or self._loop is None:
             return
@@ -297,9 +304,9 @@ class Publisher:
             self._loop.call_soon(self._serve_late_subscribers)
 
     def _on_closed_by_guard(self, address: str, reason: str) -> None:
-        """Report a connection that the connection guard closed.
+        """Report that the connection guard closed a connection.
 
-        This function runs on the guard's thread.
+        The thread of the connection guard calls this method.
         """
         text = f'topic "{self.topic.name}": a connection from {address} was closed: {reason}'
         if self._loop is None:
@@ -316,9 +323,9 @@ class Publisher:
             self._channel.forget()
 
     def close(self) -> None:
-        """Release the endpoints.
+        """Release the endpoints of the publisher.
 
-        Messages that were sent before are delivered for up to half a second.
+        Messages that were sent earlier are delivered for up to half a second.
         """
         if self._socket.closed:
             return
@@ -348,22 +355,23 @@ class Publisher:
 class Subscriber:
     """A subscriber of one topic, which calls `on_message(message, header)` in the event loop.
 
-    connect: endpoints of all writers. A writer may start later than the subscriber, or restart.
+    connect: endpoints of all nodes that publish the topic. A node may start after the subscriber,
+        and may restart.
     counts: counters of superseded, lost and rejected messages.
-    on_problem: function that is called with a text for the first rejection of each cause, for an
-        exception in `on_message`, and each time the number of lost messages has doubled. Losses on
-        `latest` topics are not reported.
+    on_problem: function that is called with a text about a problem. It is called for the first
+        rejection of each cause, and for an exception in `on_message`. It is also called each time
+        the number of lost messages has doubled, except on topics with the delivery `latest`.
     on_handshake_failed: function that is called with a text for each kind of failed handshake;
         None: `on_problem` is called.
-    raw: whether `on_message(frames, header)` is called with the frames of every message. The fields
-        are then not validated.
+    raw: whether `on_message(frames, header)` is called with the undecoded frames of every message.
+        The fields are then not validated.
     keys: keys of this host and of the other hosts; None: tcp connects to the loopback interface
         only.
-    plan: hash of the plan whose messages are accepted; None: messages of any plan.
+    plan: hash of the resolved launch file whose messages are accepted; None: all messages are
+        accepted.
     message_filter: function that is called with each valid message before `on_message`.
     on_disconnected: function that is called when a connection has ended, after its last message.
-    local: bus of this process, from which messages of writers in this process are read. It is
-        ignored if `raw` is true.
+    local: bus that delivers messages from nodes in this process. It is ignored if `raw` is true.
     """
 
     def __init__(
@@ -418,7 +426,10 @@ class Subscriber:
             )
 
     def start(self) -> None:
-        """Connect, and start to deliver messages. This requires a running event loop."""
+        """Connect to the endpoints, and start to deliver messages.
+
+        This requires a running event loop.
+        """
         if self._started:
             raise BusError(f'topic "{self.topic.name}": start() was called twice; call it once')
         try:
@@ -430,12 +441,15 @@ class Subscriber:
         self._started = True
 
     def close(self) -> None:
-        """Disconnect. The message handler may call this method."""
+        """Disconnect from all endpoints. The message handler may call this method."""
         for connection in self._connections:
             connection.close()
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Reconnect to hosts with changed keys, or to all hosts if this host's key has changed."""
+        """Reconnect to the hosts whose keys have changed.
+
+        If the key of this host has changed, reconnect to all hosts.
+        """
         for connection in self._connections:
             if (
                 isinstance(connection, _HostConnection)
@@ -447,9 +461,9 @@ class Subscriber:
                 connection.open()
 
     def accept(self, frames: list[Any], writers: frozenset[str] | None) -> Envelope | None:
-        """Read a message's envelope with the checks of `accept_header`.
+        """Decode the header of a message and check it as `accept_header` does.
 
-        Return None if the message is rejected, or has arrived before.
+        Return None if the message is rejected, or if it has arrived before.
         """
         try:
             envelope = read_envelope(frames, self.topic)
@@ -459,10 +473,11 @@ class Subscriber:
         return envelope if self.accept_header(envelope.header, writers) else None
 
     def accept_header(self, header: Header, writers: frozenset[str] | None) -> bool:
-        """Check a header, and count lost messages.
+        """Check the header of a message, and count the messages that were lost before it.
 
-        Return False if the message is rejected, or has arrived before.
-        writers: names of the writers that are expected at the endpoint; None: any writer.
+        Return False if the message is rejected, or if it has arrived before.
+
+        writers: names of the nodes that may publish at the endpoint; None: any node.
         """
         try:
             if writers is not None and header.writer not in writers:
@@ -498,7 +513,7 @@ class Subscriber:
         return True
 
     def deliver(self, envelope: Envelope) -> None:
-        """Validate a message, and call the handler with it."""
+        """Validate the fields of a message, and call the handler with the message."""
         header = envelope.header
         try:
             message = envelope.open()
@@ -511,7 +526,7 @@ class Subscriber:
         self.call(message, header)
 
     def call(self, message: Any, header: Header) -> None:
-        """Call the handler. If it raises an exception, report the exception and continue."""
+        """Call the handler, and report an exception that it raises without raising it again."""
         try:
             self._on_message(message, header)
         except Exception as error:
@@ -522,7 +537,7 @@ class Subscriber:
             )
 
     def reject(self, error: WireError) -> None:
-        """Count a rejected message, and report the first rejection of each cause."""
+        """Count a rejected message. Report it if it is the first rejection for this cause."""
         self.counts.rejected += 1
         if error.cause not in self._reported_causes:
             self._reported_causes.add(error.cause)
@@ -540,11 +555,11 @@ class Subscriber:
 
 
 class _Writer:
-    """The start time (epoch) and sequence number of the newest message of a writer.
+    """The start time (epoch) and the sequence number of the newest message of a node.
 
-    They are used to reject old messages that are sent again. A writer that restarts on the same
-    clock has a later epoch. After a reboot of its host it has a new clock identifier, and messages
-    of its former clocks are rejected.
+    They are used to reject copies of old messages. A node that restarts on the same clock has a
+    later epoch. After a reboot of its host, the node has a new clock identifier, and messages with
+    an earlier clock identifier are rejected.
     """
 
     __slots__ = ("clock_id", "epoch", "past_clocks", "sequence")
@@ -554,10 +569,11 @@ class _Writer:
         self.past_clocks: deque[str] = deque(maxlen=MAX_PAST_CLOCKS)
 
     def update(self, header: Header) -> int:
-        """Return the number of messages that were lost before this message.
+        """Store the header of a new message, and return the number of messages lost before it.
 
-        -1 means that the newest message was repeated; other negative numbers mean an older message.
-        Raises WireError for a message that was sent before the writer's latest restart.
+        A result of -1 means that the newest message was received again. Other negative results mean
+        that an older message was received. Raises WireError for a message that was sent before the
+        latest restart of its node.
         """
         if header.clock_id != self.clock_id:
             if header.clock_id in self.past_clocks:
@@ -580,13 +596,13 @@ class _Writer:
 
 
 def _list_writers(sources: Sequence[Source]) -> frozenset[str] | None:
-    """Return the writers expected at these endpoints, or None if a writer is unknown."""
+    """Return the names of the nodes that publish at the endpoints, or None if one is unknown."""
     known = [one.writer for one in sources if one.writer is not None]
     return frozenset(known) if len(known) == len(sources) > 0 else None
 
 
 class _HostConnection:
-    """A subscriber's socket that receives the messages of one host."""
+    """A socket of a subscriber that receives the messages of one host."""
 
     def __init__(
         self,
@@ -619,7 +635,7 @@ class _HostConnection:
         return self._keys is not None and self.host is not None
 
     def open(self) -> None:
-        """Connect, and start to read messages."""
+        """Connect the socket, and start to read messages."""
         topic = self._subscriber.topic
         self._loop = asyncio.get_running_loop()
         self._socket = _open_socket(zmq.SUB, topic)
@@ -671,9 +687,10 @@ class _HostConnection:
         self._disconnected.clear()
 
     def _handle_monitor_events(self) -> None:
-        """Report the end of a connection, and connect again. This is a callback of the event loop.
+        """Report the end of a connection, and connect again.
 
-        ZeroMQ itself does not reconnect after a rejected key or after corrupted data.
+        This method is a callback of the event loop. ZeroMQ itself does not reconnect after a
+        rejected key or after corrupted data.
         """
         while self._monitor is not None:
             try:
@@ -704,7 +721,7 @@ class _HostConnection:
             self.open()
 
     def _read(self) -> None:
-        """Deliver a batch of the arrived messages. This is a callback of the event loop."""
+        """Deliver a batch of received messages. This method is a callback of the event loop."""
         if self._socket is None or self._socket.closed or self._loop is None:
             return
         drained = False
@@ -715,11 +732,10 @@ class _HostConnection:
                 self._loop.call_soon(self._read)
 
     def _deliver_newest(self) -> bool:
-        """Deliver the newest message of each writer, and skip older messages without validating
-        them.
+        """Deliver the newest message of each node, and skip older messages without validating them.
 
-        A first message that is younger than half a period is delivered at once. Return whether the
-        socket has no more messages.
+        If the first message is younger than half the period of the topic, it is delivered at once.
+        Return whether the socket has no more messages.
         """
         newest: dict[str, Envelope] = {}
         drained = False
@@ -816,7 +832,11 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
 
 
 def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRing | None) -> str:
-    """Bind the socket, and return the endpoint with the assigned port number."""
+    """Bind a publisher's socket to an endpoint.
+
+    Return the endpoint, in which the actual port number replaces "*". Raises BusError if the socket
+    cannot be bound.
+    """
     _check_endpoint(topic, endpoint)
     if keys is None:
         _refuse_beyond_loopback(topic, endpoint)
@@ -845,9 +865,9 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
 
 
 def _check_endpoint(topic: Topic, endpoint: str) -> None:
-    """Raise BusError for an invalid endpoint.
+    """Raise BusError if an endpoint is invalid.
 
-    ZeroMQ would accept some of them, or report them unclearly.
+    ZeroMQ would accept some invalid endpoints, or report them with an unclear error.
     """
     transport, _, address = endpoint.partition("://")
     port = address.rpartition(":")[2]
@@ -867,7 +887,7 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
 
 
 def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
-    """Raise BusError for a tcp endpoint that other hosts can reach."""
+    """Raise BusError if other hosts can reach a tcp endpoint."""
     transport, _, address = endpoint.partition("://")
     if transport != "tcp":
         return
@@ -884,9 +904,9 @@ def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
 
 
 def _ipc_is_served(endpoint: str) -> bool:
-    """Return whether a process listens at an ipc endpoint.
+    """Return whether another process already listens at an ipc endpoint.
 
-    Binding this endpoint would take it away from that process.
+    If this process bound the same endpoint, the other process would lose it.
     """
     path = endpoint.removeprefix(IPC)
     if path == endpoint or path.startswith("@"):

@@ -1,4 +1,4 @@
-"""Decide whether a computer is too busy for its nodes, and describe why."""
+"""Decide whether a computer has too few free processors for its nodes, and describe the cause."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import CpuPressure, HostStatus
 
 MAX_LOAD_RATIO = 1.5
-"""The maximum load per core, used if a computer cannot measure how long its nodes wait."""
+"""The maximum load average per core.
+
+It is used on computers that cannot measure how long processes wait for a processor.
+"""
 
 BUSY_REMEDY = (
     "the arms may pause meanwhile; end other programs, give the graph more cores, or start fewer "
@@ -20,9 +23,9 @@ def is_busy(host: HostStatus) -> bool:
 
 
 def describe_busy_remedy(*, nice_denied: bool) -> str:
-    """Return what the user of a busy computer can do.
+    """Return a text that tells the user of an overloaded computer what to do.
 
-    nice_denied: whether nodes run without the priority that their launch file requires.
+    nice_denied: whether the nodes lack the process priority that the launch file requires.
     """
     if not nice_denied:
         return BUSY_REMEDY
@@ -33,7 +36,7 @@ def describe_busy_remedy(*, nice_denied: bool) -> str:
 
 
 def describe_busy(host: HostStatus) -> str:
-    """Return a sentence that says why a computer is busy, or "" if it is not busy."""
+    """Return a sentence that states why a computer is overloaded, or "" if it is not overloaded."""
     if not is_busy(host):
         return ""
     if host.cpu is None:
@@ -44,7 +47,7 @@ def describe_busy(host: HostStatus) -> str:
 
 
 def describe_pressure(cpu: CpuPressure) -> str:
-    """Describe which node waits for a processor, for how long, and which programs use the cores."""
+    """Describe which node waits longest for a processor, and which programs use the cores."""
     waits = f"{cpu.node} waits for a processor {cpu.wait_ratio:.0%} of the time"
     if not cpu.programs:
         return waits

@@ -1,4 +1,4 @@
-"""Define the stereo calibration file, which `flexsheet calibrate stereo` writes."""
+"""Define the calibration file of the stereo camera (`flexsheet calibrate stereo`)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", ("numbers", "number
 class Board(Part):
     """A calibration board: a chessboard, or a ChArUco board with markers in its white squares.
 
-    columns, rows: numbers of inner corners, for both kinds of board.
+    columns, rows: numbers of inner corners along both sides of the board.
     """
 
     kind: Literal["chessboard", "charuco"] = "chessboard"
@@ -40,7 +40,7 @@ class Board(Part):
 
 
 class PairResidual(Part):
-    """The reprojection error of one image pair: root mean square over the corners of each view."""
+    """The rms reprojection error (px) of the board's corners in each image of a stereo pair."""
 
     left: str
     right: str
@@ -57,10 +57,10 @@ class PairResidual(Part):
 
 
 class Uncertainty(Part):
-    """The uncertainty of the stereo camera, as standard deviations of normally distributed errors.
+    """The uncertainty of a stereo calibration, given as standard deviations.
 
-    It describes the error that all measured fingertips have in common, not the scatter of single
-    measurements.
+    The uncertainty is an error that all measured fingertip positions have in common. The scatter of
+    single measurements is not included.
     """
 
     corner_sigma_px: NonNegative = Field(
@@ -101,7 +101,10 @@ class StereoCalibration(Part):
 
 
 def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) -> None:
-    """Raise CalibrationMismatchError if a calibration does not match the camera and image size."""
+    """Check that a stereo calibration belongs to the camera in the scene.
+
+    Raises CalibrationMismatchError if the device or the image size differs.
+    """
     if calibration.device != camera.device:
         raise CalibrationMismatchError(
             f'the calibration is of the camera "{calibration.device}", but the scene\'s camera is '
@@ -118,11 +121,19 @@ def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) ->
 
 
 def save_calibration(calibration: StereoCalibration, path: Path, *, comment: str = "") -> None:
-    """Write a stereo calibration to a file. Raises FileWriteError if it cannot be written."""
+    """Write a stereo calibration to a YAML file.
+
+    comment: comment line at the start of the file; empty for none.
+
+    Raises FileWriteError if the file cannot be written.
+    """
     title = f"Stereo calibration of {calibration.device}, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_calibration(path: Path) -> StereoCalibration:
-    """Read a stereo calibration from a file. Raises CalibrationFileError if it is invalid."""
+    """Read a stereo calibration from a YAML file.
+
+    Raises CalibrationFileError if the file is invalid.
+    """
     return read_calibration(StereoCalibration, path, command="flexsheet calibrate stereo")

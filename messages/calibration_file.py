@@ -1,4 +1,4 @@
-"""Read and write calibrations as YAML files with every number in full precision."""
+"""Read and write calibration files in YAML, with every number in full precision."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_CALIBRATION_DEPTH = 12
 
 
 class CalibrationFileError(FlexsheetError, ValueError):
-    """Raised for an invalid calibration file. The text names file, key and remedy."""
+    """Raised if a calibration file is invalid. The text names the file, the key and the remedy."""
 
     code = "calibration-file"
     exit_code = 2
@@ -35,7 +35,7 @@ class CalibrationFileError(FlexsheetError, ValueError):
 
 
 class CalibrationMismatchError(FlexsheetError, ValueError):
-    """Raised if a calibration is not of the scene's camera, sheet or other device."""
+    """Raised if a calibration belongs to another camera, sheet or device than the scene's."""
 
     code = "calibration-mismatch"
     exit_code = 2
@@ -43,9 +43,13 @@ class CalibrationMismatchError(FlexsheetError, ValueError):
 
 
 def write_calibration(calibration: Part, path: Path, *, title: str, comment: str) -> None:
-    """Write a calibration file. An existing file is replaced only after the new file is complete.
+    """Write a calibration to a YAML file.
 
-    title: first comment line. comment: second comment line, such as the command; may be empty.
+    An existing file is replaced only after the new file has been written completely.
+
+    title: first comment line of the file.
+    comment: second comment line, such as the command that wrote the file; empty for none.
+
     Raises FileWriteError if the file cannot be written.
     """
     yaml = YAML()
@@ -60,7 +64,10 @@ def write_calibration(calibration: Part, path: Path, *, title: str, comment: str
 
 
 def _parse(path: Path) -> Any:
-    """Parse a YAML file. Raises YAMLError if no calibration command can have written it."""
+    """Parse a calibration file in YAML.
+
+    Raises YAMLError if the file is too large or contains YAML that no calibration file contains.
+    """
     with path.open("rb") as file:
         data = file.read(MAX_CALIBRATION_BYTES + 1)
     if len(data) > MAX_CALIBRATION_BYTES:
@@ -70,9 +77,9 @@ def _parse(path: Path) -> Any:
 
 @lru_cache(maxsize=8)
 def _parse_text(text: str) -> Any:
-    """Parse YAML text.
+    """Parse YAML text, and cache the result.
 
-    The caller must not change the result, because later calls return it again.
+    The caller must not change the result, because later calls return the same object.
     """
     yaml = YAML(typ="safe", pure=True)
     yaml.Composer = CalibrationComposer
@@ -80,7 +87,7 @@ def _parse_text(text: str) -> Any:
 
 
 class CalibrationComposer(Composer):
-    """A YAML composer that rejects aliases and excessive nesting."""
+    """A YAML composer that rejects aliases and too many nested lists or mappings."""
 
     depth = 0
 
@@ -97,12 +104,12 @@ class CalibrationComposer(Composer):
 
 
 def read_calibration(kind: type[Calibration], path: Path, *, command: str) -> Calibration:
-    """Read a calibration file of one kind.
+    """Read a calibration from a YAML file.
 
-    version: expected version of the file format. command: command that writes such files, for
-        errors.
+    kind: type of the calibration, which also defines the expected version of the file.
+    command: command that writes such files. Error texts name this command.
 
-    Raises CalibrationFileError if the file is missing, incomplete, or of another kind or version.
+    Raises CalibrationFileError if the file is missing, incomplete, or of another type or version.
     """
     try:
         content = _parse(path)

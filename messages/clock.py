@@ -1,4 +1,4 @@
-"""Define the clocks of nodes: the system's clock, and a virtual clock for tests and replays."""
+"""Define the clocks of nodes: the system clock, and a virtual clock for tests and replays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Protocol
 class Clock(Protocol):
     """The interface of a monotonic clock.
 
-    Timestamps of clocks with equal `id` may be subtracted.
+    Two timestamps may be subtracted only if their clocks have the same `id`.
     """
 
     @property
@@ -21,14 +21,14 @@ class Clock(Protocol):
 
 
 def read_boot_id() -> str:
-    """Return the kernel's random identifier of the present boot of this host."""
+    """Return the random identifier that the kernel assigned to the current boot of this host."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def read_namespace_offset() -> str:
-    """Return the offset (s) of CLOCK_MONOTONIC in this time namespace, such as "+36000.0".
+    """Return the offset (s) of CLOCK_MONOTONIC in the time namespace of this process.
 
-    Return an empty string if there is no offset.
+    The result is text such as "+36000.0", or an empty string if there is no offset.
     """
     try:
         lines = Path("/proc/self/timens_offsets").read_text().splitlines()
@@ -41,7 +41,7 @@ def read_namespace_offset() -> str:
 
 
 class SystemClock:
-    """The clock CLOCK_MONOTONIC of this host, which all its processes share."""
+    """The system clock CLOCK_MONOTONIC, which all processes of this host share."""
 
     def __init__(self) -> None:
         self._id = f"{host_name()}-{read_boot_id()[:8]}{read_namespace_offset()}"
@@ -55,7 +55,7 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock for replays and tests that advances only by `move_to`."""
+    """A clock for replays and tests, whose time changes only when `move_to` is called."""
 
     def __init__(self, start_ns: int = 0, *, clock_id: str = "virtual") -> None:
         self._now_ns = start_ns
@@ -69,5 +69,5 @@ class VirtualClock:
         return self._now_ns
 
     def move_to(self, now_ns: int) -> None:
-        """Set the time to `now_ns`, unless this is earlier than the current time."""
+        """Set the time to `now_ns`. If `now_ns` is earlier than the current time, do nothing."""
         self._now_ns = max(self._now_ns, now_ns)

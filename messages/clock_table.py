@@ -1,4 +1,4 @@
-"""Convert timestamps of other hosts' clocks to the local clock when a message arrives.
+"""Convert the timestamps of messages from other hosts to the local clock.
 
 After the conversion, ages and predictions do not depend on the host that sent the message.
 """
@@ -15,11 +15,14 @@ from flexsheet.messages.types import ClockOffset, Clocks
 M = TypeVar("M", bound=Message)
 
 MAX_STAMP_AHEAD_NS = 20_000_000
-"""The maximum time by which another clock's timestamps may be ahead of the local clock."""
+"""The maximum time (ns) by which a timestamp of another clock may be in the future."""
 
 
 class ClockTable:
-    """A table of the offsets of other hosts' clocks, from the newest `Clocks` message."""
+    """A table of the offsets between the clocks of other hosts and the local clock.
+
+    The offsets are those in the newest `Clocks` message.
+    """
 
     def __init__(self, clock_id: str) -> None:
         self._own = clock_id
@@ -28,12 +31,12 @@ class ClockTable:
         self.offsets: dict[str, ClockOffset] = {}
 
     def update(self, clocks: Clocks) -> None:
-        """Replace all offsets by those in a message of the clock node."""
+        """Replace all offsets by those in a new message of the clock node."""
         self._limit_s, self._max_drift = clocks.max_offset_uncertainty_s, clocks.max_drift_ratio
         self.offsets = {one.clock_id: one for one in clocks.offsets}
 
     def find_problem(self, clock_id: str, now_ns: int) -> str:
-        """Return why the timestamps of a clock are not accurate enough, or "" if they are.
+        """Return why the offset of a clock is not accurate enough, or "" if it is.
 
         now_ns: current time on the local clock.
         """
@@ -52,11 +55,12 @@ class ClockTable:
         )
 
     def shift_ns(self, clock_id: str, at_ns: int) -> int | None:
-        """Return the shift (ns) that converts timestamps near `at_ns` to the local clock.
+        """Return the time (ns) to add to a timestamp to convert it to the local clock.
 
-        at_ns: publication time of the message on the clock `clock_id`. All timestamps of a message
-            get the same shift, which preserves their differences. Returns None if the offset is
-            unknown.
+        Return None if the offset of the clock is unknown. All timestamps of a message get the same
+        shift, which preserves their differences.
+
+        at_ns: time when the message was published, on the clock `clock_id`.
         """
         offset = self.offsets.get(clock_id)
         if offset is None:
@@ -66,10 +70,11 @@ class ClockTable:
         return -offset.offset_ns - round(since_ns * drift / (1.0 + drift))
 
     def localize(self, message: M, header: Header, now_ns: int) -> tuple[M, Header, str]:
-        """Convert a message and its header to the local clock, and return the result of
-        `find_problem`.
+        """Convert the timestamps of a message and its header to the local clock.
 
-        If the offset of a clock is not measured, the message counts as published on arrival.
+        Return the message, the header, and the result of `find_problem`. If the offset of the
+        message's clock is unknown, the publication time is assumed to be the time of arrival
+        `now_ns`.
         """
         clock_id = header.clock_id
         if clock_id == self._own:
@@ -90,7 +95,10 @@ class ClockTable:
 
 
 def shift_stamps(message: M, shift_ns: int) -> M:
-    """Return a message with its timestamps (ns) shifted. A timestamp of 0 (none) remains 0."""
+    """Return a copy of a message in which `shift_ns` was added to each timestamp.
+
+    A timestamp of 0, which means no timestamp, remains 0.
+    """
     moved = {
         name: max(1, value + shift_ns)
         for name in find_stamp_fields(type(message))

@@ -1,14 +1,14 @@
-"""Close tcp connections to publishers on which a peer sends more data than a subscriber does.
+"""Close tcp connections on which a peer sends a publisher more data than a subscriber would.
 
-A ZeroMQ publisher stores every subscription that a peer sends, which needs about 45 times its size.
-It does so within the call that sends the next message, and that call does not return while more
-subscriptions arrive. ZeroMQ has no option that limits the number of subscriptions or the frames of
-a message.
+A ZeroMQ publisher stores every subscription that a peer sends, which needs about 45 times its size
+in memory. The publisher stores them within the call that sends the next message, and that call does
+not return while more subscriptions arrive. ZeroMQ has no option that limits the number of
+subscriptions or the number of frames in a message.
 
 A subscriber of this package sends only a handshake, one subscription, and one reply to each
 heartbeat. A thread therefore counts the bytes that the kernel has received on each accepted
-connection (TCP_INFO), and closes a connection that has received more. The thread sleeps until data
-arrives (edge-triggered epoll), so it needs no processor time while peers send nothing.
+connection (TCP_INFO). It closes a connection that has received too many bytes. The thread sleeps
+until data arrives (edge-triggered epoll), so it needs no processor time while peers send nothing.
 """
 
 from __future__ import annotations
@@ -29,39 +29,45 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 MAX_BYTES_AT_ONCE = 4096
-"""The number of bytes that a connection may receive at once.
+"""The number of bytes that a new connection may receive immediately.
 
-A CURVE handshake and a subscription have 900 bytes.
+A CURVE handshake and a subscription have 900 bytes together.
 """
 
 MAX_BYTES_PER_S = 256
-"""The number of further bytes that a connection may receive per second.
+"""The number of bytes per second that a connection may receive after the handshake.
 
 An encrypted reply to a heartbeat has 40 bytes and is sent once per second.
 """
 
 MAX_CONNECTIONS_PER_ADDRESS = 64
-"""The maximum number of connections to a publisher from one address.
+"""The maximum number of connections to a publisher from one network address.
 
-A computer's nodes, recorder and tools have fewer.
+The nodes, the recorder and the tools of one computer need fewer connections.
 """
 
 EXCLUSION_S = 1.0
-"""The time for which new connections are refused from an address that sent too much."""
+"""The time (s) for which a publisher refuses an address that has sent too much data."""
 
 RECEIVE_BUFFER_BYTES = 16_384
-"""The receive buffer of a connection. Its content is still read after the connection is closed."""
+"""The size (bytes) of the receive buffer of a connection.
+
+ZeroMQ still reads the content of this buffer after the connection has been closed.
+"""
 
 THREAD_NAME = "connection guard"
 TCP_INFO_FORMAT, TCP_INFO_BYTES_RECEIVED = "=Q", 128
 
 OnRefused = Callable[[str, str], None]
-"""A callback on the guard's thread, with the peer's address and the reason of the refusal."""
+"""A function that is called with a peer's address and the reason why it was refused.
+
+The thread of the connection guard calls the function.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class _Publisher:
-    """The monitor socket of a publisher, and the callback for its closed connections."""
+    """The monitor socket of a publisher, and the function that reports its closed connections."""
 
     monitor: zmq.Socket[bytes]
     on_refused: OnRefused
@@ -69,7 +75,10 @@ class _Publisher:
 
 @dataclass(frozen=True, slots=True)
 class _Connection:
-    """An accepted connection, identified by its two addresses. File descriptors are reused."""
+    """An accepted connection, identified by its local and remote address.
+
+    A file descriptor does not identify a connection, because the system reuses descriptors.
+    """
 
     publisher: _Publisher
     local: tuple[object, ...]
@@ -81,7 +90,10 @@ class _Connection:
         return str(self.remote[0])
 
     def open(self, fd: int) -> socket.socket | None:
-        """Return a duplicate of the descriptor `fd`, or None if another connection now uses it."""
+        """Return a duplicate of the socket with the file descriptor `fd`.
+
+        Return None if the connection has ended, or if another connection now uses the descriptor.
+        """
         try:
             opened = socket.socket(fileno=os.dup(fd))
         except OSError:
@@ -107,7 +119,10 @@ class ConnectionGuard:
 
     @classmethod
     def watch(cls, publisher: zmq.Socket[bytes], on_refused: OnRefused) -> None:
-        """Monitor all future connections of a publisher's socket, until its monitor is disabled."""
+        """Monitor all future connections to a publisher until its socket's monitor is disabled.
+
+        on_refused: function that is called with the peer's address and the reason of each refusal.
+        """
         publisher.setsockopt(zmq.RCVBUF, RECEIVE_BUFFER_BYTES)
         events = int(zmq.EVENT_ACCEPTED | zmq.EVENT_MONITOR_STOPPED)
         monitor = publisher.get_monitor_socket(events, f"inproc://accepted-{next(cls._numbers)}")
@@ -132,7 +147,7 @@ class ConnectionGuard:
                     return
 
     def _read_monitor(self, fd: int, publisher: _Publisher) -> bool:
-        """Register new connections. Return False if no publisher is left."""
+        """Register the new connections of a publisher. Return False if no publisher is left."""
         while True:
             try:
                 news = parse_monitor_message(publisher.monitor.recv_multipart(zmq.NOBLOCK))
@@ -145,7 +160,10 @@ class ConnectionGuard:
                 self._accept(int(news["value"]), int(endpoint.rpartition(":")[2]), publisher)
 
     def _accept(self, fd: int, port: int, publisher: _Publisher) -> None:
-        """Monitor a connection. Close it if its address is excluded or has too many connections."""
+        """Start to monitor a new connection.
+
+        Close the connection if its address is temporarily refused or has too many connections.
+        """
         with suppress(OSError), socket.socket(fileno=os.dup(fd)) as opened:
             local, remote = _ends(opened)
             if not remote or local[1] != port:
@@ -169,7 +187,10 @@ class ConnectionGuard:
         self._check(fd)
 
     def _count(self, new: _Connection) -> int:
-        """Count the other connections from the same address, and remove those that have ended."""
+        """Return the number of other connections from the same address to the same publisher.
+
+        Connections that have ended are removed from the table.
+        """
         number = 0
         for fd, known in list(self._connections.items()):
             if known.publisher is new.publisher and known.address == new.address:
@@ -182,7 +203,7 @@ class ConnectionGuard:
         return number
 
     def _check(self, fd: int) -> None:
-        """Close a connection that has received more bytes than a subscriber sends."""
+        """Close a connection if it has received more bytes than a subscriber sends."""
         connection = self._connections.get(fd)
         opened = None if connection is None else connection.open(fd)
         if connection is None or opened is None:
@@ -205,7 +226,7 @@ class ConnectionGuard:
         )
 
     def _remove_publisher(self, fd: int, publisher: _Publisher) -> bool:
-        """Stop monitoring a publisher. Return False if no publisher is left."""
+        """Stop monitoring the connections to a publisher. Return False if no publisher is left."""
         self._epoll.unregister(fd)
         for connected_fd, connection in list(self._connections.items()):
             if connection.publisher is publisher:
@@ -224,7 +245,10 @@ class ConnectionGuard:
 
 
 def _ends(opened: socket.socket) -> tuple[tuple[object, ...], tuple[object, ...]]:
-    """Return the local and the remote address of a connection, or empty tuples if it is closed."""
+    """Return the local and the remote address of a connection.
+
+    Return empty tuples if the connection is closed.
+    """
     try:
         local, remote = opened.getsockname(), opened.getpeername()
     except OSError:

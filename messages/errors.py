@@ -8,8 +8,9 @@ from typing import ClassVar
 class FlexsheetError(Exception):
     """The base class of errors that a user can correct.
 
-    code: name of the error for `flexsheet explain`. remedy: what the user can do. exit_code: exit
-        status of a command that ends with this error.
+    code: name of the error for the command `flexsheet explain`.
+    remedy: text that states what the user can do.
+    exit_code: exit status of a command that ends with this error.
     """
 
     code: ClassVar[str]
@@ -17,5 +18,8 @@ class FlexsheetError(Exception):
     exit_code: int = 1
 
     def __str__(self) -> str:
-        """Return the error text. Without this method, a KeyError would return it in quotes."""
+        """Return the error text.
+
+        Without this method, an error that is also a KeyError would return the text in quotes.
+        """
         return Exception.__str__(self)

@@ -14,7 +14,7 @@ from flexsheet.messages.arrays import ArraySpec
 
 
 def describe_field_type(field: FieldInfo) -> str:
-    """Return a field's type as Markdown. A model is a link to its section."""
+    """Return the type of a field as Markdown, with a link for each nested model."""
     for extra in field.metadata:
         if isinstance(extra, ArraySpec):
             return _array(extra)
@@ -22,8 +22,8 @@ def describe_field_type(field: FieldInfo) -> str:
 
 
 def describe_field(field: FieldInfo) -> dict[str, str]:
-    """Return the type (without Markdown), default and description of a field."""
-    # Links keep their text only.
+    """Return the type (as plain text), the default value and the description of a field."""
+    # Replace Markdown links by their text.
     kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
     return {
         "type": re.sub(r"[`\\]", "", kind),
@@ -47,7 +47,10 @@ def get_annotation(field: FieldInfo) -> Any:
 
 
 def split_annotation(annotation: Any) -> tuple[Any, ArraySpec | None]:
-    """Split an annotation into the type without metadata, and its array specification or None."""
+    """Split an annotation into the bare type and its array specification.
+
+    The array specification is None if the annotation contains none.
+    """
     spec = None
     while get_origin(annotation) is Annotated:
         annotation, *marks = get_args(annotation)
@@ -56,7 +59,10 @@ def split_annotation(annotation: Any) -> tuple[Any, ArraySpec | None]:
 
 
 def is_image(spec: ArraySpec) -> bool:
-    """Return whether an array is an image, which has more than one axis of variable length."""
+    """Return whether an array specification describes an image.
+
+    An image is an array in which more than one axis has a variable length.
+    """
     return sum(isinstance(length, str) for length in spec.shape) > 1
 
 

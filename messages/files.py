@@ -1,4 +1,4 @@
-"""Write files atomically."""
+"""Write files atomically: a reader never sees an incomplete file."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ from pathlib import Path
 from flexsheet.messages.errors import FlexsheetError
 
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO})
-"""The error numbers (errno) that are caused by the disk or its file system."""
+"""The error numbers (errno) of errors that the disk or its file system causes."""
 
 
 class FileWriteError(FlexsheetError, OSError):
-    """Raised if a file cannot be written. The text names path, cause, and needed and free space."""
+    """Raised if a file cannot be written.
+
+    The text contains the path and the cause. If the disk is full, it also contains the needed and
+    the free space.
+    """
 
     code = "file-write"
     remedy = "Free space on the disk, create the folder, or give another file."
@@ -26,7 +30,7 @@ class FileWriteError(FlexsheetError, OSError):
 def write_file(path: Path, content: str | bytes, *, mode: int | None = None) -> None:
     """Write a file atomically. If writing fails, an existing file remains unchanged.
 
-    mode: file permissions; None: the default of the process.
+    mode: file permissions; None: the default permissions of the process.
 
     Raises FileWriteError if the file cannot be written.
     """
@@ -52,7 +56,8 @@ def make_write_error(
 ) -> FileWriteError:
     """Make the error for a file that could not be written, with a remedy that fits the cause.
 
-    needed_bytes: size of the file, for the text about a full disk; None: unknown.
+    needed_bytes: size of the file, which the error text contains if the disk is full; None:
+        unknown.
     """
     text = f"{path}: cannot be written: {error.strerror or error}"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -68,7 +73,7 @@ def make_write_error(
 
 
 def free_bytes(folder: Path) -> int:
-    """Return the number of bytes that are free for this user on a folder's disk.
+    """Return the free space (bytes) for this user on the disk of a folder.
 
     Raises OSError if the folder does not exist.
     """

@@ -1,8 +1,8 @@
 """Define limits for numbers in scenes, launch files, parameters and calibrations.
 
-The limit of a number follows from the unit at the end of its field's name. A few names have a limit
-of their own. The limits are wide: they only exclude numbers that no hardware of this kind has, and
-that could cause overflow or other numerical errors in the nodes.
+The limit of a number depends on the unit at the end of its field's name, such as `_m`. A few field
+names have their own limits. The limits are wide. They only exclude numbers that no hardware of this
+kind has and that could cause numerical errors in the nodes, such as overflow.
 """
 
 from __future__ import annotations
@@ -17,25 +17,28 @@ from pydantic import BaseModel, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
 MAX_LENGTH_M = 10.0
-"""The maximum length or coordinate: the size of a room."""
+"""The maximum length or coordinate (m), which is about the size of a room."""
 
 MAX_ANGLE_RAD = 7.0
-"""The maximum angle: a full rotation plus a margin for rounding."""
+"""The maximum angle (rad): a full rotation plus a margin for rounding."""
 
 MAX_DURATION_S = 86_400.0
 MAX_RATE_HZ = 10_000.0
 MAX_IMAGE_PX = 16_384.0
-"""The maximum size of an image: the largest OpenGL texture on common devices."""
+"""The maximum width or height of an image (px): the largest OpenGL texture on common devices."""
 
 MAX_STRESS_PA = 1.2e12
-"""The maximum stress or modulus: Young's modulus of diamond, the stiffest material."""
+"""The maximum stress or elastic modulus (Pa): Young's modulus of diamond, the stiffest material."""
 
 MAX_FORCE_N = 10_000.0
 MAX_SPEED_M_PER_S = 10.0
-"""The maximum speed: the speed of the fastest movements of a hand."""
+"""The maximum speed (m/s): the speed of the fastest movements of a hand."""
 
 MAX_TOOL_SPEED_M_PER_S = 2.2
-"""The maximum speed of the RV-1A with all joints together, from its specification."""
+"""The maximum speed (m/s) of the tool of an arm.
+
+The value is from the specification of the RV-1A, for motion of all joints together.
+"""
 
 MAX_STRETCH_RATIO = 10.0
 """The maximum stretch ratio of a sheet. Natural rubber breaks at a smaller ratio."""
@@ -85,23 +88,29 @@ MAX_BY_UNIT = {
     "_ratio": 1e6,
     "_bytes": MAX_BYTES,
 }
-"""The maximum magnitude by the suffix of a field's name. Longer suffixes come first."""
+"""The maximum magnitude of a number, by the unit suffix of its field's name.
+
+If one suffix ends with another suffix, the longer suffix is listed first.
+"""
 
 MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-9, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
-"""The minimum value of positive fields by suffix, below the resolution of any device."""
+"""The minimum value of a positive number, by the unit suffix of its field's name.
+
+The values are below the resolution of any device.
+"""
 
 MIN_POSITIVE = 1e-9
-"""The minimum value of positive fields whose unit is not in `MIN_BY_UNIT`."""
+"""The minimum value of a positive number whose unit is not in `MIN_BY_UNIT`."""
 
 MAX_ROTATION_ERROR = 1e-4
-"""The maximum error of an element of R R^T for a rotation matrix R.
+"""The maximum error of an element of R R^T for a rotation matrix R, where R^T is its transpose.
 
-It corresponds to 0.05 mm at a distance of half a metre.
+It corresponds to an error of 0.05 mm at a distance of half a metre.
 """
 
 
 class LimitedModel(BaseModel):
-    """The base class of models whose numbers are limited by their units.
+    """The base class of models in which each number has a limit that depends on its unit.
 
     Matrices of shape (4, 4) must be rigid transforms.
     """
@@ -138,7 +147,7 @@ def _check_number(value: float, name: str) -> None:
 
 
 def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
-    """Raise ValueError unless a matrix (4, 4) is a rigid transform."""
+    """Raise ValueError if a matrix (4, 4) is not a rigid transform."""
     if not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
         raise ValueError("the last row of a rigid transform must be [0, 0, 0, 1]")
     rotation = matrix[:3, :3]
@@ -150,7 +159,7 @@ def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
 
 @cache
 def find_max_magnitude(name: str) -> float:
-    """Return the maximum magnitude of the numbers in a field with this name."""
+    """Return the maximum magnitude of a number in a field with the given name."""
     if name in MAX_BY_NAME:
         return MAX_BY_NAME[name]
     return next((MAX_BY_UNIT[unit] for unit in MAX_BY_UNIT if name.endswith(unit)), MAX_NUMBER)
@@ -158,7 +167,7 @@ def find_max_magnitude(name: str) -> float:
 
 @cache
 def find_min_positive(name: str) -> float:
-    """Return the minimum value of a positive field with this name."""
+    """Return the minimum value of a positive number in a field with the given name."""
     unit = next((unit for unit in MAX_BY_UNIT if name.endswith(unit)), "")
     return MIN_BY_UNIT.get(unit, MIN_POSITIVE)
 
@@ -175,7 +184,7 @@ def _refuses_zero(model: type[BaseModel], name: str) -> bool:
 
 
 def _constraints(field: FieldInfo, annotation: Any) -> Iterator[Any]:
-    """Yield the constraints of a field, including those of the members of an optional type."""
+    """Yield the constraints of a field, including those inside an optional type."""
     yield from field.metadata
     for member in get_args(annotation):
         if get_origin(member) is Annotated:

@@ -1,12 +1,13 @@
-"""Deliver messages between the nodes of one process without serialization.
+"""Deliver messages between the nodes of one process without encoding them.
 
 A publisher passes each message to the subscribers in its process. It sends the message on its
-    socket only while another process has subscribed. A subscriber applies the same checks as to
-    messages from sockets: writer, plan, order, types, shapes and ranges. Arrays of at most
-    `INLINE_BYTES` are copied, as for a socket, because a sender may reuse them. Larger arrays are
-    shared. All arrays are read-only for the subscribers.
+socket only while another process has subscribed. A subscriber applies the same checks as to
+messages from sockets: writer, plan, order, types, shapes and ranges. Arrays of at most
+`INLINE_BYTES` are copied, because a sender may reuse their memory. Larger arrays are shared. All
+arrays are read-only for the subscribers.
 
-A handler runs in a callback of the event loop after the sender's callback, never inside `send`.
+A message handler runs in a callback of the event loop after the sender's callback, never inside
+`send`.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ _SCALARS = frozenset((bool, int, float, str, type(None)))
 
 
 class LocalEnvelope(Envelope):
-    """A message for the subscribers in the sender's process, copied and validated at most once.
+    """A message for the subscribers in the sender's process.
+
+    The message is copied and validated at most once, for all subscribers together.
 
     array_bytes: total size of the message's arrays.
     """
@@ -42,7 +45,7 @@ class LocalEnvelope(Envelope):
         self.fields = self._share_fields(original.__dict__)
 
     def open(self) -> Message:
-        """Return the validated message, which is the same object for every subscriber.
+        """Return the validated message, which is the same object for all subscribers.
 
         Raises WireError if a field is invalid.
         """
@@ -65,7 +68,7 @@ class LocalEnvelope(Envelope):
         return shared
 
     def _share(self, value: Any) -> Any:
-        """Return a value with read-only arrays, in which message parts are dictionaries."""
+        """Return a copy of a value in which arrays are read-only and models are dictionaries."""
         if isinstance(value, np.ndarray):
             self.array_bytes += value.nbytes
             array = value.copy() if value.nbytes <= INLINE_BYTES else value.view()
@@ -81,7 +84,7 @@ class LocalEnvelope(Envelope):
 
 
 class LocalReceiver(Protocol):
-    """The interface of a subscriber, whose checks and handler are the same as for sockets."""
+    """The interface of a subscriber that receives messages from its own process."""
 
     topic: Topic
     counts: Any
@@ -92,7 +95,7 @@ class LocalReceiver(Protocol):
 
 
 class LocalChannel:
-    """A channel for the messages of one writer on one topic, inside its process."""
+    """A channel that passes the messages of one node on one topic to subscribers in its process."""
 
     def __init__(self) -> None:
         self._readers: list[LocalConnection] = []
@@ -101,7 +104,7 @@ class LocalChannel:
     def send(self, topic: Topic, message: Message, header: Header) -> None:
         """Pass a message to all subscribers in this process.
 
-        Raises WireError if the arrays are larger than the topic allows.
+        Raises WireError if the arrays are larger than the topic permits.
         """
         latched = topic.delivery is Delivery.LATCHED
         if not (self._readers or latched):
@@ -123,7 +126,10 @@ class LocalChannel:
         self._last = None
 
     def interrupt(self) -> None:
-        """Report to the subscribers that this writer is disconnected until its next message."""
+        """Report to the subscribers that the publishing node has disconnected.
+
+        The next message ends the disconnection.
+        """
         for reader in self._readers:
             reader.report_end()
 
@@ -138,22 +144,25 @@ class LocalChannel:
 
 
 class LocalBus:
-    """The channels of one process, by the endpoints to which its publishers bind."""
+    """The set of all message channels inside one process.
+
+    endpoints: endpoints to which the publishers of this process bind. Each has one channel.
+    """
 
     def __init__(self, endpoints: Iterable[str]) -> None:
         self._channels = {endpoint: LocalChannel() for endpoint in endpoints}
 
     def find(self, endpoints: Sequence[str]) -> LocalChannel | None:
-        """Return the channel of the first endpoint that has a channel, or None."""
+        """Return the channel of the first endpoint that has a channel, or None if there is none."""
         return next((self._channels[one] for one in endpoints if one in self._channels), None)
 
 
 class LocalConnection:
-    """A connection of a subscriber to the writers in its own process.
+    """A connection of a subscriber to publishers in its own process.
 
-    writers: names that these writers may have; None: any name.
-    max_waiting: maximum number of messages in the queue. A full queue drops the newest message, as
-        a socket does, and the subscriber counts it as lost.
+    writers: names of the nodes whose messages are accepted; None: any node.
+    max_waiting: maximum number of messages in the queue. A full queue drops the newest message, and
+        the subscriber counts it as lost.
     """
 
     def __init__(
@@ -181,14 +190,17 @@ class LocalConnection:
             channel.add(self)
 
     def close(self) -> None:
-        """Stop receiving messages, and discard those in the queue."""
+        """Stop receiving messages, and discard the messages in the queue."""
         for channel in self._channels:
             channel.remove(self)
         self._waiting.clear()
         self._loop = None
 
     def put(self, envelope: LocalEnvelope) -> None:
-        """Queue a message and schedule its delivery."""
+        """Add a message to the queue, and schedule its delivery.
+
+        If the queue is full, the message is dropped.
+        """
         if len(self._waiting) < self._max_waiting:
             self._waiting.append(envelope)
         if not self._scheduled and self._loop is not None:
@@ -196,12 +208,12 @@ class LocalConnection:
             self._loop.call_soon(self._read)
 
     def report_end(self) -> None:
-        """Call `on_disconnected` after all queued messages have been delivered."""
+        """Schedule a call of `on_disconnected` after all queued messages have been delivered."""
         if self._receiver.on_disconnected is not None and self._loop is not None:
             self._loop.call_soon(self._receiver.on_disconnected)
 
     def _read(self) -> None:
-        """Deliver the messages that are in the queue when this callback begins."""
+        """Deliver the messages that are in the queue at the start of this call."""
         self._scheduled = False
         waiting, accept = self._waiting, self._receiver.accept_header
         if len(waiting) == 1:

@@ -1,4 +1,4 @@
-"""Define the marker's calibration file, which `flexsheet calibrate marker` writes."""
+"""Define the file with the marker's position on the finger (`flexsheet calibrate marker`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Triple = tuple[float, float, float]
 
 
 class MarkerCalibration(Part):
-    """The position of the marker on a finger, with its uncertainty."""
+    """The calibrated position of the marker on a finger, with its uncertainty."""
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
@@ -46,7 +46,10 @@ class MarkerCalibration(Part):
 
 
 def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
-    """Raise CalibrationMismatchError if the marker was calibrated in another scene."""
+    """Check that a marker calibration belongs to the scene.
+
+    Raises CalibrationMismatchError if the marker was calibrated in another scene.
+    """
     if calibration.scene != scene.name:
         raise CalibrationMismatchError(
             f'scene: the marker was calibrated in the scene "{calibration.scene}", not in '
@@ -57,11 +60,19 @@ def refuse_other_marker(calibration: MarkerCalibration, scene: Scene) -> None:
 def save_marker_calibration(
     calibration: MarkerCalibration, path: Path, *, comment: str = ""
 ) -> None:
-    """Write a marker calibration to a file. Raises FileWriteError if it cannot be written."""
+    """Write a marker calibration to a YAML file.
+
+    comment: comment line at the start of the file; empty for none.
+
+    Raises FileWriteError if the file cannot be written.
+    """
     title = f"Calibration of a finger's marker, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_marker_calibration(path: Path) -> MarkerCalibration:
-    """Read a marker calibration from a file. Raises CalibrationFileError if it is invalid."""
+    """Read a marker calibration from a YAML file.
+
+    Raises CalibrationFileError if the file is invalid.
+    """
     return read_calibration(MarkerCalibration, path, command="flexsheet calibrate marker")

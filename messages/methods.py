@@ -1,8 +1,8 @@
-"""Define the method families of the nodes, and the choice of methods in a scene.
+"""Define the names of the methods between which nodes can choose.
 
-A method family is a set of interchangeable methods for one task (`nodes/methods.py`). This module
-defines their names. `flexsheet tune SCENE` writes the key `methods` of a scene. A node uses these
-methods if its parameter has the value `auto`. Any other value overrides the scene's choice.
+A method family is a set of interchangeable methods for one task (`nodes/methods.py`). The command
+`flexsheet tune SCENE` writes the best methods to the key `methods` of a scene. A node uses these
+methods if its parameter has the value `auto`. Any other value of the parameter overrides the scene.
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ class SoftBodyChoice(BaseModel):
 
 
 class Methods(BaseModel):
-    """The method that a scene chooses from each method family; None: the node's default."""
+    """The methods that a scene chooses for the nodes, one for each task.
+
+    None means that the node uses its default method.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -51,8 +54,8 @@ class Methods(BaseModel):
 def resolve_method(parameter: T | Literal["auto"], by_scene: T | None, default: T) -> T:
     """Return the method that a node uses.
 
-    parameter: value of the node's parameter; "auto" means the scene's choice. by_scene: choice of
-        the scene; None means `default`.
+    parameter: value of the node's parameter; "auto" selects the scene's choice.
+    by_scene: choice of the scene; None selects `default`.
     """
     if parameter != "auto":
         return parameter

@@ -1,13 +1,13 @@
-"""Migrate messages from bags that were recorded before a message type changed.
+"""Convert messages from bags that were recorded before a message type changed.
 
-Every bag contains the JSON Schemas of its messages. Recorded fields remain valid if a type only
+Every bag contains the JSON Schemas of its messages. Recorded fields remain valid if a type has only
 gained fields with defaults, literal values, or members of a union. `is_compatible` checks this by
 comparing the two schemas.
 
 A renamed field needs a line in `RENAMED_FIELDS`, a renamed literal value in `RENAMED_VALUES`, and a
 removed field in `REMOVED_FIELDS`. These lines apply to every recorded version of the type. Any
-other change needs a line in `MIGRATIONS`: the type, its former fingerprint (`flexsheet bag info
---json`), and a function that converts the recorded fields to those of the next version.
+other change needs a line in `MIGRATIONS`. It contains the type, its former fingerprint (`flexsheet
+bag info --json`), and a function that converts the recorded fields to the next version.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ Schema = Mapping[str, Any]
 
 
 RENAMED_TOPICS: dict[str, str] = {"moment": "bookmark"}
-"""The current names of renamed topics, by former name."""
+"""The current names of topics that have been renamed, by former name."""
 
 RENAMED_TYPES: dict[str, str] = {"Moment": "Bookmark"}
-"""The current names of renamed message types, by former name."""
+"""The current names of message types that have been renamed, by former name."""
 
 RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "Fingertip": {
@@ -57,7 +57,7 @@ RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "SoftBody": {"lead_s": "prediction_horizon_s"},
     "TwinEye": {"proper": "expected"},
 }
-"""The current names of renamed fields, by model and former name."""
+"""The current names of message fields that have been renamed, by message type and former name."""
 
 RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Fingertip", "reason"): {
@@ -78,7 +78,10 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     },
     ("Methods", "sheet_force"): {"cubic": "scaled", "linear": "scaled"},
 }
-"""The current names of renamed literal values, by model, current field name and former value."""
+"""The current names of literal values that have been renamed.
+
+The keys are the message type with the current field name, and the former value.
+"""
 
 SHEET_REASONS = {
     "": "ok",
@@ -93,7 +96,7 @@ SHEET_REASONS = {
     "sheet turned too far about its normal; lift the finger": "beyond_spin",
     "hollow place: the flat sheet rests on its rim": "concave_contact",
 }
-"""The current literals for former texts of `SheetTarget.reason`."""
+"""The current values of `SheetTarget.reason`, by the text that old bags contain instead."""
 
 
 def _convert_sheet_reason(recorded: str) -> str:
@@ -109,19 +112,22 @@ def _convert_sheet_reason(recorded: str) -> str:
 TEXTS_TO_LITERALS: dict[tuple[str, str], Callable[[str], str]] = {
     ("SheetTarget", "reason"): _convert_sheet_reason,
 }
-"""The functions that convert a former text to a current literal, by model and field name."""
+"""The functions that convert a text in an old bag to a current literal value.
+
+The keys are the message type and the name of the field.
+"""
 
 REMOVED_FIELDS: dict[str, frozenset[str]] = {
     "FingerTruth": frozenset({"hand_damping_ns_per_m"}),
     "Methods": frozenset({"kinematics", "triangulation"}),
 }
-"""The names of removed fields, by model."""
+"""The names of message fields that have been removed, by message type."""
 
 _STROKE_LABEL = re.compile(r"stroke (\d+(?:\.\d+)?) s")
 
 
 def _add_stroke_duration(fields: Fields) -> Fields:
-    """Add the duration of a stroke, which old messages contain only in the path's label."""
+    """Add the field `path_stroke_s`, which old messages contain only as text in `path_label`."""
     found = _STROKE_LABEL.fullmatch(fields["path_label"])
     return {**fields, "path_stroke_s": None if found is None else float(found[1])}
 
@@ -138,7 +144,9 @@ _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf
 def find_migration(
     message_type: type[Message], fingerprint: str, recorded_schema: Schema
 ) -> Migration | None:
-    """Return the function that converts recorded fields to the current type, or None.
+    """Return a function that converts recorded fields to the current message type.
+
+    Return None if the recorded fields cannot be converted.
 
     fingerprint: hexadecimal fingerprint of the recorded type.
     recorded_schema: JSON Schema of the recorded type.
@@ -155,7 +163,7 @@ def find_migration(
 
 
 def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
-    """Replace former names in a recorded schema by current names."""
+    """Return a recorded JSON Schema with former names replaced by current names."""
     parts = recorded.get("$defs", {})
     if not isinstance(parts, Mapping):
         return recorded
@@ -164,7 +172,7 @@ def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
 
 
 def _literal_schema(model: str, recorded: Schema, current: Schema) -> Schema:
-    """Replace text fields in a recorded schema by the literals that have replaced their texts."""
+    """Return a recorded JSON Schema in which text fields that became literals have the new type."""
     properties = recorded.get("properties")
     if not isinstance(properties, Mapping):
         return recorded
@@ -181,7 +189,7 @@ def _is_text(schema: Any) -> bool:
 
 
 def _rename_part(model: str, schema: Any) -> Any:
-    """Replace former property names and literal values in the schema of one model."""
+    """Return the schema of one model with current field names and literal values."""
     if not isinstance(schema, Mapping) or not isinstance(schema.get("properties"), Mapping):
         return schema
     names, removed = RENAMED_FIELDS.get(model, {}), REMOVED_FIELDS.get(model, frozenset())
@@ -197,7 +205,7 @@ def _rename_part(model: str, schema: Any) -> Any:
 
 
 def _rename_values(schema: Any, values: Mapping[str, str]) -> Any:
-    """Replace former literal values in a field's schema, including those in its options."""
+    """Replace former literal values in the schema of a field, including those inside a union."""
     if not values or not isinstance(schema, Mapping):
         return schema
     renamed = dict(schema)
@@ -211,9 +219,9 @@ def _rename_values(schema: Any, values: Mapping[str, str]) -> Any:
 
 
 def rename_fields(model: type[BaseModel], fields: Fields) -> Fields:
-    """Rename the recorded fields of a model and of its nested models to current names.
+    """Rename the recorded fields of a model and of its nested models to their current names.
 
-    Calibration files contain the fields of a calibration and are converted by this function, too.
+    The function also converts calibration files, because they contain the fields of a model.
     """
     names = RENAMED_FIELDS.get(model.__name__, {})
     renamed: Fields = {}
@@ -236,7 +244,7 @@ def rename_fields(model: type[BaseModel], fields: Fields) -> Fields:
 
 
 def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
-    """Rename the recorded fields of a part, or of each part in a list, to current names."""
+    """Rename the recorded fields of a nested model, or of each model in a list."""
     if model is not None and isinstance(value, dict):
         return rename_fields(model, value)
     if model is not None and isinstance(value, list):
@@ -245,20 +253,20 @@ def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the only model that an annotation allows, or None if it allows none or several."""
+    """Return the model class in an annotation, or None unless it contains exactly one."""
     options = [annotation, *get_args(annotation)]
     models = [one for one in options if isinstance(one, type) and issubclass(one, BaseModel)]
     return models[0] if len(models) == 1 else None
 
 
 def is_compatible(recorded: Schema, current: Schema) -> bool:
-    """Return whether all values that the recorded schema allows are valid in the current one."""
+    """Return whether all values that a recorded schema allows are valid in the current schema."""
     try:
         return _Comparison(recorded.get("$defs", {}), current.get("$defs", {})).is_compatible(
             recorded, current
         )
     except (KeyError, TypeError, AttributeError, RecursionError):
-        return False  # The schema is damaged: not a JSON Schema, or without end.
+        return False  # The schema is not a valid JSON Schema, or contains itself.
 
 
 def _unchanged(fields: Fields) -> Fields:
@@ -307,7 +315,10 @@ class _Comparison:
 
 
 def _resolve(schema: Any, parts: Schema) -> Any:
-    """Follow the references in a schema to the schema they name. Raises TypeError for a cycle."""
+    """Replace a reference in a JSON Schema by the schema that it names.
+
+    Raises TypeError for a cycle of references.
+    """
     for _ in range(len(parts) + 1):
         if not (isinstance(schema, Mapping) and "$ref" in schema):
             return schema

@@ -1,4 +1,4 @@
-"""Define the phrases that nodes report, and their remedies, which `flexsheet explain` prints."""
+"""Define the problems that nodes report, with the remedies that `flexsheet explain` prints."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row 
 
 
 class NodeNote(Enum):
-    """The notes, reasons and warnings of nodes that require an action of the user.
+    """The problems that nodes report and that require an action of the user.
 
-    phrase: constant part of the reported text. remedy: what the user can do.
+    phrase: constant part of the reported text.
+    remedy: text that states what the user can do.
     """
 
     COMPUTER_BUSY = (
@@ -182,7 +183,7 @@ class NodeNote(Enum):
 
     @property
     def code(self) -> str:
-        """Return the name of the note for `flexsheet explain`."""
+        """Return the name of the problem for the command `flexsheet explain`."""
         return self.name.lower().replace("_", "-")
 
 
@@ -202,7 +203,7 @@ SHEET_REASON_TEXTS: dict[SheetReason, str] = {
     "past_sheet_height": "the finger is past the sheet's usable height",
     "concave_contact": "the object is concave there, and the flat sheet touches its rim",
 }
-"""The texts of the console for `reason` of the topic `sheet_target`."""
+"""The texts that the console displays for each `reason` in the topic `sheet_target`."""
 
 SHEET_REASON_REMEDIES: dict[SheetReason, str] = {
     "fingertip_invalid": "`flexsheet topic echo fingertip --field reason` prints the reason.",
@@ -219,7 +220,7 @@ SHEET_REASON_REMEDIES: dict[SheetReason, str] = {
     "past_sheet_height": "Move the finger towards the middle of the sheet.",
     "concave_contact": "Touch the object beside the hollow: a flat sheet cannot enter it.",
 }
-"""The remedies for each `reason` of the topic `sheet_target`, except "ok"."""
+"""The remedy for each `reason` in the topic `sheet_target`, except "ok"."""
 
 
 FINGERTIP_REMEDIES: dict[FingertipReason, str] = {
@@ -234,7 +235,7 @@ FINGERTIP_REMEDIES: dict[FingertipReason, str] = {
     "too_fast": "A jump faster than a finger is usually a reflection: cover it.",
     "unconfirmed": "Wait: a new marker is accepted after a few images.",
 }
-"""The remedies for each `reason` of the topic `fingertip`, except "ok"."""
+"""The remedy for each `reason` in the topic `fingertip`, except "ok"."""
 
 SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
     "camera_moved": "the stereo camera is not where the scene says",
@@ -250,7 +251,7 @@ SELF_CHECK_FINDINGS: dict[SuspectedCause, str] = {
     "says",
     "display_latency": "projected images appear later than assumed",
 }
-"""The descriptions of the causes that a self-check of a node suspects."""
+"""The description of each cause that a node can suspect for a deviation from expected values."""
 
 SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "camera_moved": "Fasten the camera, and calibrate its pose again (docs/set-up-camera.md).",
@@ -271,7 +272,7 @@ SELF_CHECK_REMEDIES: dict[SuspectedCause, str] = {
     "apart, or calibrate both again.",
     "display_latency": "Set `display_latency_s` of the renderer to the measured latency.",
 }
-"""The remedies for the causes that a self-check of a node suspects."""
+"""The remedy for each cause that a node can suspect for a deviation from expected values."""
 
 _SHOWN_UNITS = {
     "m": ("mm", 1e3),
@@ -283,7 +284,7 @@ _SHOWN_UNITS = {
 
 
 def describe_self_check(check: SelfCheck) -> str:
-    """Describe a suspected cause with the measured and the expected value."""
+    """Describe the suspected cause of a deviation, with the measured and the expected value."""
     unit, scale = _SHOWN_UNITS[check.unit]
     subject = f"{check.subject}: " if check.subject else ""
     return (

@@ -1,8 +1,8 @@
 """Define the scene: object, devices, working range and tolerances.
 
-Scene files (`launch/scenes/*.yaml`) contain these fields. Units are metres, radians and pascals.
-The world frame has its origin at the centre of the imaginary screen, x to the right, y up, and z
-towards the user.
+Scene files (`launch/scenes/*.yaml`) contain the fields that this module defines. Units are metres,
+radians and pascals. The world frame has its origin at the centre of the imaginary screen, with x to
+the right, y up, and z towards the user.
 """
 
 from __future__ import annotations
@@ -23,23 +23,29 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Small = Annotated[float, Field(ge=-0.5, le=0.5)]
-"""A relative deviation or a small angle. A larger magnitude indicates a mistake in the file."""
+"""A relative deviation, a length (m) or an angle (rad) of at most 0.5.
+
+A larger magnitude indicates a mistake in the file.
+"""
 
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 SmallSix = tuple[Small, Small, Small, Small, Small, Small]
 
 MAX_AXIS_ERROR = 1e-6
-"""The maximum deviation of the length of a joint axis vector from 1."""
+"""The maximum difference between the length of a joint axis vector and 1."""
 
 
 class Part(MessagePart, LimitedModel):
-    """The base class of the parts of scenes and calibrations. It limits each number by its unit."""
+    """The base class of the parts of scenes and calibrations.
+
+    Each number has a limit that depends on its unit.
+    """
 
 
 class Pose(Part):
-    """The pose of a frame in its parent frame.
+    """The position (m) and orientation of a frame in its parent frame.
 
-    Roll, pitch and yaw are rotations about the fixed x, y and z axes, in this order.
+    Roll, pitch and yaw (rad) are rotations about the fixed x, y and z axes, applied in this order.
     """
 
     position_m: Vector3
@@ -47,7 +53,7 @@ class Pose(Part):
 
 
 class Material(Part):
-    """The linear elastic constants of the soft object."""
+    """The linear elastic constants of a soft object."""
 
     young_modulus_pa: Positive
     poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)]
@@ -65,14 +71,14 @@ class Cylinder(Part):
 
 
 class Sphere(Part):
-    """A solid sphere about the origin of the object frame."""
+    """A solid sphere centred on the origin of the object frame."""
 
     shape: Literal["sphere"] = "sphere"
     radius_m: Positive
 
 
 class Ellipsoid(Part):
-    """A solid ellipsoid about the origin of the object frame."""
+    """A solid ellipsoid centred on the origin of the object frame."""
 
     shape: Literal["ellipsoid"] = "ellipsoid"
     semi_axes_m: tuple[Positive, Positive, Positive] = Field(
@@ -81,7 +87,10 @@ class Ellipsoid(Part):
 
 
 class Plane(Part):
-    """A half-space below z = 0 of the object frame. A rectangle at the origin can be touched."""
+    """A solid half-space below the plane z = 0. The user can touch a rectangle at the origin.
+
+    The plane is in the object frame. The rectangle is centred on the origin.
+    """
 
     shape: Literal["plane"] = "plane"
     width_m: Positive = Field(description="size along x")
@@ -108,10 +117,10 @@ class RoundedBox(Part):
 
 
 class Mesh(Part):
-    """A smooth solid that approximates a closed triangle mesh.
+    """A solid with a smooth surface that approximates a closed triangle mesh.
 
-    The scene message contains the whole mesh, so all nodes on all hosts use the same mesh. A scene
-    file names the mesh's file with `shape: mesh_file`.
+    The scene message contains the whole mesh, so all nodes on all hosts use the same mesh. In a
+    scene file, `shape: mesh_file` and the name of a mesh file replace the vertices and triangles.
     """
 
     shape: Literal["mesh"] = "mesh"
@@ -127,7 +136,7 @@ Geometry = Annotated[
 
 
 class StripSupport(Part):
-    """A support that fixes the surface of a soft object where it faces away from the user."""
+    """A support that fixes the part of a soft object's surface that faces away from the user."""
 
     kind: Literal["strip"] = "strip"
     angle_rad: Positive = Field(
@@ -137,7 +146,7 @@ class StripSupport(Part):
 
 
 class BaseSupport(Part):
-    """A support that fixes the lowest part of the surface, as a table under the object does."""
+    """A support that fixes the lowest part of a soft object's surface, as a table does."""
 
     kind: Literal["base"] = "base"
     height_m: Positive = Field(
@@ -157,7 +166,7 @@ class BaseSupport(Part):
 
 
 class SpherePatchSupport(Part):
-    """A support that fixes the surface within a sphere, as a clamp does."""
+    """A support that fixes the part of a soft object's surface inside a sphere, as a clamp does."""
 
     kind: Literal["sphere_patch"] = "sphere_patch"
     centre_m: Vector3 = Field(description="centre of the sphere in the object frame")
@@ -165,7 +174,10 @@ class SpherePatchSupport(Part):
 
 
 class BoxPatchSupport(Part):
-    """A support that fixes the surface within a box along the axes of the object frame."""
+    """A support that fixes the part of a soft object's surface inside a box.
+
+    The edges of the box are parallel to the axes of the object frame.
+    """
 
     kind: Literal["box_patch"] = "box_patch"
     min_m: Vector3 = Field(description="lower corner of the box in the object frame")
@@ -185,10 +197,10 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 class Appearance(Part):
-    """The colour and texture of the object. The texture moves with the surface, and so shows its
-    strain.
+    """The colour and the texture of the virtual object.
 
-    `texture: image` needs an image, whose file a scene file names as `image_file`.
+    The texture moves with the surface and therefore shows its strain. The value `texture: image`
+    requires an image. A scene file gives the name of the image file as `image_file`.
     """
 
     colour: tuple[Fraction, Fraction, Fraction] = Field(
@@ -213,9 +225,9 @@ class Appearance(Part):
 
 
 class VirtualObject(Part):
-    """The virtual object, which is rigid if it has no material.
+    """The virtual object that the user touches. An object without a material is rigid.
 
-    In a scene file, `support_angle_rad: x` is short for `support: {kind: strip, angle_rad: x}`.
+    In a scene file, `support_angle_rad: x` stands for `support: {kind: strip, angle_rad: x}`.
     """
 
     geometry: Geometry
@@ -252,9 +264,9 @@ class VirtualObject(Part):
 
     @property
     def support_angle_rad(self) -> float:
-        """Return the angle (rad) of the fixed strip.
+        """Return the angle (rad) of a strip support.
 
-        Raises UnfitGeometryError for another support.
+        Raises UnfitGeometryError if the object has another kind of support.
         """
         if not isinstance(self.support, StripSupport):
             raise UnfitGeometryError(
@@ -265,7 +277,10 @@ class VirtualObject(Part):
 
 
 class SheetSpec(Part):
-    """The rubber sheet, clamped at its left and right edges (x) and free at top and bottom (y)."""
+    """The rubber sheet, clamped at its left and right edges and free at its top and bottom edges.
+
+    The x axis points from the left to the right edge, and the y axis along the edges.
+    """
 
     width_m: Positive = Field(
         description="distance between the clamped edges when the sheet is unstretched"
@@ -290,7 +305,7 @@ class SheetSpec(Part):
 
 
 class ArmModel(Part):
-    """The base class of the models of a 6-axis arm: its name and the limits of its joints."""
+    """The base class of models of a 6-axis arm, with the arm's name and joint limits."""
 
     name: str
     min_rad: Six = Field(description="lower end of each joint's range")
@@ -319,7 +334,7 @@ class ArmModel(Part):
 
 
 class JointChain(ArmModel):
-    """An arm that is a chain of six rotary joints, as read from a URDF file."""
+    """A model of an arm as a chain of six rotary joints, such as one read from a URDF file."""
 
     kind: Literal["joint_chain"] = "joint_chain"
     origins: tuple[Pose, Pose, Pose, Pose, Pose, Pose] = Field(
@@ -340,10 +355,10 @@ class JointChain(ArmModel):
 
 
 class ClosedFormArm(ArmModel):
-    """An arm with the axes z, y, y, z, y, z, of which the last three intersect in one point.
+    """A model of an arm whose inverse kinematics have a closed-form solution.
 
-    At joint angles of zero, the arm is upright, and every frame is parallel to the base. The
-    inverse kinematics are a formula.
+    The joint axes are z, y, y, z, y, z. The last three axes intersect in one point. At joint angles
+    of zero, the arm is upright, and every frame is parallel to the base frame.
     """
 
     kind: Literal["closed_form"] = "closed_form"
@@ -356,7 +371,7 @@ class ClosedFormArm(ArmModel):
     flange_m: Positive = Field(description="distance from the wrist centre to the flange")
 
     def chain(self) -> JointChain:
-        """Convert the dimensions of this arm to a chain of joints."""
+        """Convert this model to a general chain of six joints with the same kinematics."""
         offsets = (
             (0.0, 0.0, 0.0),
             (0.0, 0.0, self.shoulder_height_m),
@@ -390,7 +405,7 @@ RV_1A = ClosedFormArm(
     speed_rad_per_s=_radians(180, 90, 135, 180, 180, 210),
     start_rad=_radians(0, 25, 119, 0, -54, 0),
 )
-"""The Mitsubishi RV-1A.
+"""The model of the Mitsubishi RV-1A arm.
 
 Source: two public models (Adolphus `mitsubishirv1a.yaml`, ICube `mrv1a.urdf`).
 """
@@ -407,20 +422,22 @@ RV_2FR = ClosedFormArm(
     speed_rad_per_s=_radians(300, 150, 300, 450, 450, 720),
     start_rad=_radians(0, 10, 115, 0, -35, 0),
 )
-"""The Mitsubishi RV-2FR, from the manufacturer's public model (`melfa_description`).
+"""The model of the Mitsubishi RV-2FR arm.
 
-The elbow is shifted backwards, as in the RV-1A. Only then does the maximum reach of the wrist
-centre equal the 504 mm of the data sheet.
+Source: the manufacturer's public model (`melfa_description`). The elbow is shifted backwards, as in
+the RV-1A. Without this shift, the maximum reach of the wrist centre would differ from the 504 mm of
+the data sheet.
 """
 
 ARM_MODELS = {arm.name: arm for arm in (RV_1A, RV_2FR)}
-"""The known arm models, which a scene may select by name."""
+"""The arm models that a scene file may select by name."""
 
 
 class ArmSpec(Part):
     """A robot arm: its model, the pose of its base, and the pose of the sheet's edge on its flange.
 
-    Sheet frame: x from the left to the right edge, y along the edges, z towards the user.
+    In the sheet frame, x points from the left to the right edge, y along the edges, and z towards
+    the user.
     """
 
     model: Annotated[ClosedFormArm | JointChain, Field(discriminator="kind")] = Field(
@@ -454,7 +471,7 @@ class ArmSpec(Part):
 
 
 class Arms(Part):
-    """The two robot arms and their common limits."""
+    """The two robot arms and the limits that they have in common."""
 
     left: ArmSpec
     right: ArmSpec
@@ -467,7 +484,10 @@ class Arms(Part):
 
 
 class Lens(Part):
-    """A pinhole camera with Brown's distortion (k1, k2, p1, p2, k3), as defined by OpenCV."""
+    """The parameters of a pinhole camera with Brown's lens distortion (k1, k2, p1, p2, k3).
+
+    OpenCV defines these parameters.
+    """
 
     fx_px: Positive
     fy_px: Positive
@@ -477,7 +497,10 @@ class Lens(Part):
 
 
 class StereoCamera(Part):
-    """The stereo camera. Both camera frames have x right, y down and z along the optical axis."""
+    """The parameters of the stereo camera. Each camera frame has x to the right, y down, z ahead.
+
+    The z axis is the optical axis of the camera.
+    """
 
     device: str
     width_px: Annotated[int, Field(gt=0)]
@@ -503,9 +526,9 @@ class StereoCamera(Part):
 
 
 class Projector(Part):
-    """The projector, which has the lens model of a camera.
+    """The parameters of the projector, which has the same lens model as a camera.
 
-    The z axis points along the projection.
+    The z axis of the projector frame points in the direction of projection.
     """
 
     width_px: Annotated[int, Field(gt=0)]
@@ -521,9 +544,9 @@ class Projector(Part):
 
 
 class Eyes(Part):
-    """The midpoint between the user's eyes.
+    """The positions of the user's eyes.
 
-    Each eye is half the interocular distance away along x.
+    The eyes are at equal distances from their midpoint along the x axis of the world.
     """
 
     centre_world_m: Vector3
@@ -535,11 +558,11 @@ FingerLengths = tuple[FingerLength, FingerLength, FingerLength]
 
 
 class Finger(Part):
-    """The user's finger, its marker and its limits.
+    """The user's finger, its marker, and the limits of its motion.
 
-    The finger's frame has its origin at the contact point of the fingertip's pad, x along
-    `direction_world`, z out of the nail, and a horizontal y. Its direction in the world is
-    constant.
+    The finger frame has its origin at the contact point of the fingertip's pad. The x axis points
+    along `direction_world`, the z axis out of the nail, and the y axis is horizontal. The
+    orientation of the finger frame in the world is constant.
     """
 
     radius_m: Positive
@@ -569,7 +592,10 @@ class Finger(Part):
 
 
 class WorkingRange(Part):
-    """The range of the user's finger motion for which limits and charts are computed."""
+    """The range of finger motions that the display must support.
+
+    Limits and method comparisons are computed for this range.
+    """
 
     push_depth_m: Positive
     tilt_rad: Positive
@@ -577,7 +603,10 @@ class WorkingRange(Part):
 
 
 class Tolerances(Part):
-    """The maximum permitted errors. Each method family is tuned to meet one of these errors."""
+    """The maximum permitted errors of the display.
+
+    For each task, nodes can choose a method that meets the corresponding tolerance.
+    """
 
     image_m: Positive = Field(description="displacement of the image as seen from the eye")
     fingertip_m: Positive
@@ -597,7 +626,7 @@ class Tolerances(Part):
 
 
 class Scene(Message):
-    """The scene that all nodes of a graph share: object, devices, working range and tolerances."""
+    """The scene that all nodes use: object, devices, working range and tolerances."""
 
     name: str
     object: VirtualObject
@@ -616,7 +645,7 @@ class Scene(Message):
 
 
 class UnfitGeometryError(FlexsheetError, ValueError):
-    """Raised for an object shape that a command or method does not support."""
+    """Raised if a command or method does not work with the object's shape or support."""
 
     code = "unfit-geometry"
     exit_code = 2
@@ -624,7 +653,7 @@ class UnfitGeometryError(FlexsheetError, ValueError):
 
 
 def require_cylinder(scene: Scene) -> Cylinder:
-    """Return the scene's cylinder.
+    """Return the geometry of the scene's object, which must be a cylinder.
 
     Raises UnfitGeometryError if the object has a different shape.
     """
@@ -637,7 +666,7 @@ def require_cylinder(scene: Scene) -> Cylinder:
 
 
 class MissingPartError(FlexsheetError, ValueError):
-    """Raised if a scene does not contain a required part."""
+    """Raised if a scene does not contain a part that a node or command requires."""
 
     code = "missing-part"
     remedy = "Add the part to the scene file, or leave out the node or command that needs it."
@@ -651,7 +680,10 @@ def require_projector(scene: Scene) -> Projector:
 
 
 def shows_check_marks(scene: Scene) -> bool:
-    """Return whether the projector shows marks with which the stereo camera checks calibrations."""
+    """Return whether the projector projects check marks onto the sheet.
+
+    The stereo camera uses these marks to check the calibrations.
+    """
     return scene.projector is not None and bool(scene.projector.check_marks_sheet_m)
 
 
@@ -665,7 +697,10 @@ def require_material(scene: Scene) -> Material:
 
 
 def require_support(scene: Scene) -> Support:
-    """Return the fixed part of the object's surface. Raises MissingPartError if there is none."""
+    """Return the support that fixes a part of the object's surface.
+
+    Raises MissingPartError if the object has no support.
+    """
     if scene.object.support is None:
         raise MissingPartError(
             f'scene "{scene.name}": the key `object.support` is missing; a soft object needs it'

@@ -1,12 +1,12 @@
 """Authenticate hosts by CURVE keys.
 
 Every host has one CURVE key pair. The secret key is in a file that only its owner may read. The
-    public keys of all hosts are in the launch file. A bound socket accepts only hosts of the plan:
-    ZeroMQ asks for this decision by its authentication protocol (ZAP), in the event loop. A
-    connecting socket requires the key of one host. Each end of a connection therefore knows the
-    host of the other end.
+launch file contains the public keys of all hosts. A bound socket accepts only connections from
+hosts in the launch file. ZeroMQ asks for this decision by its authentication protocol (ZAP), in the
+event loop. A connecting socket requires the key of one host. Each end of a connection therefore
+knows the host at the other end.
 
-Keys are written as 40 characters in Z85.
+Keys are written as 40 characters in the encoding Z85.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ RefusalHandler = Callable[[str], None]
 
 
 class SecurityError(FlexsheetError, RuntimeError):
-    """Raised for an invalid or missing key. The text names the file or host, and the remedy."""
+    """Raised if a key is invalid or missing. The text names the file or host, and the remedy."""
 
     code = "keys"
     remedy = (
@@ -48,7 +48,10 @@ class SecurityError(FlexsheetError, RuntimeError):
 
 
 def make_key_pair() -> tuple[str, str]:
-    """Return a new (public, secret) key pair; the public key does not begin with a hyphen."""
+    """Return a new pair of keys as (public, secret).
+
+    The public key does not begin with a hyphen, so it can be an argument of a command.
+    """
     while True:
         public, secret = zmq.curve_keypair()
         if not public.startswith(b"-"):
@@ -72,7 +75,9 @@ def is_key(text: str) -> bool:
 def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
     """Write a secret key to a file that only its owner can read.
 
-    replace: whether an existing file is replaced. If it is false, SecurityError is raised instead.
+    replace: whether an existing file is replaced.
+
+    Raises SecurityError if the file cannot be written, or if it exists and `replace` is false.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     part = path.with_suffix(".part")
@@ -134,10 +139,10 @@ def read_secret(path: Path) -> str:
 
 @dataclass(frozen=True, slots=True)
 class KeyChange:
-    """The hosts whose keys a reload of the key ring has changed.
+    """The result of a reload of the key ring: the hosts whose keys have changed.
 
-    own: whether the key of this host has changed. hosts: names of the other hosts with changed
-        keys.
+    own: whether the key of this host has changed.
+    hosts: names of the other hosts with changed keys.
     """
 
     own: bool
@@ -149,7 +154,7 @@ class KeyRing:
 
     file: JSON file with {"host", "secret_file", "public": {host: key}}, written by `write_ring`.
 
-    Raises SecurityError if the files are invalid.
+    Raises SecurityError if the JSON file or the file with the secret key is invalid.
     """
 
     def __init__(self, file: Path) -> None:
@@ -170,13 +175,14 @@ class KeyRing:
         return key
 
     def find_host(self, key: str) -> str | None:
-        """Return the host that has a public key, or None if no host has this key."""
+        """Return the name of the host with a public key, or None if no host has this key."""
         return self._host_by_key.get(key)
 
     def reload(self) -> KeyChange | None:
-        """Read the files again if they have changed. Return the changes, or None if there are none.
+        """Read the key files again, and return the changes.
 
-        Raises SecurityError for invalid files; the keys then remain unchanged.
+        Return None if the files have not changed. Raises SecurityError if a file is invalid. In
+        this case, the keys in memory remain unchanged.
         """
         try:
             ring = json.loads(self._file.read_text())
@@ -207,10 +213,11 @@ class KeyRing:
         return change
 
     def set_server_keys(self, opened: zmq.Socket[bytes], domain: bytes) -> None:
-        """Require that peers of a socket have a key of this ring, for endpoints that are bound
-        later.
+        """Set the keys of a server socket, so that its peers must have a key of this ring.
 
-        domain: ZAP domain of the socket, from `ZapAuthenticator.register`.
+        This applies to all endpoints that are bound after this call.
+
+        domain: ZAP domain of the socket, which `ZapAuthenticator.register` returned.
         """
         opened.setsockopt(zmq.CURVE_SERVER, 1)
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
@@ -219,7 +226,11 @@ class KeyRing:
         opened.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
 
     def set_client_keys(self, opened: zmq.Socket[bytes], host: str) -> None:
-        """Require that endpoints that are connected later have the key of a host."""
+        """Set the keys of a client socket, so that the server must have the key of a host.
+
+        This applies to all endpoints that are connected after this call. Raises SecurityError if
+        the host has no key.
+        """
         opened.setsockopt(zmq.CURVE_SERVERKEY, self.get_public_key(host).encode())
         opened.setsockopt(zmq.CURVE_PUBLICKEY, self.public_key.encode())
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
@@ -232,9 +243,10 @@ def write_ring(file: Path, *, host: str, secret_file: Path, public: dict[str, st
 
 
 class ZapAuthenticator:
-    """A handler of ZeroMQ's authentication requests (ZAP), which all sockets of a process share.
+    """A handler of ZeroMQ's authentication requests (ZAP) for all sockets of a process.
 
-    Each bound socket has its own ZAP domain, with a key ring and a function that reports refusals.
+    Each bound socket has its own ZAP domain, with a key ring and a function that reports refused
+    connections.
     """
 
     _present: ClassVar[ZapAuthenticator | None] = None
@@ -251,7 +263,10 @@ class ZapAuthenticator:
 
     @classmethod
     def register(cls, keys: KeyRing, on_refused: RefusalHandler) -> bytes:
-        """Register a key ring, and return a new ZAP domain for the socket that uses it."""
+        """Register a key ring for a socket, and return the new ZAP domain of the socket.
+
+        on_refused: function that is called with a text for each refused connection.
+        """
         if cls._present is None:
             cls._present = ZapAuthenticator()
         domain = f"flexsheet-{next(cls._numbers)}".encode()
@@ -260,7 +275,7 @@ class ZapAuthenticator:
 
     @classmethod
     def unregister(cls, domain: bytes) -> None:
-        """Remove a ZAP domain. Close the authenticator when no domain is left."""
+        """Remove a ZAP domain. If no domain is left, close the authenticator."""
         if cls._present is None:
             return
         cls._present._domains.pop(domain, None)
@@ -276,7 +291,10 @@ class ZapAuthenticator:
         self._socket.close(linger=0)
 
     def _answer(self) -> None:
-        """Answer all pending requests. This is a callback of the event loop."""
+        """Answer all pending authentication requests.
+
+        This method is a callback of the event loop.
+        """
         while not self._socket.closed:
             try:
                 request = self._socket.recv_multipart(zmq.NOBLOCK)
@@ -285,7 +303,11 @@ class ZapAuthenticator:
             self._socket.send_multipart(self.reply(request))
 
     def reply(self, request: list[bytes]) -> list[bytes]:
-        """Return the reply to a ZAP request: status 200 and the host's name, or status 400."""
+        """Return the reply to an authentication request (ZAP).
+
+        The status is 200, with the name of the host, if the key belongs to a host. Otherwise it is
+        400.
+        """
         version, number, domain, address, _, mechanism, *credentials = request
         keys, on_refused = self._domains.get(domain, (None, lambda _: None))
         host, reason = None, "the peer uses no key"
@@ -301,7 +323,7 @@ class ZapAuthenticator:
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:
-    """Return mtime (ns), inode and size (bytes) of a file, or None if the file does not exist."""
+    """Return modification time (ns), inode and size (bytes) of a file, or None if it is missing."""
     try:
         status = path.stat()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Define the sheet's calibration file, which `flexsheet calibrate sheet` writes."""
+"""Define the calibration file of the rubber sheet (`flexsheet calibrate sheet`)."""
 
 from __future__ import annotations
 
@@ -21,27 +21,30 @@ Axis = Annotated[NDArray[np.float64], ArraySpec("<f8", ("entries",))]
 Entries = Annotated[NDArray[np.float64], ArraySpec("<f8", ("stretches", "depths", "xs", "ys"))]
 
 NOMINAL_RATIO = 0.02
-"""The maximum relative difference between the nominal sizes of a calibration and of the scene."""
+"""The maximum relative difference between the sheet sizes in a calibration and in the scene."""
 
 
 class Fitted(Part):
-    """A fitted value with the standard deviation of its normally distributed error."""
+    """A fitted value and its standard deviation."""
 
     value: NonNegative
     standard_deviation: NonNegative
 
 
 class LeftOutRow(Part):
-    """A measured push that was excluded as an outlier; `line` is its line in the file, from 1."""
+    """A measurement of the sheet's force that was excluded from the fit as an outlier.
+
+    line: line of the measurement in the file, starting at 1.
+    """
 
     line: Annotated[int, Field(ge=1)]
     residual_ratio: float = Field(description="measured force divided by fitted force, minus one")
 
 
 class SheetTable(Part):
-    """A table of the ratio of measured to fitted force.
+    """A table of the measured force on the finger divided by the force of the fitted model.
 
-    It is interpolated linearly over stretch and position, and by cubics over depth.
+    Values are interpolated linearly over stretch and position, and by cubics over depth.
     """
 
     stretch_ratios: Axis = Field(description="edge distance divided by the nominal width")
@@ -52,7 +55,10 @@ class SheetTable(Part):
 
 
 class SheetCalibration(Part):
-    """The calibration of a sheet: fitted parameters of the force model, and the measured range."""
+    """The calibration of a rubber sheet.
+
+    It contains the fitted parameters of the sheet's force model, and the range of the measurements.
+    """
 
     version: Literal[1] = 1
     date: str = Field(description="ISO 8601, UTC")
@@ -92,7 +98,10 @@ class SheetCalibration(Part):
 
 
 def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
-    """Raise CalibrationMismatchError if the calibrated sheet's size differs from the scene's."""
+    """Check that a sheet calibration belongs to the sheet in the scene.
+
+    Raises CalibrationMismatchError if the sizes differ.
+    """
     sizes = (
         ("width_m", calibration.nominal_width_m, sheet.width_m),
         ("height_m", calibration.height_m, sheet.height_m),
@@ -106,11 +115,19 @@ def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
 
 
 def save_sheet_calibration(calibration: SheetCalibration, path: Path, *, comment: str = "") -> None:
-    """Write a sheet calibration to a file. Raises FileWriteError if it cannot be written."""
+    """Write a sheet calibration to a YAML file.
+
+    comment: comment line at the start of the file; empty for none.
+
+    Raises FileWriteError if the file cannot be written.
+    """
     title = f"Calibration of a sheet, {calibration.date}."
     write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_sheet_calibration(path: Path) -> SheetCalibration:
-    """Read a sheet calibration from a file. Raises CalibrationFileError if it is invalid."""
+    """Read a sheet calibration from a YAML file.
+
+    Raises CalibrationFileError if the file is invalid.
+    """
     return read_calibration(SheetCalibration, path, command="flexsheet calibrate sheet")

@@ -1,6 +1,6 @@
-"""Define the table of topics: names, message types, delivery, rates and access.
+"""Define all topics: their names, message types, delivery, rates and access.
 
-Ports, recorder, health checks, command line and documentation use this table.
+Nodes, recorder, health checks, command line and documentation use this table.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from flexsheet.messages.migrations import RENAMED_TOPICS
 
 
 class Delivery(StrEnum):
-    """The kind of delivery of messages to a slow or late subscriber.
+    """The rule by which messages are delivered to a slow or late subscriber.
 
-    latest: only the newest message; older messages are dropped and counted.
-    every: all messages in order through a bounded queue; an overflow is counted as an error.
-    latched: like `every`, and a late subscriber first receives the last message that was sent.
+    latest: only the newest message is delivered. Older messages are dropped and counted.
+    every: all messages are delivered in order through a bounded queue. An overflow is counted as an
+        error.
+    latched: all messages are delivered as with `every`. A late subscriber first receives the last
+        message that was sent.
     """
 
     LATEST = "latest"
@@ -30,13 +32,13 @@ class Delivery(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic, which is one row of the table of topics.
+    """A topic: a named stream of messages of one type.
 
-    rate_hz: expected range of the rate, for health checks; None: the topic has no expected rate.
+    rate_hz: expected minimum and maximum rate, for health checks; None: no expected rate.
     logged: whether the topic is recorded by default.
     many_writers: whether any number of nodes may publish the topic; otherwise exactly one node.
-    max_bytes: maximum size of a message, checked by writer and reader.
-    open_to_tools: whether command-line tools may publish the topic, if it has many writers.
+    max_bytes: maximum size of a message, checked when it is sent and when it is received.
+    open_to_tools: whether command-line tools may publish the topic, if any number of nodes may.
     """
 
     name: str
@@ -117,7 +119,7 @@ TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ROWS}
 
 
 class UnknownTopicError(FlexsheetError, KeyError):
-    """Raised for an unknown topic name. The text suggests a similar name."""
+    """Raised if a topic name is unknown. The text suggests a similar name."""
 
     code = "unknown-topic"
     exit_code = 2
@@ -125,9 +127,9 @@ class UnknownTopicError(FlexsheetError, KeyError):
 
 
 def find_topic(name: str) -> Topic:
-    """Return the topic of this name.
+    """Return the topic with the given name.
 
-    Raises UnknownTopicError, which names the most similar topic.
+    Raises UnknownTopicError, which suggests the most similar name, if there is no such topic.
     """
     try:
         return TOPICS[name]

@@ -1,10 +1,10 @@
 """Define the messages of all topics except the scene, which `flexsheet.messages.scene` defines.
 
 Positions and directions are in the world frame, unless the name contains another frame. Arrays
-never contain NaN; a field such as `valid` states whether a quantity is known.
+never contain NaN. A field such as `valid` states whether a quantity is known.
 
-The sheet is the rubber sheet that two robot arms hold in front of the user. Its target pose follows
-the user's fingertip over the virtual object.
+Two robot arms hold a rubber sheet in front of the user. The target pose of the sheet follows the
+user's fingertip over the virtual object.
 """
 
 from __future__ import annotations
@@ -42,9 +42,10 @@ StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "
 
 
 class StereoPair(Message):
-    """A stereo image pair. The header's source timestamp is the midpoint of the exposure.
+    """A pair of images of the stereo camera.
 
-    If the cameras have no common trigger, it is midway between the midpoints of both exposures.
+    The source timestamp is the midpoint of the exposure. If the two cameras have no common trigger,
+    it is the mean of the midpoints of both exposures.
     """
 
     device: str
@@ -77,28 +78,36 @@ FingertipReason = Literal[
     "too_fast",
     "unconfirmed",
 ]
-"""The reason why an image pair gave no fingertip, in the order of the values.
+"""The reason why no fingertip position was computed from an image pair.
 
-No marker was found; the marker is in one view only; there are several candidates; the marker is
-merged with another light source; it is blurred; it is overexposed; it is outside the finger's
-volume; the rays of the two views do not intersect; it is faster than a finger; there are too few
-detections for a track.
+no_marker: no marker was found.
+marker_in_one_view: only one camera sees the marker.
+two_markers: there are several possible markers.
+merged: the marker's image touches another bright spot.
+blurred: the marker moves too fast for the exposure.
+saturated: the marker is overexposed.
+outside_volume: the marker is outside the finger's possible positions.
+inconsistent: the rays of the two cameras do not intersect.
+too_fast: the marker is faster than a finger.
+unconfirmed: there are too few detections for a track.
 """
 
 FingertipState = Literal["lost", "acquiring", "tracking", "coasting"]
-"""The state of the fingertip's track.
+"""The state of the track of the fingertip.
 
-lost: there is no track. acquiring: the track is tentative. tracking: this image pair confirms the
-    track. coasting: the position is only predicted.
+lost: there is no track.
+acquiring: a track has begun, but is not yet confirmed.
+tracking: the current image pair confirms the track.
+coasting: the position is only predicted.
 """
 
 
 class Fingertip(Message):
     """The position of the fingertip at the exposure of an image pair, and its predicted path.
 
-    If `valid` is false, `reason` gives the cause. While `state` is "coasting", position and
-    velocity are predicted from the last valid measurement. `measured_world_m` is the unfiltered
-    triangulated point of this image pair.
+    If `valid` is false, `reason` states the cause. While `state` is "coasting", position and
+    velocity are predicted from the last valid measurement. `measured_world_m` is the triangulated
+    position from this image pair without filtering.
     """
 
     valid: bool
@@ -133,17 +142,17 @@ SheetReason = Literal[
     "past_sheet_height",
     "concave_contact",
 ]
-"""The reason why the sheet does not follow the finger.
+"""The reason why the sheet does not follow the finger; "ok" if it does.
 
 With "concave_contact", the sheet follows the finger at a distance.
 """
 
 
 class SheetTrajectory(MessagePart):
-    """The motion of the sheet after the time of its target, until a newer target arrives.
+    """The motion of the sheet after the time of its target pose, until a newer target arrives.
 
-    The sheet keeps the target's velocity (twist) for `keep_s`, and then decelerates uniformly to
-    rest.
+    The sheet keeps the target's velocity (twist) for `keep_s`, and then decelerates uniformly until
+    it rests.
     """
 
     keep_s: float = Field(
@@ -157,9 +166,9 @@ class SheetTrajectory(MessagePart):
 class SheetTarget(Message):
     """The target pose and velocity of the sheet at the time `valid_at_ns`.
 
-    The origin of the sheet frame is the sheet's centre. Its x axis points from the left to the
-    right edge, and z towards the user. For another time, a node extrapolates with the velocity
-    (twist), or follows `trajectory`.
+    The sheet frame has its origin at the sheet's centre. The x axis points from the left to the
+    right edge, and the z axis towards the user. For another time, a node extrapolates the pose with
+    the velocity (twist), or follows `trajectory`.
     """
 
     phase: Phase
@@ -195,7 +204,10 @@ class SheetTarget(Message):
 ArmMode = Literal[
     "disconnected", "idle", "follow", "hold", "stopping", "fault", "relax", "estop", "starting"
 ]
-"""The operating mode of an arm; "starting": the arm has not answered since its bridge started."""
+"""The operating mode of an arm.
+
+In the mode "starting", the arm's controller has not answered since the arm's node started.
+"""
 
 
 class ArmState(Message):
@@ -256,7 +268,7 @@ class ArmState(Message):
 
 
 class ArmLatency(Message):
-    """The mean latency of one arm over its most recent sheet targets, while it follows them."""
+    """The mean latency of one arm for the newest sheet targets that the arm has followed."""
 
     side: Side
     latency_s: Finite = Field(
@@ -266,9 +278,9 @@ class ArmLatency(Message):
 
 
 class Skin(Message):
-    """The surface mesh of the soft body at rest, published once per object.
+    """The surface mesh of the undeformed soft body, published once for each object.
 
-    Its normals point outwards.
+    The normals of the triangles point outwards.
     """
 
     mesh_id: str
@@ -280,7 +292,7 @@ ForceCurve = Annotated[NDArray[np.float64], ArraySpec("<f8", ("depths", 2))]
 
 
 class SoftBody(Message):
-    """The deformation and force by which the soft body responds to the finger."""
+    """The deformation of the soft body under the finger, and its force on the finger."""
 
     mesh_id: str
     method: str
@@ -311,18 +323,19 @@ class SoftBody(Message):
 
 ForceSource = Literal["gauge", "motor_currents"]
 ForceAxis = Literal["sheet_normal", "left_edge", "right_edge"]
-"""The measured component of a force, in the frame of the sheet.
+"""The component of a force that a sensor measures, in the sheet frame.
 
-sheet_normal: force of the finger on the sheet, positive away from the user. left_edge, right_edge:
-    pull of the sheet on an arm's clamped edge, positive towards the other edge.
+sheet_normal: force of the finger on the sheet, positive away from the user.
+left_edge, right_edge: force of the sheet on the clamped edge at an arm, positive towards the other
+    edge.
 """
 
 ForceReason = Literal["ok", "no_reading", "overload", "in_motion"]
-"""The reason why a measured force is not valid.
+"""The reason why a measured force is not valid; "ok" if it is valid.
 
-no_reading: the device has sent no readable number for some time. overload: the force exceeds the
-    device's range. in_motion: the arm moves, so its motor currents also depend on friction and
-    acceleration.
+no_reading: the device has sent no readable number for some time.
+overload: the force exceeds the range of the device.
+in_motion: the arm moves, so its motor currents also depend on friction and acceleration.
 """
 
 
@@ -342,9 +355,9 @@ class Force(Message):
 
 
 class Eye(Message):
-    """The position of the user's eyes, measured by a head tracker.
+    """The positions of the user's eyes, measured by a head tracker.
 
-    Without a tracker, nodes use the scene's `eyes`.
+    Without a head tracker, nodes use the positions in the scene.
     """
 
     valid: bool = Field(
@@ -358,7 +371,7 @@ class Eye(Message):
 
 
 class Display(Message):
-    """The display settings for the renderer, published by the console or an experiment."""
+    """The display settings of the renderer, which the console or an experiment publishes."""
 
     correction: Correction
     stereo: StereoMode
@@ -380,9 +393,9 @@ class Display(Message):
 
 
 class Frame(Message):
-    """An image for the projector.
+    """An image that the renderer draws for the projector.
 
-    Its source timestamp is that of the camera image it is based on.
+    The source timestamp is the exposure of the camera image from which the frame was computed.
     """
 
     number: int
@@ -445,7 +458,10 @@ class Frame(Message):
 
 
 class EStop(Message):
-    """An emergency stop by software, which the arm bridges store. `engaged` false resets it."""
+    """A software emergency stop of the arms, which remains active until it is reset.
+
+    The message engages the stop if `engaged` is true, and resets it if `engaged` is false.
+    """
 
     engaged: bool
     reason: str
@@ -458,16 +474,16 @@ class Recording(Message):
 
 
 class Bookmark(Message):
-    """A label for a time in a bag, which is the source timestamp of this message."""
+    """A label for a time in a bag. The source timestamp of this message is the labelled time."""
 
     label: str = Field(max_length=200)
 
 
 class Arming(Message):
-    """A command of the operator to arm the robot arms, or to stop and relax the sheet (`ready`
-    false).
+    """A command of the operator that permits or ends motion of the robot arms.
 
-    After any stop, the arms rest until the next command.
+    The value `ready` true permits motion. The value `ready` false stops the arms and relaxes the
+    sheet. After any stop, the arms rest until the next command.
     """
 
     ready: bool
@@ -475,9 +491,9 @@ class Arming(Message):
 
 
 class PortStatus(MessagePart):
-    """The statistics of one port of a node.
+    """The statistics of one input or output of a node.
 
-    The rate is that of the last second. Messages are counted from the start of the node.
+    The rate is the mean of the last second. Messages are counted from the start of the node.
     """
 
     topic: str
@@ -496,7 +512,7 @@ class PortStatus(MessagePart):
 
 
 class ClockEcho(MessagePart):
-    """A reply to the newest ping that a clock node received from the clock node of another host."""
+    """A reply of a clock node to the newest ping from the clock node of another host."""
 
     clock_id: str
     sent_ns: int = Field(ge=0, description="publish timestamp of the ping, on its own clock")
@@ -506,17 +522,17 @@ class ClockEcho(MessagePart):
 
 
 class ClockPing(Message):
-    """A ping between the clock nodes of two hosts, which measures the offset of their clocks.
+    """A message between the clock nodes of two hosts to measure the offset between their clocks.
 
-    A round trip has four timestamps: the two times in an echo, the header's publish timestamp, and
-        the time of arrival.
+    A round trip has four timestamps. Two of them are in an echo, and the others are the publish
+    timestamp in the header and the time of arrival.
     """
 
     echoes: tuple[ClockEcho, ...]
 
 
 class ClockOffset(MessagePart):
-    """The time of another clock minus the time of the header's clock, measured at `at_ns`."""
+    """The offset of another clock: its time minus the time of the header's clock, at `at_ns`."""
 
     clock_id: str
     at_ns: int = Field(ge=0)
@@ -529,7 +545,10 @@ class ClockOffset(MessagePart):
 
 
 class Clocks(Message):
-    """The offsets of other hosts' clocks, sent by a host's clock node to the nodes of that host."""
+    """The offsets of the clocks of other hosts.
+
+    The clock node of a host sends this message to the nodes of the same host.
+    """
 
     max_offset_uncertainty_s: Positive = Field(
         description="uncertainty of an offset (s) above which no arm moves"
@@ -555,18 +574,22 @@ SuspectedCause = Literal[
 ]
 """The suspected cause of a deviation between a measured and an expected value.
 
-camera_moved: the stereo camera is not where the scene says. cameras_misaligned: one camera has
-    moved relative to the other. marker_offset: the marker is not at the assumed offset from the
-    finger's pad. servo_lag: an arm's lag differs from the configured lag. arm_not_following: an arm
-    does not execute the commanded motion. sheet_stiffness: the sheet's calibrated stiffness differs
-    from the scene's. projector_moved: the projector is not where the scene says. arm_base_moved: an
-    arm's base or clamp is not where the scene says. A cause with "or": the data cannot distinguish
-    the two devices. display_latency: projected images appear later than assumed.
+camera_moved: the pose of the stereo camera differs from the scene.
+cameras_misaligned: one camera has moved relative to the other.
+marker_offset: the marker is not at the assumed position on the finger.
+servo_lag: an arm's lag differs from the configured lag.
+arm_not_following: an arm does not execute the commanded motion.
+sheet_stiffness: the measured stiffness of the sheet differs from the scene.
+projector_moved: the pose of the projector differs from the scene.
+arm_base_moved: the pose of an arm's base or clamp differs from the scene.
+display_latency: projected images appear later than assumed.
+
+With a value that contains "or", the data cannot distinguish the two causes.
 """
 
 
 class SelfCheck(MessagePart):
-    """A comparison of a measured value with the value that a node assumes."""
+    """A comparison of a measured value with the value that a node expects."""
 
     cause: SuspectedCause
     subject: str = Field(default="", description="device concerned, if there are several")
@@ -580,7 +603,7 @@ class SelfCheck(MessagePart):
 
 
 class Status(Message):
-    """The state of a node, published once per second."""
+    """The state of a node, which each node publishes once per second."""
 
     node: str
     state: Literal["starting", "running", "degraded", "stopping"]
@@ -613,7 +636,7 @@ class Status(Message):
 
 
 class ParameterChange(Message):
-    """A change of a parameter of a running node, requested by `flexsheet param set`."""
+    """A request to change a parameter of a running node (`flexsheet param set`)."""
 
     node: str
     parameter: str
@@ -621,7 +644,7 @@ class ParameterChange(Message):
 
 
 class NodeProcess(MessagePart):
-    """The state of a node's process, reported by the launcher that started it."""
+    """The state of a node's process, as observed by the launcher that started it."""
 
     name: str
     state: Literal["starting", "ready", "exited"] = Field(
@@ -632,7 +655,7 @@ class NodeProcess(MessagePart):
 
 
 class NodeOmission(MessagePart):
-    """A node of the launch file that is not started, with the reason."""
+    """A node in the launch file that the launcher does not start, and the reason."""
 
     name: str
     reason: Literal["rigid_object", "no_image", "no_reader", "no_writer"] = Field(
@@ -642,23 +665,24 @@ class NodeOmission(MessagePart):
 
 
 class HostKey(MessagePart):
-    """The public key of a host, as stored on the host that sends the message."""
+    """The public key of a host, as known to the host that sends the message."""
 
     host: str
     key: str
 
 
 class ProgramCpu(MessagePart):
-    """The processor time of all processes that have the same name."""
+    """The processor time of all processes with the same name."""
 
     name: str = Field(description="name of the node, or of another program")
     cores: NonNegative = Field(description="processor time divided by elapsed time")
 
 
 class CpuPressure(MessagePart):
-    """The time for which the nodes of a computer wait for a free processor, over the last seconds.
+    """The time for which the nodes of a computer have waited for a free processor.
 
-    Nodes with a `nice` value of 10 or more are not included.
+    The time is measured over the last seconds. Nodes with a `nice` value of 10 or more are not
+    included.
     """
 
     busy: bool = Field(description="`wait_ratio` is above a quarter")
@@ -673,7 +697,7 @@ class CpuPressure(MessagePart):
 
 
 class HostStatus(Message):
-    """The state of a computer, published by its launcher once per second."""
+    """The state of a computer, which its launcher publishes once per second."""
 
     host: str
     run: str = Field(description="identifier of the run")
@@ -714,7 +738,7 @@ PathJoin = Literal["rounded_lines", "spline"]
 
 
 class FingerPath(Message):
-    """A path for the simulated finger, which first moves smoothly to the first point."""
+    """A path for the simulated finger, which first moves smoothly to the path's first point."""
 
     label: str
     times_s: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points",))]
@@ -736,7 +760,7 @@ class FingerPath(Message):
 
 
 class TwinFinger(Message):
-    """The true position of the simulated fingertip at the source timestamp."""
+    """The true position and velocity of the simulated fingertip at the source timestamp."""
 
     path_label: str
     path_done: bool
@@ -766,7 +790,7 @@ Viewpoint = Literal["centre", "left", "right"]
 
 
 class TwinEye(Message):
-    """An image that a simulated camera sees from an eye's viewpoint, and the expected image."""
+    """A rendering of what an eye sees in the simulation, and the image that it should see."""
 
     label: str
     correction: Correction

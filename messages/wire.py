@@ -6,18 +6,18 @@ The header frame is one msgpack array of eleven elements:
   type         name of the message's class
   fingerprint  8 bytes of the hash of its JSON Schema, see `messages.base.compute_fingerprint`
   sequence, source_ns, publish_ns, clock_id, writer, epoch, plan      see `messages.base.Header`
-  fields       a map; a nested part is a map, a tuple is an array, and a numpy array is one of
-               two extension types:
+  fields       a map of the message's fields. A nested model is a map, and a tuple is an array.
+               A numpy array is one of two extension types:
   type 1       dtype and shape, then the elements (for an array of at most 1 KiB)
   type 2       dtype and shape only; the elements are in the next frame
 
-Dtype and shape are encoded as one byte with the index in `DTYPES`, one byte with the number of
-axes, two zero bytes, and a little-endian uint32 per axis. Zeros up to a multiple of eight bytes
-align the elements. Elements are little-endian and in C order.
+The encoding of dtype and shape is one byte with the index in `DTYPES`, one byte with the number of
+axes, and two zero bytes. Then a little-endian uint32 follows for each axis. Zeros up to a multiple
+of eight bytes align the elements. Elements are little-endian and in C order.
 
 `encode` and `decode` do not copy large arrays. A sender must not change an array that is in a
 message, and a receiver gets read-only views of the memory from the socket. Small arrays are copied,
-because that is faster than sending them separately (`benchmarks/messaging.py`). Equal messages with
+because this is faster than sending them separately (`benchmarks/messaging.py`). Equal messages with
 equal headers have equal bytes. The protocol "flexsheet/1" of old bags differs only in that `plan`
 is missing.
 """
@@ -52,12 +52,16 @@ DTYPES = tuple(
 INLINE_BYTES = 1024
 NAME_LENGTH = 200
 MAX_HEADER_BYTES = 1 << 20
-"""The maximum size of the header frame. Its decoded values need up to 64 times as much memory."""
+"""The maximum size (bytes) of the header frame.
+
+The decoded values need up to 64 times as much memory.
+"""
 
 MAX_ELEMENTS = 4096
 """The maximum number of elements of an array or a map in the header frame.
 
-The decoder allocates the stated length before it reads the elements, and arrays can be nested.
+The limit protects the memory. The decoder allocates the stated length before it reads the elements,
+and arrays can be nested.
 """
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
@@ -69,7 +73,7 @@ _extension = tuple.__new__
 
 
 class WireError(FlexsheetError, ValueError):
-    """Raised for an invalid or unexpected message, or for a message that cannot be encoded.
+    """Raised if a message is invalid or unexpected, or if it cannot be encoded.
 
     cause: "malformed", "type", "fingerprint", "frames", "size" or "field". A subscriber also uses
         "writer", "plan", "replayed" and "forbidden".
@@ -105,11 +109,12 @@ def encode(
     max_bytes: int | None = None,
     inline_bytes: int = INLINE_BYTES,
 ) -> list[Buffer]:
-    """Encode a message as frames.
+    """Encode a message as frames (byte strings of a ZeroMQ multipart message).
 
-    inline_bytes: maximum size of the arrays that are in the header frame.
+    max_bytes: maximum size of the message; None: no limit.
+    inline_bytes: maximum size of an array inside the header frame. Each larger array is a frame.
 
-    Raises WireError if a field cannot be encoded, or the message is larger than `max_bytes`.
+    Raises WireError if a field cannot be encoded, or if the message is too large.
     """
     frames: list[Buffer] = [b""]
 
@@ -152,7 +157,7 @@ def encode(
 
 
 class Envelope:
-    """A message with a checked header, whose fields are not yet validated."""
+    """A message whose header has been checked, but whose fields have not been validated."""
 
     __slots__ = ("codec", "fields", "header")
 
@@ -160,7 +165,10 @@ class Envelope:
         self.codec, self.header, self.fields = codec, header, fields
 
     def open(self) -> Message:
-        """Validate the message's fields. Raises WireError, which names the first invalid field."""
+        """Validate the fields, and return the message.
+
+        Raises WireError, which names the first invalid field.
+        """
         try:
             return self.codec.validate(self.fields)  # type: ignore[no-any-return]  # pydantic's validator is untyped
         except ValidationError as error:
@@ -176,11 +184,12 @@ def read_envelope(
 ) -> Envelope:
     """Decode a message and check its header, without validating its fields.
 
-    frames: buffers (bytes, memoryview or zmq.Frame), of which the first is the header.
-    expected: topic, whose size limit applies, or message type.
-    fingerprint, type_name: values of a recorded message type; None: those of the current type.
+    frames: buffers (bytes, memoryview or zmq.Frame). The first buffer is the header.
+    expected: topic or message type. A topic also limits the size of the message.
+    fingerprint, type_name: fingerprint and name of a recorded message type; None: those of the
+        current type.
 
-    Raises WireError for an invalid or unexpected message.
+    Raises WireError if the message is invalid or unexpected.
     """
     if isinstance(expected, Topic):
         codec = get_codec(expected.message)
@@ -192,7 +201,8 @@ def read_envelope(
     unpacked = _unpack(frames)
     if type(unpacked) is not tuple or len(unpacked) not in (10, 11):
         raise WireError(
-            "malformed", "this is no flexsheet message: its header does not have eleven elements"
+            "malformed",
+            "this is not a flexsheet message: its header does not have eleven elements",
         )
     protocol, name, found, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
     if type(protocol) is not str or ELEMENTS.get(protocol) != len(unpacked):
@@ -237,7 +247,10 @@ def decode(frames: Sequence[Any], expected: type[M]) -> tuple[M, Header]: ...
 @overload
 def decode(frames: Sequence[Any], expected: Topic) -> tuple[Message, Header]: ...
 def decode(frames: Sequence[Any], expected: Topic | type[Message]) -> tuple[Message, Header]:
-    """Decode and validate a message and its header. Raises WireError for invalid data."""
+    """Decode and validate a message, and return it with its header.
+
+    Raises WireError if the message is invalid or unexpected.
+    """
     envelope = read_envelope(frames, expected)
     return envelope.open(), envelope.header
 
@@ -248,7 +261,10 @@ def count_bytes(frames: Sequence[Any]) -> int:
 
 
 def _unpack(frames: Sequence[Any]) -> Any:
-    """Decode the header frame and its arrays. Each further frame must belong to one array."""
+    """Decode the header frame and the arrays in the further frames.
+
+    Raises WireError unless each further frame belongs to exactly one array.
+    """
     used = 0
 
     def unpack(code: int, data: bytes) -> NDArray[Any]:
@@ -295,7 +311,7 @@ def _unpack(frames: Sequence[Any]) -> Any:
     # others.
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"[:200]
-        raise WireError("malformed", f"this is no flexsheet message: {reason}") from error
+        raise WireError("malformed", f"this is not a flexsheet message: {reason}") from error
     if used != len(frames) - 1:
         raise WireError(
             "frames", f"the message has {len(frames)} frames, but its header describes {used + 1}"
@@ -334,7 +350,11 @@ def _dtype_and_shape(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 @lru_cache(maxsize=1024)
 def _read_dtype_and_shape(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], int, int]:
-    """Return dtype, shape, length of `head` (bytes), and total size of the elements (bytes)."""
+    """Decode the dtype and shape of an array.
+
+    Return dtype, shape, number of bytes that were read from `head`, and total size of the elements
+    in bytes.
+    """
     code, axes = head[0], head[1]
     if code >= len(DTYPES) or axes > 8 or len(head) != (4 * axes + 11) & ~7:
         raise WireError("malformed", f"an array has an invalid dtype or shape: {head[:16].hex()}")
@@ -357,9 +377,10 @@ def _describe(error: ValidationError, name: str) -> str:
 
 
 def _format_value(value: object) -> str:
-    """Describe a received value for an error text. Only the type of a container is given.
+    """Format a received value for an error text.
 
-    The `repr` of deeply nested values would fail.
+    For a container, only the type is returned, because the `repr` of deeply nested values would
+    fail.
     """
     if isinstance(value, bytes):
         return repr(value[:60].hex())[:60]

@@ -125,7 +125,7 @@ def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
         ({"marker_m": 0.04}, "markers of 40 mm do not fit into squares of 40 mm"),
         ({"dictionary": "DICT_9X9"}, "an OpenCV dictionary, such as DICT_4X4_50"),
         ({"marker_m": None}, "give the marker size"),
-        ({"columns": 14, "rows": 10}, "needs 82 markers, DICT_4X4_50 contains 50"),
+        ({"columns": 14, "rows": 10}, "needs 82 markers, but DICT_4X4_50 contains only 50"),
     ],
 )
 def test_impossible_charuco_boards_are_rejected(change: dict[str, Any], printed: str) -> None:

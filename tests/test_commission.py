@@ -402,7 +402,10 @@ def test_the_report_names_residuals_limits_and_advice(tmp_path: Path) -> None:
     [
         (lambda folder: open_lab(folder, "seed:4").write(), "belongs to seed:4, .* gives seed:3"),
         (lambda folder: (folder / "notes.txt").write_text("x"), "not empty and has no commission"),
-        (lambda folder: (folder / "commission.json").write_text("{]"), "not a valid state of a"),
+        (
+            lambda folder: (folder / "commission.json").write_text("{]"),
+            "this is not a valid state of a",
+        ),
     ],
 )
 def test_a_folder_of_something_else_is_refused(tmp_path: Path, prepare: Any, words: str) -> None:

@@ -84,8 +84,8 @@ def test_images_at_a_constant_phase_leave_the_latency_uncertain() -> None:
 @pytest.mark.parametrize(
     ("images", "words"),
     [
-        ([], "0 switches of the projected image; at least 20"),
-        (switch(0.02, count=MIN_SWITCHES - 1), "19 switches of the projected image"),
+        ([], "contain 0 switches of the projected image, but at least 20 are required"),
+        (switch(0.02, count=MIN_SWITCHES - 1), "contain 19 switches of the projected image"),
         (
             [replace(one, is_new=False) for one in switch(0.02)],
             "only 0 of .* images later than 150 ms after a switch show the new state",

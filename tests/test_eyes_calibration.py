@@ -107,7 +107,7 @@ def test_bad_rows_are_refused(tmp_path: Path, row: str, words: str) -> None:
 
 
 def test_alignments_that_do_not_determine_the_eyes_are_refused() -> None:
-    with pytest.raises(EyesError, match="3 alignments of the left eye"):
+    with pytest.raises(EyesError, match="there are 3 alignments of the left eye"):
         fit_eyes(align()[:3], SCENE.eyes)
     mirrored = [Alignment(one.eye, one.bead_m * [1, 1, -1], one.cross_m) for one in align()]
     with pytest.raises(EyesError, match="from its position in the scene"):

@@ -261,7 +261,7 @@ def test_motions_that_leave_it_open_are_rejected(rotation_rad: Any, words: str) 
 
 
 def test_too_few_poses_are_rejected() -> None:
-    with pytest.raises(HandEyeError, match="5 arm poses, at least 6"):
+    with pytest.raises(HandEyeError, match="there are 5 arm poses, but at least 6 are required"):
         calibrate_base(Workplace(9).detections(5), RIG)
 
 
@@ -327,10 +327,13 @@ def test_a_table_of_board_poses_will_do(tmp_path: Path, unit: str) -> None:
     ("text", "words"),
     [
         (None, "cannot be read"),
-        ("", "found columns none; add j1_deg"),
-        ("left,right,j1_deg\n", "add j1_deg to j6_deg"),
-        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "missing columns; add left and right"),
-        ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "does not contain rows"),
+        ("", r"has no joint angles \(columns: none\); add the columns j1_deg"),
+        ("left,right,j1_deg\n", "add the columns j1_deg to j6_deg"),
+        (
+            "j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n",
+            "neither images nor board poses; add the columns left and right",
+        ),
+        ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "the table has no rows"),
         (
             "left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0,x,0,0,0\n",
             "row 2, column j3_deg: expected a number, found 'x'",
@@ -493,7 +496,7 @@ def test_bad_input_to_the_command_is_named(
 def test_images_of_another_size_or_without_a_board(tmp_path: Path) -> None:
     live = LiveCapture(tmp_path)
     live.show(live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3)))
-    with pytest.raises(ArmPosesError, match="images of 640x480 px"):
+    with pytest.raises(ArmPosesError, match="the images have 640x480 px"):
         read_detections(tmp_path, BOARD, RIG, (800, 600), lambda *_: None)
     add_row(tmp_path, ["left01.png", "left01.png"], READY)
     other = Board(columns=9, rows=6, square_m=0.015)

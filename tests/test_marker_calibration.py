@@ -112,7 +112,10 @@ def test_touches_of_the_sheet_give_the_offset() -> None:
 @pytest.mark.parametrize(
     ("tilts_deg", "words"),
     [
-        (((0, 0), (15, 0)), "2 touches in 2 orientations; at least 4 touches in 3 orientations"),
+        (
+            ((0, 0), (15, 0)),
+            "there are 2 touches in 2 orientations, but at least 4 touches in 3 orientations",
+        ),
         (((0, 0), (1, 0), (0, 1), (1, 1), (2, 0)), "touch in at least 2 more orientations"),
     ],
 )
@@ -141,7 +144,9 @@ def test_contradicting_touches_are_refused() -> None:
     random = np.random.default_rng(9)
     touches = [touch(tilt, random) for tilt in TILTS_DEG]
     touches[3].marker_m[0] += 0.02
-    with pytest.raises(MarkerFitError, match=r"contradict each other: rms residual .* in touch 4"):
+    with pytest.raises(
+        MarkerFitError, match=r"contradict each other: the rms residual is .* of touch 4"
+    ):
         fit_marker(touches)
 
 

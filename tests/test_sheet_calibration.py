@@ -191,7 +191,10 @@ def test_edge_forces_reduce_the_uncertainty() -> None:
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        (pushes_of(ScaledSheetModel(NOMINAL))[:5], r"5 measured pushes; fitting .* requires 6"),
+        (
+            pushes_of(ScaledSheetModel(NOMINAL))[:5],
+            r"there are 5 measured pushes, but fitting .* requires 6",
+        ),
         (
             pushes_of(ScaledSheetModel(NOMINAL), stretches=(1.05,), depths=(0.005,) * 8),
             r"do not determine|known to",

@@ -1,1 +1,1 @@
-"""Play back bags (files of recorded topics), rerun nodes on them, report on and export them."""
+"""Play back, replay, verify, report on and export bags (files of recorded topics)."""

@@ -4,13 +4,13 @@ Each topic becomes a JSON channel of the same name. It contains the fields of th
 arrays of more than `json_channel.MAX_ARRAY` values. Images and 3D data become separate channels:
 
     stereo/left, stereo/right, frame/image, twin/eye/seen, twin/eye/expected     foxglove.RawImage
-    tf          the sheet and both flanges                                foxglove.FrameTransforms
+    tf          poses of the sheet and of both flanges                    foxglove.FrameTransforms
     finger      the fingertip with its predicted path                     foxglove.SceneUpdate
     sheet       the sheet between the flanges                             foxglove.SceneUpdate
-    object      the deformed skin of the soft body                        foxglove.SceneUpdate
+    object      the deformed surface of the soft body                     foxglove.SceneUpdate
 
-The world frame is that of flexsheet (x right, y up, z towards the user). The time of a message is
-when it was recorded. Times count from 1970 if the bag contains the wall-clock time of its start.
+The axes of the world frame are x to the right, y up, and z towards the user. The time of a message
+is when it was recorded. Times count from 1970 if the bag contains the wall-clock time of its start.
 Otherwise they count from the start of the recording computer.
 """
 
@@ -75,11 +75,14 @@ Output = tuple[str, Any]
 
 
 MIN_FREE_BYTES = 4 << 20
-"""The minimum free disk space during an export. It exceeds the write buffer of the library."""
+"""The minimum free disk space (bytes) during an export.
+
+It exceeds the size of the write buffer of the Foxglove library.
+"""
 
 
 class ExportError(FlexsheetError, RuntimeError):
-    """Raised if an export cannot be made. The text gives the reason and the remedy."""
+    """Raised if a bag cannot be exported. The text gives the reason and the remedy."""
 
     code = "export"
     remedy = "Install the package that the text names, or choose another output file."
@@ -87,7 +90,11 @@ class ExportError(FlexsheetError, RuntimeError):
 
 @dataclass(slots=True)
 class ExportResult:
-    """The result of an export: message numbers per channel, and topics that could not be read."""
+    """The result of an export.
+
+    messages: number of exported messages of each channel.
+    unreadable: names of the topics that could not be read.
+    """
 
     output: Path
     messages: dict[str, int] = field(default_factory=dict)
@@ -101,13 +108,15 @@ def export(
     topics: Iterable[str] | None = None,
     progress: Callable[[float, float], None] = lambda done_s, whole_s: None,
 ) -> ExportResult:
-    """Write a bag as an MCAP file with the schemas of Foxglove.
+    """Export a bag as an MCAP file with the schemas of Foxglove.
 
-    topics: names of topics to export; None: all topics. progress: function that is called with the
-    exported and the total duration (s).
+    Topics whose message type cannot be converted to the current version are omitted. The result
+    contains their names.
 
-    Topics whose message type has changed since the recording cannot be read. The result contains
-    their names. Raises ExportError and BagError.
+    topics: names of the topics to export; None: all topics.
+    progress: function that is called with the exported and the total duration (s).
+
+    Raises ExportError if the export fails, and BagError if the bag cannot be read.
     """
     if not HAS_FOXGLOVE:
         raise ExportError(
@@ -151,10 +160,11 @@ def export(
 
 @dataclass(frozen=True, slots=True)
 class TopicsToExport:
-    """The bag to export, its start and duration, and the names of the topics to export.
+    """The bag to export, its start time and duration, and the names of the topics to export.
 
-    context: further topics whose messages are needed to draw the exported topics.
-    unreadable: requested topics whose message type cannot be migrated.
+    readable: names of the topics to export.
+    context: names of further topics whose messages are needed to draw the exported topics.
+    unreadable: names of the requested topics whose messages cannot be decoded.
     clock_id: clock of the recorder; None if it is unknown.
     """
 
@@ -168,11 +178,13 @@ class TopicsToExport:
 
 
 def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) -> TopicsToExport:
-    """Select the topics of a bag to export.
+    """Select the topics of a bag that can be exported.
 
-    output: file to write, which must not exist. topics: names of topics; None: all readable topics.
+    output: file to write, which must not exist; None: not checked.
+    topics: names of the requested topics; None: all topics of the bag.
 
-    Raises ExportError if the output exists or the bag does not contain a topic, and BagError.
+    Raises ExportError if `output` exists or if the bag does not contain a requested topic. Raises
+    BagError if the bag cannot be read.
     """
     if output is not None and output.exists():
         raise ExportError(f"{output}: the file exists already; give the name of a new file")
@@ -198,21 +210,24 @@ def select_topics(bag: Path, output: Path | None, topics: Iterable[str] | None) 
 
 
 def check_free_space(output: Path) -> None:
-    """Raise OSError if the disk of the output is nearly full."""
+    """Raise OSError if the disk of the output file is nearly full."""
     if free_bytes(output.parent) < MIN_FREE_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @dataclass(slots=True)
 class ViewState:
-    """The latest scene, soft-body skin and flange poses, needed to draw later messages."""
+    """The newest scene, soft-body surface and flange poses, needed to draw later messages."""
 
     scene: Scene | None = None
     skin: Skin | None = None
     flanges: dict[Side, Floats] = field(default_factory=dict)
 
     def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
-        """Yield the images and 3D data of a message as (channel, Foxglove message)."""
+        """Yield the images and the 3D data in a message as (channel, Foxglove message).
+
+        at_ns: timestamp of the Foxglove messages.
+        """
         stamp = make_stamp(at_ns)
         match message:
             case Scene():
@@ -244,7 +259,10 @@ class ViewState:
         return draw_mesh("object", vertices, self.skin.triangles, stamp, SKIN_COLOUR)
 
     def _sheet(self, stamp: Any) -> Any | None:
-        """Return a drawing of the flat sheet between both edges, or None if an edge is unknown."""
+        """Return a drawing of the sheet as a flat surface between its clamped edges.
+
+        Return None if the pose of an edge is unknown.
+        """
         corners = find_sheet_corners(self.scene, self.flanges)
         if corners is None:
             return None
@@ -253,7 +271,7 @@ class ViewState:
 
 
 def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
-    """Yield the images in a message with the names of their channels."""
+    """Yield each image in a message with the name of its channel."""
     match message:
         case StereoPair():
             yield f"{topic}/left", message.left
@@ -267,7 +285,10 @@ def list_images(topic: str, message: Message) -> Iterator[NamedImage]:
 
 
 def wall_clock_offset_ns(reader: BagReader) -> int | None:
-    """Return the time since 1970 minus the recorded time (ns), or None if it is unknown."""
+    """Return the offset (ns) to add to recorded times to obtain times since 1970.
+
+    Return None if the bag does not contain the wall-clock time of its start.
+    """
     recording = reader.metadata.get("recording", {})
     try:
         started = datetime.fromisoformat(recording["started"])

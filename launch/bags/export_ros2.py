@@ -1,8 +1,8 @@
-"""Export bags as bags of ROS 2: MCAP files in CDR, which `ros2 bag play` and RViz can read.
+"""Export bags as bags of ROS 2, which `ros2 bag play` and RViz can read.
 
-`flexsheet.launch.ros2.mapping` defines the topics and types. Timestamps count from 1970 if the bag
-contains the wall-clock time of its start. Otherwise they count from the start of the recording
-computer.
+A bag of ROS 2 is an MCAP file with messages in CDR encoding. `flexsheet.launch.ros2.mapping`
+defines the topics and types. Timestamps count from 1970 if the bag contains the wall-clock time of
+its start. Otherwise they count from the start of the recording computer.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ def export_ros2(
     topics: Iterable[str] | None = None,
     progress: Callable[[float, float], None] = lambda done_s, whole_s: None,
 ) -> ExportResult:
-    """Convert a bag to a ROS 2 bag.
+    """Convert a bag to a bag of ROS 2.
 
-    output: folder to create, with metadata.yaml and an MCAP file. If its name ends with .mcap, only
-        the MCAP file is written, which contains the same metadata.
-    topics: names of flexsheet topics to convert; None: all topics.
+    output: folder to create, which will contain metadata.yaml and an MCAP file. If the name ends
+        with .mcap, only the MCAP file is written, and it contains the same metadata.
+    topics: names of the flexsheet topics to convert; None: all topics.
     progress: function that is called with the converted and the total duration (s).
 
-    Raises ExportError, Ros2Error and BagError.
+    Raises ExportError or Ros2Error if the export fails, and BagError if the bag cannot be read.
     """
     ros = load_ros_types()
     from rosbags.rosbag2 import StoragePlugin, Writer
@@ -95,7 +95,11 @@ def export_ros2(
 
 
 def make_qos(topic: RosTopic) -> Any:
-    """Return the quality of service of a topic: reliable, and if latched, also transient local."""
+    """Return the ROS 2 quality of service for a topic.
+
+    All topics are reliable. A latched topic is also transient local, so that late subscribers
+    receive its last message.
+    """
     from rosbags.interfaces import (
         Qos,
         QosDurability,

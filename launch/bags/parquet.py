@@ -1,8 +1,8 @@
 """Convert bags to tables: one Parquet file per topic, or a table in memory.
 
-Each row is a message. The first columns contain the recording time, and the timestamps, clock,
-writer and sequence number of its header. Each field becomes one or more columns named after the
-field, whose name contains the unit:
+Each row contains one message. The first columns contain the recording time, and the timestamps,
+clock, writer and sequence number of the message's header. Each message field becomes one or more
+columns, which have the name of the field with its unit:
 
     number, text, timestamp          one column
     vector of 2 or 3                 FIELD.x, FIELD.y, FIELD.z
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 MAX_VECTOR = 6
 ROWS_PER_GROUP = 2000
 MAX_GROUP_BYTES = 64 << 20
-"""The size of buffered images at which a row group is written."""
+"""The size (bytes) of buffered images above which the buffer is written as a row group."""
 
 TWIST = tuple(
     f"{kind}_{axis}_{unit}"
@@ -69,7 +69,11 @@ Get = Callable[[Any], Any]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a table: name, Arrow type, function that reads its value, and metadata."""
+    """A column of a table.
+
+    get: function that reads the value of the column from a message.
+    about: metadata of the column.
+    """
 
     name: str
     type: Any
@@ -87,7 +91,10 @@ def _arrow() -> Any:
 
 @cache
 def list_columns(kind: type[Message], *, images: bool) -> tuple[Column, ...]:
-    """List the table columns for the fields of a message type, with or without images."""
+    """Return the table columns for the fields of a message type.
+
+    images: whether image fields get columns.
+    """
     return tuple(_columns_of_group(kind, "", lambda message: message, images))
 
 
@@ -156,7 +163,10 @@ def _columns_of_array(
 
 
 def split_pose(matrix: np.ndarray) -> list[float]:
-    """Split a rigid transform (4, 4) into position (m) and quaternion (x, y, z, w): 7 values."""
+    """Return the position (m) and the quaternion of a rigid transform (4, 4).
+
+    The result is a list of seven numbers: x, y, z, qx, qy, qz, qw.
+    """
     w, *xyz = quaternion_from_rotation(matrix[:3, :3]).tolist()
     return [*matrix[:3, 3].tolist(), *xyz, w]
 
@@ -174,7 +184,7 @@ def _is_vector(arguments: tuple[Any, ...]) -> bool:
 
 
 def _find_type(annotation: Any) -> Any:
-    """Return the Arrow type for a value that is stored in one column."""
+    """Return the Arrow type of a column for values with a type annotation."""
     arrow = _arrow()
     inner, spec = split_annotation(annotation)
     if spec is not None:
@@ -210,7 +220,10 @@ def _make_conversion(annotation: Any) -> Get:
 
 
 def _applied(get: Get, function: Callable[[Any], Any]) -> Get:
-    """Return a function that gets a value and applies `function`, unless the value is None."""
+    """Return a function that applies `function` to the result of `get`.
+
+    If the result of `get` is None, the returned function returns None.
+    """
 
     def apply(row: Any) -> Any:
         value = get(row)
@@ -263,11 +276,16 @@ class TableBuilder:
 
     @property
     def is_full(self) -> bool:
-        """Return whether enough rows are buffered to be written as a row group."""
+        """Return whether enough rows are buffered to write them as a row group."""
         return len(self._rows) >= ROWS_PER_GROUP or self._bytes >= MAX_GROUP_BYTES
 
     def add(self, message: Message, header: Header, log_ns: int) -> None:
-        """Add a row for a message. `time_s` is its source time since the start of the bag."""
+        """Add a row for a message.
+
+        The column `time_s` is the source time of the message since the start of the bag.
+
+        log_ns: time when the message was recorded, ns.
+        """
         # The delay between publication and recording is negligible.
         same_clock = header.clock_id == self._selection.clock_id
         source_ns = header.source_ns + (0 if same_clock else log_ns - header.publish_ns)
@@ -287,7 +305,7 @@ class TableBuilder:
     def drain(self) -> pyarrow.Table:
         """Return the buffered rows as a table, and clear the buffer.
 
-        Raises ExportError for a value that does not fit its column.
+        Raises ExportError if a value does not fit the type of its column.
         """
         arrow = _arrow()
         columns = zip(*self._rows, strict=True) if self._rows else ((),) * len(self.schema)
@@ -304,9 +322,13 @@ class TableBuilder:
 
 
 def read_table(bag: Path | str, topic: str, *, images: bool = False) -> pyarrow.Table:
-    """Read a topic of a bag into an Arrow table, which `to_pandas` converts to a data frame.
+    """Read a topic of a bag into an Arrow table.
 
-    images: whether the table contains images. Raises ExportError and BagError.
+    `to_pandas` converts the table to a pandas data frame.
+
+    images: whether the table contains images.
+
+    Raises ExportError if the table cannot be made, and BagError if the bag cannot be read.
     """
     selection = select_topics(Path(bag), None, [topic])
     if not selection.readable:
@@ -328,13 +350,15 @@ def write_parquet(
     images: bool = False,
     progress: Callable[[float, float], None] = lambda done_s, whole_s: None,
 ) -> ExportResult:
-    """Write one Parquet file per topic of a bag into a new folder.
+    """Write one Parquet file for each topic of a bag into a new folder.
 
-    topics: names of topics; None: all topics. images: whether the tables contain images. progress:
-        function that is called with the converted and the total duration (s). A slash in the
-        topic's name becomes a dot in the file's name.
+    A slash in the name of a topic becomes a dot in the name of the file.
 
-    Raises ExportError and BagError.
+    topics: names of the topics; None: all topics.
+    images: whether the tables contain images.
+    progress: function that is called with the converted and the total duration (s).
+
+    Raises ExportError if the export fails, and BagError if the bag cannot be read.
     """
     _arrow()
     from pyarrow.parquet import ParquetWriter

@@ -1,4 +1,4 @@
-"""Play a bag: publish its messages in a running graph under the writer name "tools"."""
+"""Play a bag: publish its messages in a running graph of nodes, with the writer name "tools"."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flexsheet.messages.clock_table import shift_stamps
 from flexsheet.messages.topics import Delivery, find_topic
 
 Progress = Callable[[float, float], None]
-"""A function that is called with the played and the total duration (s)."""
+"""A function that is called with the duration (s) already played and the total duration (s)."""
 
 
 NEVER_PLAYED = {
@@ -26,12 +26,12 @@ NEVER_PLAYED = {
     "estop": "an e-stop or its reset is not repeated",
     "recording": "requests to record are not repeated",
 }
-"""The topics that are never played, with the reasons."""
+"""The reason for each topic that is never played."""
 
 
 @dataclass(frozen=True, slots=True)
 class TopicSelection:
-    """The topics of a bag that will be played, and the omitted topics with the reasons."""
+    """The topics of a bag that will be played, and the reason for each omitted topic."""
 
     topics: tuple[str, ...]
     left_out: dict[str, str]
@@ -40,9 +40,10 @@ class TopicSelection:
 def select_topics(
     recorded: Collection[str], plan: ResolvedGraph, wanted: Collection[str]
 ) -> TopicSelection:
-    """Select the topics of a bag that may be published under the writer name "tools".
+    """Select the topics of a bag that command-line tools may publish in a graph.
 
-    recorded: topics of the bag. wanted: topics to play; empty for all topics.
+    recorded: topics of the bag.
+    wanted: topics to play; empty for all topics.
 
     Raises BagError if a wanted topic cannot be played.
     """
@@ -76,12 +77,14 @@ async def play(
     start_s: float = 0.0,
     progress: Progress = lambda played, total: None,
 ) -> int:
-    """Play a bag once from `start_s`, and return the number of sent messages.
+    """Play a bag once, and return the number of published messages.
 
-    rate: speed factor.
+    First, the last message of each latched topic before `start_s` is published. All timestamps are
+    shifted, so that a message has the same age as in the recording.
 
-    First, the last message of each latched topic before `start_s` is sent. Timestamps are shifted,
-    so a message has the same age as in the recording.
+    rate: playback speed divided by the recorded speed.
+    start_s: time in the bag at which playback starts, s.
+    progress: function that is called with the played and the total duration (s).
     """
     summary = BagReader(bag).info()
     begin_ns = summary.start_ns + round(start_s * 1e9)
@@ -122,7 +125,10 @@ async def play(
 def latched_before(
     bag: Path, topics: Collection[str], begin_ns: int
 ) -> list[tuple[str, Message, Header, int]]:
-    """Return the last message of every latched topic before `begin_ns`, from a bag."""
+    """Return the last message of every latched topic that was recorded before `begin_ns`.
+
+    Each entry is (topic name, message, header, time of recording in ns).
+    """
     latched = [name for name in topics if find_topic(name).delivery is Delivery.LATCHED]
     last = {}
     for entry in BagReader(bag, latched, end_ns=begin_ns):

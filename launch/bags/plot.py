@@ -16,18 +16,22 @@ from flexsheet.messages.topics import UnknownTopicError, find_topic
 from flexsheet.nodes.arrays import Floats
 
 MAX_COMPONENTS = 16
-"""The maximum number of lines in one chart, which excludes images and meshes."""
+"""The maximum number of lines in one chart.
+
+Fields with more numbers, such as images, are rejected.
+"""
 
 CHART_SIZE_IN = (8.0, 2.4)
-"""The width and height of the chart of one field, inches."""
+"""The width and the height of the chart of one field, in inches."""
 
 
 @dataclass(frozen=True, slots=True)
 class FieldSeries:
     """The values of a message field as a function of time.
 
-    name: "TOPIC.FIELD". times_s (n,): source times since the start of the bag. values (n,
-        components): values of the field.
+    name: topic and field, as "TOPIC.FIELD".
+    times_s: source times (n,) since the start of the bag.
+    values: values (n, components) of the field.
     """
 
     name: str
@@ -35,7 +39,7 @@ class FieldSeries:
     values: Floats
 
     def to_json(self) -> dict[str, Any]:
-        """Return the series as JSON types."""
+        """Return the series as a dictionary of values that JSON can represent."""
         return {
             "field": self.name,
             "times_s": self.times_s.tolist(),
@@ -46,11 +50,12 @@ class FieldSeries:
 def read_fields(
     bag: Path, names: Sequence[str], progress: Callable[[float, float], None]
 ) -> list[FieldSeries]:
-    """Read fields named "TOPIC.FIELD" or "TOPIC.FIELD.FIELD" from a bag.
+    """Read numeric message fields from a bag.
 
+    names: names of the fields, as "TOPIC.FIELD" or "TOPIC.FIELD.FIELD".
     progress: function that is called with the read and the total duration (s).
 
-    Raises BadInputError if the bag does not contain a topic or field, or a field is not a number.
+    Raises BadInputError if the bag does not contain a topic or field, or if a field is not numeric.
     """
     paths = {name: _parse(name) for name in names}
     reader = BagReader(bag)
@@ -70,7 +75,10 @@ def read_fields(
 
 
 def _parse(name: str) -> tuple[str, list[str]]:
-    """Split "TOPIC.FIELD.FIELD" into the topic and the path of the field, and check both."""
+    """Split "TOPIC.FIELD.FIELD" into the topic and the list of nested field names.
+
+    Raises BadInputError if the topic or its field does not exist.
+    """
     topic, _, path = name.partition(".")
     try:
         fields: Any = find_topic(topic).message.model_fields
@@ -84,7 +92,12 @@ def _parse(name: str) -> tuple[str, list[str]]:
 
 
 def _get_number(bag: Path, name: str, message: BaseModel, path: Sequence[str]) -> Floats | None:
-    """Return the numbers (components,) of a field, or None if the field is null."""
+    """Return the numbers (components,) of a message field, or None if the field is null.
+
+    path: names of the nested fields that lead to the value.
+
+    Raises BadInputError if the field does not exist or is not numeric.
+    """
     value: Any = message
     for part in path:
         fields = type(value).model_fields if isinstance(value, BaseModel) else {}
@@ -127,7 +140,7 @@ def _error(bag: Path, what: str, name: str, known: list[str]) -> BadInputError:
 
 
 def draw_fields(series: Sequence[FieldSeries], image: Path, *, title: str) -> None:
-    """Draw one chart for each field, with a common time axis, into an image file.
+    """Draw one chart for each series, with a common time axis, into an image file.
 
     Raises BadInputError if the file cannot be written.
     """

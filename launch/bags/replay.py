@@ -1,11 +1,13 @@
-"""Replay one node with its recorded inputs on a virtual clock, twice, and compare the outputs.
+"""Replay one node with its recorded inputs on a virtual clock, and check its outputs.
 
-The node is built from the plan in the bag. Its status messages contain the order and time of the
-messages that it handled (`messages.types.Status.execution_log`). The replay follows this log, so it
-skips the same messages as the live node. Bags of earlier versions contain no log. For them, the
-replay passes all recorded inputs in the order in which they were recorded, and calls timers when
-they are due. Both replays must give the same bytes. The fields of the outputs are compared with the
-recorded fields, with a tolerance.
+The node is built from the resolved launch file in the bag. Its status messages contain the order
+and time of the messages that it handled (`messages.types.Status.execution_log`). The replay follows
+this log, so it skips the same messages as the live node. Bags of earlier versions contain no log.
+For them, the replay passes all recorded inputs to the node in the order in which they were
+recorded, and calls timers when they are due.
+
+The replay runs twice, and both runs must give the same bytes. The fields of the outputs are
+compared with the recorded fields, with a tolerance.
 """
 
 from __future__ import annotations
@@ -37,17 +39,17 @@ from flexsheet.nodes.node import Node, find_parameters_type, find_timers
 
 CLOCKS = "clocks"
 EPOCH = 0
-"""The epoch (start of a writer) in replayed messages. A live writer uses the time of its start."""
+"""The start time (epoch) in the headers of replayed messages. A live node uses its start time."""
 
 PROGRESS_STEPS = 100
-"""The number of replayed messages between two reports of progress."""
+"""The number of replayed messages between two calls of the progress function."""
 
 Progress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
 class SentMessage:
-    """A message that a replayed node published, as bytes."""
+    """An encoded message that a replayed node published."""
 
     topic: str
     data: tuple[bytes, ...]
@@ -55,13 +57,13 @@ class SentMessage:
 
 @dataclass(slots=True)
 class ReplayResult:
-    """The result of one replay of the bag.
+    """The result of one replay of a node.
 
     messages_in: number of input messages.
-    missing: number of logged messages that the bag does not contain.
-    by_execution_log: whether the replay followed the node's execution log, instead of the recorded
-        order.
-    logged_until_ns: end of the execution log, on the clock of the node's host.
+    missing: number of messages in the execution log that the bag does not contain.
+    by_execution_log: whether the replay followed the node's execution log. Otherwise it followed
+        the order of recording.
+    logged_until_ns: end of the execution log, ns, on the clock of the node's host.
     """
 
     messages_in: int = 0
@@ -73,7 +75,7 @@ class ReplayResult:
     last_error: str = ""
 
     def digest(self) -> str:
-        """Return the SHA-256 of all bytes that the node published, in order."""
+        """Return the SHA-256 of all messages that the node published, in hexadecimal digits."""
         digest = hashlib.sha256()
         for one in self.sent:
             digest.update(one.topic.encode())
@@ -85,10 +87,13 @@ class ReplayResult:
 
 @dataclass(slots=True)
 class Comparison:
-    """A comparison of replayed and recorded messages of one topic, paired by source timestamp.
+    """A comparison of the replayed with the recorded messages of one topic.
 
-    recorded, replayed, compared, beyond_tolerance: numbers of messages.
-    worst: maximum difference of each field that differs; 1 for values other than numbers.
+    Messages with the same source timestamp are compared.
+
+    recorded, replayed, compared: numbers of messages.
+    beyond_tolerance: number of messages that differ by more than the tolerance.
+    worst: maximum difference of each field that differs; 1 for values that are not numbers.
     """
 
     recorded: int = 0
@@ -100,9 +105,12 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """The result of `flexsheet bag verify`.
+    """The result of `flexsheet bag verify`: a replayed node compared with its recording.
 
-    `ReplayResult` explains `by_execution_log` and `missing`.
+    by_execution_log: whether the replay followed the node's execution log.
+    missing: number of messages in the execution log that the bag does not contain.
+    same_bytes: whether two replays gave the same bytes.
+    digest: SHA-256 of the replayed messages, in hexadecimal digits.
     """
 
     node: str
@@ -120,12 +128,12 @@ class Verification:
 
     @property
     def repeatable(self) -> bool:
-        """Return whether both replays succeeded and gave the same bytes."""
+        """Return whether both replays were without errors and gave the same bytes."""
         return self.same_bytes and self.errors == 0
 
     @property
     def as_live(self) -> bool:
-        """Return whether the replayed outputs equal the recorded outputs within the tolerance."""
+        """Return whether the replayed outputs equal the recorded outputs within a tolerance."""
         return all(
             one.beyond_tolerance == 0 and (one.compared > 0 or one.recorded == 0)
             for one in self.topics.values()
@@ -143,13 +151,14 @@ def verify(
     tolerance: float = 1e-6,
     progress: Progress = lambda done, total: None,
 ) -> Verification:
-    """Replay the node `name` of the bag's plan twice, and compare the outputs.
+    """Replay a node twice with its recorded inputs, and compare the outputs with the recording.
 
-    tolerance: maximum difference of a field.
+    name: name of the node.
+    tolerance: maximum difference of a field that counts as equal.
     progress: function that is called with the numbers of replayed and of all messages.
 
-    Raises BagError if the bag lacks the node, its inputs or a valid plan, or if the node cannot be
-    replayed.
+    Raises BagError if the bag does not contain the node, its inputs or a valid launch file, or if
+    the node cannot be replayed.
     """
     reader = BagReader(bag)
     plan = _read_plan(reader)
@@ -205,7 +214,7 @@ def refusal(node: ResolvedNode) -> str:
 async def replay(
     bag: Path, planned: ResolvedNode, progress: Progress = lambda done, total: None
 ) -> ReplayResult:
-    """Replay a newly built node once with its recorded inputs, and return its outputs."""
+    """Build a node, replay it once with its recorded inputs, and return its outputs."""
     result = ReplayResult()
     runs = read_runs(bag, planned.name)
     before, total = 0, sum(len(run.steps) for run in runs)
@@ -225,7 +234,7 @@ def _report_progress(progress: Progress, before: int, total: int, step: int) -> 
 
 
 def _build_node(planned: ResolvedNode, clock: VirtualClock, result: ReplayResult) -> Node:
-    """Build the node as a launcher does. Its published messages are stored in `result`."""
+    """Build the node as a launcher does, but store its published messages in `result`."""
 
     def store(topic: Topic, message: Message, header: Header) -> None:
         result.sent.append(
@@ -259,7 +268,7 @@ async def _set_up(node: Node, result: ReplayResult) -> AsyncIterator[None]:
 async def _replay_in_order(
     bag: Path, planned: ResolvedNode, result: ReplayResult, progress: Progress
 ) -> None:
-    """Pass all recorded inputs to the node in the order in which they were recorded."""
+    """Pass all recorded inputs to the node, in the order in which they were recorded."""
     ports: dict[str, list[str]] = {}
     for port in planned.inputs:
         ports.setdefault(port.topic, []).append(port.port)
@@ -291,7 +300,11 @@ async def _replay_run(
     result: ReplayResult,
     report: Callable[[int], None],
 ) -> None:
-    """Pass the inputs of one run to the node in the order of its execution log."""
+    """Pass recorded inputs to the node, in the order of the node's execution log.
+
+    run: execution log of the node from one start to the next.
+    report: function that is called with the number of each step.
+    """
     clock = VirtualClock(int(run.steps[0, 3]), clock_id=run.clock_id)
     node = _build_node(planned, clock, result)
     names, timers = list(node.inputs), find_timers(type(node))
@@ -319,10 +332,10 @@ async def _replay_run(
 
 @dataclass(frozen=True, slots=True)
 class NodeRun:
-    """The execution log of a node from one of its starts to the next.
+    """The execution log of a node, from one start of the node to the next start.
 
-    steps (n, 4): one row per executed step: index of the input, or -1 - index of the timer;
-        sequence number; epoch; time, ns.
+    steps: integers (n, 4), one row for each executed step. The columns are input, sequence number,
+        epoch and time (ns). The input is its index, or -1 minus the index of a timer.
     """
 
     clock_id: str
@@ -330,9 +343,9 @@ class NodeRun:
 
 
 def read_runs(bag: Path, name: str) -> list[NodeRun]:
-    """Read the execution logs of a node, one per start.
+    """Read the execution logs of a node from a bag, one for each start of the node.
 
-    Return an empty list if the bag has none.
+    Return an empty list if the bag contains no log.
     """
     logs: dict[int, list[Ints]] = {}
     clock_ids: dict[int, str] = {}
@@ -350,10 +363,10 @@ def read_runs(bag: Path, name: str) -> list[NodeRun]:
 
 
 class RecordedInputs:
-    """A reader of a node's recorded inputs, which reads only as far as the execution log needs."""
+    """A reader that finds the recorded inputs of a node in the order of the execution log."""
 
     LOOK_AHEAD = 5000
-    """The number of messages to read before a logged message counts as missing."""
+    """The maximum number of further messages that are searched for a logged message."""
 
     def __init__(self, bag: Path, node: Node) -> None:
         self._bag, self._node = bag, node
@@ -367,9 +380,9 @@ class RecordedInputs:
         }
 
     def latched_before(self, run: NodeRun) -> list[tuple[str, Message, Header]]:
-        """Return the latched messages that the node had before the first step of the run.
+        """Return the latched messages that the node had received before the run started.
 
-        The result contains (port, message, header) of the last message of each port.
+        The result contains (port, message, header) for the last message of each port.
         """
         steps = {(names, *key) for names, *key in run.steps[:, :3].tolist()}
         latched = {
@@ -389,7 +402,10 @@ class RecordedInputs:
         return [(port, *entry) for port, entry in found.items()]
 
     def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
-        """Return the message of a port with this sequence number and epoch, or None."""
+        """Return the message of an input port with the given sequence number and epoch.
+
+        Return None if the bag does not contain the message.
+        """
         waiting = self._waiting[port]
         latest = self._node.inputs[port].topic.delivery is Delivery.LATEST
         read = seen = 0
@@ -423,7 +439,7 @@ class RecordedInputs:
 
 
 class Timers:
-    """A scheduler that calls the periodic methods of a node on a virtual clock."""
+    """A scheduler that calls the periodic methods of a node at due times on a virtual clock."""
 
     def __init__(self, node: Node, start_ns: int) -> None:
         self._node = node
@@ -434,7 +450,7 @@ class Timers:
         self._due_ns = dict.fromkeys(self._periods_ns, start_ns)
 
     async def call_until(self, now_ns: int, clock: VirtualClock) -> None:
-        """Call the methods that are due up to `now_ns`, in the order of their times."""
+        """Call the methods that are due up to `now_ns`, in the order of their due times."""
         while self._due_ns:
             next_one = min(self._due_ns, key=lambda one: (self._due_ns[one], one[1].method))
             due_ns = self._due_ns[next_one]
@@ -448,7 +464,10 @@ class Timers:
 def compare(
     bag: Path, node: ResolvedNode, replayed: ReplayResult, tolerance: float
 ) -> dict[str, Comparison]:
-    """Compare the node's recorded outputs with the replayed outputs, by topic."""
+    """Compare the recorded outputs of a node with its replayed outputs, topic by topic.
+
+    tolerance: maximum difference of a field that counts as equal.
+    """
     outputs = {port.topic for port in node.outputs} - {"status"}
     recorded: dict[str, dict[int, Message]] = {topic: {} for topic in outputs}
     comparisons = {topic: Comparison() for topic in sorted(outputs)}
@@ -479,9 +498,9 @@ def compare(
 def compute_field_differences(
     one: BaseModel, other: BaseModel, prefix: str = ""
 ) -> dict[str, float]:
-    """Return the difference of each field in which two messages differ, by field name.
+    """Return the differences between two messages, by the name of each field that differs.
 
-    It is the maximum absolute difference of numbers, and 1 for other values.
+    A difference is the maximum absolute difference of numbers, or 1 for other values.
     """
     found: dict[str, float] = {}
     for name in type(one).model_fields:
@@ -506,7 +525,10 @@ def _difference(a: Any, b: Any) -> float:
 
 
 def _distance(a: Floats, b: Floats) -> float:
-    """Return the largest difference of two arrays; infinite if a value is NaN in only one array."""
+    """Return the maximum absolute difference between two arrays of the same shape.
+
+    The result is infinite if an element is NaN in only one of the arrays.
+    """
     same = (a == b) | (np.isnan(a) & np.isnan(b))
     with np.errstate(invalid="ignore"):
         apart = np.where(same, 0.0, np.abs(a - b))
@@ -514,9 +536,9 @@ def _distance(a: Floats, b: Floats) -> float:
 
 
 def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: ResolvedNode) -> None:
-    """Raise BagError if an input topic was not recorded.
+    """Raise BagError if the inputs of the node were not recorded.
 
-    A recorded topic may have no messages. A topic that no node of the graph publishes may be
+    A recorded topic may have no messages. An input that no node of the graph publishes may be
     missing.
     """
     recorded = set(reader.topics)

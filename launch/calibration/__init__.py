@@ -1,1 +1,1 @@
-"""Calibrate cameras, arms, projector and sheet offline, from files or from the simulator."""
+"""Calibrate the cameras, arms, projector and sheet from files, recordings or the simulator."""

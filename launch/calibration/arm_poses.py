@@ -1,10 +1,11 @@
 """Read, record and simulate poses of an arm with a calibration board on its flange.
 
 The folder for `flexsheet calibrate arms` contains `joints.csv` and images. Each row of the table is
-a pose of the arm at rest: six joint angles (`j1_deg` ... `j6_deg`, or `j1_rad` ...) with two image
-files (`left`, `right`). Instead of images it may give the board's pose in the left camera's frame
-(`board_x_m`, `board_y_m`, `board_z_m`: first corner; `board_rx_rad`, `board_ry_rad`,
-`board_rz_rad`: rotation vector).
+a pose of the arm at rest. It contains six joint angles (`j1_deg` ... `j6_deg`, or `j1_rad` ...) and
+the names of two image files (`left`, `right`). Instead of images, a row may contain the pose of the
+board in the left camera's frame. The columns are then `board_x_m`, `board_y_m`, `board_z_m`
+(position of the first corner), and `board_rx_rad`, `board_ry_rad`, `board_rz_rad` (rotation
+vector).
 """
 
 from __future__ import annotations
@@ -65,18 +66,24 @@ BOARD_COLUMNS = (
 )
 
 MAX_STILL_RAD, MIN_STILL_S = 0.0005, 0.7
-"""The maximum joint motion of an arm that counts as resting, and minimum duration of the rest."""
+"""The maximum joint motion (rad) and the minimum duration (s) of an arm at rest."""
 
 MIN_NEW_ROTATION_RAD, MIN_NEW_SHIFT_M = 0.05, 0.01
-"""The minimum rotation or translation of the board between two recorded poses."""
+"""The minimum rotation (rad) and translation (m) of the board between two recorded poses.
+
+A pose is new if it meets one of the two minimums.
+"""
 
 SIMULATED_BASE_M, SIMULATED_BASE_RAD, SIMULATED_JOINT_RAD = 0.005, 0.01, 2e-4
-"""The standard deviations of the simulated bases from those in the scene, and of the joint errors.
+"""The standard deviations of the errors of a simulated arm.
+
+The errors are the position (m) and rotation (rad) of its base relative to the scene, and the joint
+angles (rad).
 """
 
 
 class ArmPosesError(FlexsheetError, ValueError):
-    """Raised for a folder of arm poses that cannot be used."""
+    """Raised if a folder of arm poses cannot be used for a calibration."""
 
     code = "arm-poses"
     exit_code = 2
@@ -84,7 +91,11 @@ class ArmPosesError(FlexsheetError, ValueError):
 
 
 def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRig:
-    """Make the stereo camera at the scene's pose, with the calibration's or the scene's optics."""
+    """Return the lenses and poses of the stereo camera.
+
+    The lenses and the transform between them are from the calibration, or from the scene without a
+    calibration. The pose in the world is always from the scene.
+    """
     measured = scene.camera if calibration is None else calibration
     pose = scene.camera.world_from_left
     return LensRig(
@@ -103,9 +114,11 @@ def _make_camera_lens(lens: SceneLens) -> CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class PoseRow:
-    """A row of a table of arm poses, with either image files or a board pose.
+    """A row of the table of arm poses. It contains either two image files or a board pose.
 
-    joints_rad: (6,). images: left and right image file. left_from_board: board pose (4, 4).
+    joints_rad: joint angles (6,).
+    images: left and right image file; None if the row contains a board pose.
+    left_from_board: board pose (4, 4) in the left camera's frame; None if the row names images.
     """
 
     name: str
@@ -115,7 +128,10 @@ class PoseRow:
 
 
 def read_pose_table(folder: Path) -> list[PoseRow]:
-    """Read the rows of the table in a folder; raises ArmPosesError with row and column."""
+    """Read the table of arm poses in a folder.
+
+    Raises ArmPosesError, which names row and column, if the table is missing or invalid.
+    """
     path = folder / TABLE
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -128,20 +144,21 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
         ) from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise ArmPosesError(
-            f"{path}: invalid CSV: {error}; save it as comma-separated values"
+            f"{path}: the file is not valid CSV: {error}; save it as comma-separated values"
         ) from error
     unit = next(
         (one for one in ("deg", "rad") if all(f"{j}_{one}" in columns for j in JOINTS)), None
     )
     if unit is None:
         raise ArmPosesError(
-            f"{path}: found columns {', '.join(columns) or 'none'}; add j1_deg to j6_deg, or "
-            "j1_rad to j6_rad"
+            f"{path}: the table has no joint angles (columns: {', '.join(columns) or 'none'}); add "
+            "the columns j1_deg to j6_deg, or j1_rad to j6_rad"
         )
     by_pose = all(name in columns for name in BOARD_COLUMNS)
     if not by_pose and not {"left", "right"} <= set(columns):
         raise ArmPosesError(
-            f"{path}: missing columns; add left and right (images), or {', '.join(BOARD_COLUMNS)}"
+            f"{path}: the table has neither images nor board poses; add the columns left and "
+            f"right, or {', '.join(BOARD_COLUMNS)}"
         )
     rows = []
     for number, line in enumerate(lines, start=2):
@@ -155,7 +172,7 @@ def read_pose_table(folder: Path) -> list[PoseRow]:
             images = (folder / (line["left"] or ""), folder / (line["right"] or ""))
             rows.append(PoseRow(line["left"] or f"row {number}", joints_rad, images, None))
     if not rows:
-        raise ArmPosesError(f"{path}: does not contain rows; add one per pose of the arm")
+        raise ArmPosesError(f"{path}: the table has no rows; add one row per pose of the arm")
     return rows
 
 
@@ -180,11 +197,15 @@ def _parse_numbers(
 def read_detections(
     folder: Path, board: Board, rig: LensRig, size: tuple[int, int], progress: Progress
 ) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
-    """Detect the board in the images in a folder.
+    """Read the table of arm poses in a folder, and detect the board in the images.
 
-    Return the detections, and (name, reason) of the poses in whose images the board was not
-    detected. size: required (width, height), in px, of the images. Raises ArmPosesError and
-    CalibrationError.
+    Return the detections, and (pose name, reason) for each pose in which the board was not
+    detected.
+
+    rig: stereo camera. A board pose in the table is projected into its images.
+    size: required (width, height) of the images, px.
+
+    Raises ArmPosesError for an invalid table, and CalibrationError for unusable images.
     """
     rows = read_pose_table(folder)
     if rows[0].images is None:
@@ -195,7 +216,7 @@ def read_detections(
     )
     if found_size != size:
         raise ArmPosesError(
-            f"{folder}: images of {found_size[0]}x{found_size[1]} px, but the camera's "
+            f"{folder}: the images have {found_size[0]}x{found_size[1]} px, but the camera's "
             f"calibration is for {size[0]}x{size[1]}; capture images of that size"
         )
     detections, missing = [], []
@@ -218,7 +239,10 @@ def _make_detection(name: str, joints_rad: Floats, pair: BoardPair, board: Board
 
 
 def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
-    """Project a board whose pose the CSV row states into both images, without noise."""
+    """Compute the image corners of a board whose pose is known, without noise.
+
+    Raises ArmPosesError if the board is behind a camera.
+    """
     assert row.left_from_board is not None
     points = board_points(board)
     views = []
@@ -234,9 +258,10 @@ def _project_board(row: PoseRow, board: Board, rig: LensRig) -> BoardDetection:
 
 
 class PoseRecorder:
-    """A recorder that stores a pose to a folder whenever the arm rests and the board's pose is new.
+    """A recorder that stores joint angles and images of a calibration board on an arm.
 
-    Joint angles and images must be added in the order of their times (s, on one clock).
+    It stores a pose whenever the arm is at rest and the board has a new pose. Joint angles and
+    images must be added in the order of their times (s, on one clock).
     """
 
     def __init__(self, folder: Path, board: Board, rig: LensRig) -> None:
@@ -248,13 +273,18 @@ class PoseRecorder:
         self._poses: list[Floats] = []
 
     def update_joints(self, joints_rad: Floats, time_s: float) -> None:
-        """Add measured joint angles (6,), rad."""
+        """Add measured joint angles (6,), in rad, at `time_s`."""
         moved = self._joints is None or np.abs(joints_rad - self._joints).max() > MAX_STILL_RAD
         if moved:
             self._joints, self._still_since_s = joints_rad, time_s
 
     def update_images(self, left: Image, right: Image, exposed_s: float) -> str:
-        """Add an image pair (h, w), record it if its pose is new, and return a hint."""
+        """Add an image pair, each (h, w), and store it if the pose of the board is new.
+
+        Return an instruction to the user, or the reason why the pair was not stored.
+
+        exposed_s: time of the exposure.
+        """
         joints = self._joints
         if joints is None:
             return "no message from the arm yet"
@@ -273,7 +303,7 @@ class PoseRecorder:
         return f"pose {self.count} recorded; rotate and move the flange"
 
     def _estimate_pose(self, pair: BoardPair) -> Floats:
-        """Estimate left_from_board (4, 4) from the left image, to compare it with earlier poses."""
+        """Estimate the board's pose (4, 4) in the left camera's frame from the left image."""
         points = board_points(self._board)[pair.left.ids]
         lens = self._rig.left
         _, rotation, shift = cv2.solvePnP(points, pair.left.pixels, lens.matrix, lens.distortion)
@@ -291,7 +321,13 @@ class PoseRecorder:
 
 
 def add_row(folder: Path, names: list[str], joints_rad: Floats) -> None:
-    """Append a pose to a folder's table of joint angles; create the table if needed."""
+    """Append a pose to the table of joint angles in a folder.
+
+    The table is created if it does not exist.
+
+    names: names of the left and right image file.
+    joints_rad: joint angles (6,).
+    """
     path = folder / TABLE
     exists = path.exists()
     with path.open("a", newline="", encoding="utf-8") as file:
@@ -310,7 +346,7 @@ def _is_same_pose(pose: Floats, other: Floats) -> bool:
 
 
 def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
-    """Return a random world_from_base (4, 4) for the simulated arm, near the pose in the scene."""
+    """Return a random pose world_from_base (4, 4) of a simulated arm near its pose in the scene."""
     pose: Pose = getattr(scene.arms, side).world_from_base
     nominal = pose_matrix(pose)
     random = np.random.default_rng([seed, side == "left"])
@@ -321,11 +357,11 @@ def draw_true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
 
 
 class SimulatedArm:
-    """A simulated arm without a sheet: true pose of its base, and true errors of its angles.
+    """A simulated arm without a sheet, whose base pose and joint angles have errors.
 
-    Without an apparatus (true hardware parameters), the base deviates at random from the scene's,
-    and each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, its base pose and
-    joint offsets are used, and each joint rests at a random angle within its backlash.
+    Without an apparatus (true hardware parameters), the base deviates at random from the scene, and
+    each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, the arm has its base
+    pose and joint offsets, and each joint rests at a random angle within its backlash.
     """
 
     def __init__(self, scene: Scene, side: Side, apparatus: Apparatus | None, *, seed: int) -> None:
@@ -344,9 +380,9 @@ class SimulatedArm:
         )
 
     def place_flange(self, joints_rad: Floats, *, exact: bool = False) -> Floats:
-        """Return the true world_from_flange (4, 4) for reported joint angles (6,).
+        """Return the true pose world_from_flange (4, 4) for reported joint angles (6,), in rad.
 
-        exact: leave out the errors that differ from pose to pose.
+        exact: whether random joint errors are omitted.
         """
         if exact:
             errors = np.zeros(6)
@@ -369,10 +405,14 @@ def simulate_poses(
     seed: int,
     apparatus: Apparatus | None = None,
 ) -> Iterator[int]:
-    """Write images of a board on the simulated arm to a folder; yield the count after each pose.
+    """Simulate images of a board on an arm, and write images and joint angles to a folder.
 
-    The images have blur and noise. apparatus: true camera and arms; None: arms that deviate at
-    random from the scene. Raises BoardError for a board that cannot be rendered.
+    The images have blur and noise. Yield the number of finished poses after each pose.
+
+    places: number of poses.
+    apparatus: true parameters of camera and arms; None: the arms deviate at random from the scene.
+
+    Raises BoardError for a board that cannot be rendered.
     """
     random = np.random.default_rng([seed, side == "left", 1])
     true_camera = apply_apparatus(scene, apparatus).camera

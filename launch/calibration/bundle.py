@@ -1,9 +1,10 @@
-"""Fit a stereo rig to all corners of all board poses by least squares, with its covariance.
+"""Fit a stereo camera and all board poses to the detected board corners by least squares.
 
-The unknowns are the rig (22 parameters, `PARAMETERS`) and the board's pose in each image pair (6).
-The corners of a pair depend only on the rig and on that pose, so the poses can be eliminated. A
-system of 22 equations remains (Schur complement; Triggs et al., Bundle Adjustment: A Modern
-Synthesis, 1999, section 6). Lens model: pinhole with distortion k1, k2, p1, p2.
+The unknowns are the parameters of the stereo camera, or rig (22, `PARAMETERS`), and the board's
+pose in each image pair (6). The corners of a pair depend only on the rig and on the pose of that
+pair, so the poses can be eliminated. A system of 22 equations remains (Schur complement; Triggs et
+al., Bundle Adjustment: A Modern Synthesis, 1999, section 6). The lens model is a pinhole with the
+distortion coefficients k1, k2, p1, p2.
 """
 
 from __future__ import annotations
@@ -27,17 +28,20 @@ PARAMETERS = (
     *(f"right.{name}" for name in LENS),
     *(f"right_from_left.{name}" for name in ("rx_rad", "ry_rad", "rz_rad", "tx_m", "ty_m", "tz_m")),
 )
-"""The names of the rig's parameters, in their order; rx, ry, rz are a rotation vector."""
+"""The names of the 22 parameters of a stereo rig, in their order.
+
+The names with rx, ry and rz are the components of a rotation vector.
+"""
 
 LEFT, RIGHT, STAND = slice(0, 8), slice(8, 16), slice(16, 22)
 
 MAX_STEPS = 50
 CONVERGED_COST_CHANGE = 1e-9
-"""The relative change of the cost (sum of squared residuals) below which the iteration ends."""
+"""The relative change of the sum of squared residuals below which the iteration ends."""
 
 
 class NotDeterminedError(FlexsheetError, ValueError):
-    """Raised if the image pairs do not determine all parameters of the rig."""
+    """Raised if the image pairs do not determine all parameters of the stereo rig."""
 
     code = "not-determined"
     remedy = "Add image pairs that differ in tilt and distance."
@@ -45,12 +49,14 @@ class NotDeterminedError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RigFit:
-    """A fitted stereo rig and its residuals.
+    """A fitted stereo rig and the residuals of the fit.
 
-    rig: parameters (22,). poses: poses of the board (pairs, 6), rotation vector and position in the
-    left camera's frame. residuals: for each pair, detected minus projected corners (n, 2), in px,
-    of the left and of the right image. sigma_px: standard deviation of one corner coordinate.
-    covariance: covariance matrix (22, 22) of the rig's parameters.
+    rig: parameters (22,).
+    poses: board poses (pairs, 6) in the left camera's frame, as rotation vector and position.
+    residuals: detected minus projected corners (n, 2), in px, of the left and right image of each
+        pair.
+    sigma_px: standard deviation of one coordinate of a corner.
+    covariance: covariance matrix (22, 22) of the parameters.
     """
 
     rig: Floats
@@ -60,43 +66,49 @@ class RigFit:
     covariance: Floats
 
     def pair_rms_px(self) -> Floats:
-        """Return the rms corner residuals (pairs, 2), in px, of the left and right views."""
+        """Return the rms corner residuals (pairs, 2), in px, of the left and right images."""
         return np.array([[rms_distance(view) for view in views] for views in self.residuals])
 
     def rms_px(self) -> float:
-        """Return the rms distance (px) between detected and projected corners of both views."""
+        """Return the rms distance (px) between detected and projected corners of all images."""
         return rms_distance(np.concatenate([view for views in self.residuals for view in views]))
 
 
 def to_floats(array: object) -> Floats:
-    """Convert an OpenCV result to a double-precision array."""
+    """Convert an array of any type, such as an OpenCV result, to double precision."""
     return np.asarray(array, dtype=np.float64)
 
 
 def rms_distance(shifts: Floats) -> float:
-    """Return the root mean square length of shifts (n, 2)."""
+    """Return the root mean square length of two-dimensional vectors (n, 2)."""
     return float(np.sqrt(np.mean(np.sum(shifts * shifts, axis=1))))
 
 
 def lens_arrays(lens: Floats) -> tuple[Floats, Floats]:
-    """Return the camera matrix (3, 3) and OpenCV's distortion (5,) for lens parameters (8,)."""
+    """Return the camera matrix (3, 3) and OpenCV's distortion coefficients (5,) of a lens.
+
+    lens: parameters (8,) fx, fy, cx, cy (px), k1, k2, p1, p2.
+    """
     fx, fy, cx, cy, k1, k2, p1, p2 = lens
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     return matrix, np.array([k1, k2, p1, p2, 0.0])
 
 
 def pose_transform(pose: Floats) -> Floats:
-    """Return the transform (4, 4) that belongs to a pose (6,): rotation vector and position."""
+    """Convert a pose (6,), rotation vector (rad) and position (m), to a transform (4, 4)."""
     return rigid.transform(rigid.rotation_from_vector(pose[:3]), pose[3:])
 
 
 def pose_vector(transform: Floats) -> Floats:
-    """Return the pose (6,), rotation vector and position, of a transform (4, 4)."""
+    """Convert a transform (4, 4) to a pose (6,), rotation vector (rad) and position (m)."""
     return np.concatenate([rigid.vector_from_rotation(transform[:3, :3]), transform[:3, 3]])
 
 
 def _project(points: Floats, pose: Floats, lens: Floats) -> tuple[Floats, Floats, Floats]:
-    """Project points to pixels (n, 2), with derivatives by pose (2n, 6) and by lens (2n, 8)."""
+    """Project points (n, 3), in m, to pixels (n, 2).
+
+    Return the pixels and their derivatives with respect to the pose (2n, 6) and the lens (2n, 8).
+    """
     matrix, distortion = lens_arrays(lens)
     pixels, slope = cv2.projectPoints(points, pose[:3], pose[3:], matrix, distortion)
     slopes = to_floats(slope)
@@ -104,9 +116,12 @@ def _project(points: Floats, pose: Floats, lens: Floats) -> tuple[Floats, Floats
 
 
 def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
-    """Compose a board pose with the pose between the cameras.
+    """Transform a board pose (6,) from the left to the right camera's frame.
 
-    Return the pose (6,) in the right camera's frame, and its derivatives (6, 6) by both poses.
+    Return the pose (6,) in the right camera's frame, and its derivatives (6, 6) with respect to
+    `pose` and `stand`.
+
+    stand: pose (6,) of the left camera in the right camera's frame.
     """
     rotation, position, *slopes = cv2.composeRT(pose[:3], pose[3:], stand[:3], stand[3:])
     rr1, rt1, rr2, rt2, tr1, tt1, tr2, tt2 = slopes
@@ -117,10 +132,11 @@ def _compose(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class Linearized:
-    """The linearized residuals of one image pair.
+    """The residuals of one image pair, with derivatives.
 
-    shifts: residuals (m,), px. by_rig, by_pose: derivatives (m, 22) by the rig and (m, 6) by the
-    pose.
+    shifts: residuals (m,), px.
+    by_rig: derivatives (m, 22) with respect to the parameters of the rig.
+    by_pose: derivatives (m, 6) with respect to the board pose.
     """
 
     shifts: Floats
@@ -129,9 +145,11 @@ class Linearized:
 
 
 def linearize(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Linearized:
-    """Linearize the residuals of an image pair at a rig (22,) and a board pose (6,).
+    """Compute the residuals of an image pair and their derivatives.
 
     board: corners of the board (n, 3), m.
+    rig: parameters of the stereo rig (22,).
+    pose: board pose (6,) in the left camera's frame.
     """
     left_points, right_points = board[pair.left.ids], board[pair.right.ids]
     left, left_by_pose, left_by_lens = _project(left_points, pose, rig[LEFT])
@@ -153,10 +171,12 @@ def linearize(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Line
 
 @dataclass(frozen=True, slots=True)
 class _Reduced:
-    """The normal equations of the rig after elimination of the poses.
+    """The normal equations of the rig after elimination of the board poses.
 
-    matrix, side: matrix (22, 22) and right-hand side (22,). poses: for each pose, the inverse of
-    its block (6, 6), its gradient (6,) and its coupling to the rig (22, 6).
+    matrix: matrix (22, 22).
+    side: right-hand side (22,).
+    poses: for each board pose, the inverse of its block (6, 6), its gradient (6,) and its coupling
+        to the rig (22, 6).
     """
 
     matrix: Floats
@@ -165,7 +185,10 @@ class _Reduced:
 
 
 def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
-    """Make the Levenberg-Marquardt equations, whose diagonal is multiplied by 1 + `damping`."""
+    """Return the Levenberg-Marquardt equations of the rig, with the board poses eliminated.
+
+    damping: number that is added to 1 to give the factor of the diagonal.
+    """
     matrix, side = np.zeros((22, 22)), np.zeros(22)
     poses = []
     for pair in pairs:
@@ -181,9 +204,9 @@ def _eliminate_poses(pairs: Sequence[Linearized], damping: float) -> _Reduced:
 
 
 def _scaled_inverse(matrix: Floats) -> Floats:
-    """Invert a symmetric positive definite matrix whose rows have very different units.
+    """Invert a symmetric positive definite matrix, whose rows may have very different units.
 
-    Raises NotDeterminedError for a matrix that is not positive definite or is nearly singular.
+    Raises NotDeterminedError if the matrix is not positive definite or is nearly singular.
     """
     scale = np.sqrt(np.diag(matrix))
     if not (np.isfinite(scale).all() and (scale > 0).all()):
@@ -203,9 +226,13 @@ def _scaled_inverse(matrix: Floats) -> Floats:
 
 
 def fit_rig(pairs: Sequence[BoardPair], board: Floats, *, rig: Floats, poses: Floats) -> RigFit:
-    """Fit the rig and the poses to all corners, from initial values (Levenberg-Marquardt).
+    """Fit a stereo rig and the board poses to all corners by the Levenberg-Marquardt method.
 
-    board: corners of the board (n, 3), m. Raises NotDeterminedError.
+    board: corners of the board (n, 3), m.
+    rig: initial parameters (22,).
+    poses: initial board poses (pairs, 6) in the left camera's frame.
+
+    Raises NotDeterminedError if the pairs do not determine the rig.
     """
     rig, poses = rig.copy(), poses.copy()
 
@@ -235,7 +262,8 @@ def fit_rig(pairs: Sequence[BoardPair], board: Floats, *, rig: Floats, poses: Fl
     freedom = numbers - len(PARAMETERS) - poses.size
     if freedom < 1:
         raise NotDeterminedError(
-            f"{numbers} corner coordinates do not determine {numbers - freedom} unknowns"
+            f"{numbers} corner coordinates do not determine {numbers - freedom} unknowns; add "
+            "image pairs"
         )
     variance = cost / freedom
     return RigFit(
@@ -254,7 +282,11 @@ def _split_views(linearized: Linearized, pair: BoardPair) -> tuple[Floats, Float
 
 
 def board_pose(view: BoardView, board: Floats, lens: Floats) -> Floats:
-    """Estimate the pose (6,) of the board in a camera's frame from one view."""
+    """Estimate the pose (6,) of the board in a camera's frame from one image.
+
+    board: corners of the board (n, 3), m.
+    lens: lens parameters (8,).
+    """
     points = board[view.ids]
     _, rotation, position = cv2.solvePnP(points, view.pixels, *lens_arrays(lens))
     return np.concatenate([rotation.ravel(), position.ravel()])

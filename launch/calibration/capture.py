@@ -1,7 +1,7 @@
-"""Select image pairs of a board during live capture for a stereo calibration.
+"""Select image pairs of a board for a stereo calibration while the camera is running.
 
-A pair is accepted if the board is at rest in a new pose and adds coverage: cells of the image,
-tilts, distances, or the number of pairs.
+A pair is accepted if the board is at rest in a new pose and if the pair improves the coverage. The
+coverage counts cells of the image, tilts and distances of the board, and the number of pairs.
 """
 
 from __future__ import annotations
@@ -21,29 +21,31 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 COLUMNS, ROWS = 4, 3
-"""The number of columns and rows of the cells into which an image is divided to count coverage."""
+"""The numbers of columns and rows of image cells in which the coverage is counted."""
 
 MIN_CELL_CORNERS = 2
 UPRIGHT_RAD = np.radians(12.0)
 STILL_PX = 0.5
-"""The maximum motion (px) of the corners between images of a board that counts as resting."""
+"""The maximum motion (px) of the board's corners between two images of a board at rest."""
 
 NEW_POSE_PX = 12.0
-"""The minimum distance (px) of the corners between a new board pose and every accepted one."""
+"""The minimum median distance (px) of corners between a new pose and each accepted pose."""
 
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
 NEAR, FAR = 0.55, 0.35
-"""The limits of near and far distances, as length of the board's diagonal over the image's
-diagonal."""
+"""The minimum size of a near board, and the maximum size of a far board.
+
+The size is the length of the board's diagonal divided by the length of the image's diagonal.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """A condition (such as an image cell or a tilt) that a minimum number of image pairs must meet.
+    """A condition, such as an image cell or a tilt, that a minimum number of image pairs must meet.
 
-    group: "left cell", "right cell", "tilt", "distance" or "pairs". name: column and row of a cell,
-    or the name of the range.
+    group: "left cell", "right cell", "tilt", "distance" or "pairs".
+    name: column and row of a cell, or name of a tilt or distance.
     """
 
     group: str
@@ -51,10 +53,10 @@ class Bin:
 
 
 def compute_required_counts(pairs: int) -> dict[Bin, int]:
-    """Return the required number of image pairs in each bin, for a total of `pairs`.
+    """Return the required number of image pairs for each condition, for a total of `pairs`.
 
-    Cells at the left edge of the left image and the right edge of the right image are excluded,
-    because at most distances only one camera sees them.
+    Cells at the outer edges of the two images are excluded, because only one camera sees them at
+    most distances. These are the left edge of the left image and the right edge of the right image.
     """
     count = max(1, round(0.1 * pairs))
     required = {Bin("pairs", ""): pairs}
@@ -71,9 +73,9 @@ def compute_required_counts(pairs: int) -> dict[Bin, int]:
 
 @dataclass(frozen=True, slots=True)
 class PairAssessment:
-    """The assessment of one image pair.
+    """The decision about one image pair.
 
-    hint: instruction to the user for the next board pose.
+    hint: instruction to the user for the next pose of the board.
     """
 
     accepted: bool
@@ -81,7 +83,7 @@ class PairAssessment:
 
 
 class Capture:
-    """A selector of image pairs for a calibration, which keeps count of the coverage."""
+    """A selector of image pairs for a calibration. It counts the pairs that meet each condition."""
 
     def __init__(
         self,
@@ -92,10 +94,12 @@ class Capture:
         pairs: int = 20,
         still_images: int = 4,
     ) -> None:
-        """Create a selector without pairs.
+        """Create a selector that has not yet accepted a pair.
 
-        lens: approximate lens of the left camera. still_images: number of consecutive images at
-        rest that a pair requires.
+        lens: approximate lens of the left camera.
+        size: width and height of the images, px.
+        pairs: number of pairs to accept.
+        still_images: number of consecutive images in which the board must be at rest.
         """
         self.board = board
         self.needed = compute_required_counts(pairs)
@@ -116,11 +120,11 @@ class Capture:
         return not self.missing()
 
     def missing(self) -> list[Bin]:
-        """Return the bins that lack coverage, in the order in which the user is asked for them."""
+        """Return the conditions for which more image pairs are required."""
         return [one for one, count in self.needed.items() if self.counts[one] < count]
 
     def add_pair(self, left: Image, right: Image) -> PairAssessment:
-        """Assess a pair of grey images (h, w), and add it to the coverage if it is accepted."""
+        """Decide whether to accept a pair of grey images (h, w), and count an accepted pair."""
         views = self._finder.find(left), self._finder.find(right)
         pair = match_views(*views, self.board, ("the left image", "the right image"))
         if isinstance(pair, str):
@@ -142,7 +146,7 @@ class Capture:
         return PairAssessment(True, self._make_hint("accepted; "))
 
     def _find_bins(self, pair: BoardPair) -> list[Bin]:
-        """Return the bins to which a pair contributes."""
+        """Return the conditions that an image pair meets."""
         pose = board_pose(pair.left, self._points, self._lens)
         bins = [Bin("pairs", ""), Bin("tilt", classify_tilt(pose, self._middle))]
         bins.append(Bin("distance", self._classify_distance(pose)))
@@ -164,7 +168,10 @@ class Capture:
         return "near" if fraction > NEAR else "far" if fraction < FAR else "middle"
 
     def _make_hint(self, prefix: str) -> str:
-        """Return the next instruction to the user, preceded by `prefix`."""
+        """Return an instruction to the user for the next pose of the board.
+
+        prefix: text before the instruction.
+        """
         missing = self.missing()
         if not missing:
             return prefix + "coverage complete"
@@ -187,7 +194,7 @@ def _describe_pose(one: Bin) -> str:
 
 
 def _describe_cell(cell: Bin) -> str:
-    """Describe the position of a cell, such as "at the top left of"."""
+    """Return the position of a cell in words, such as "at the top left of"."""
     column, row = (int(part) for part in cell.name.split(","))
     height = ("top", "middle", "bottom")[row]
     across = ("left", "centre left", "centre right", "right")[column]
@@ -195,10 +202,13 @@ def _describe_cell(cell: Bin) -> str:
 
 
 def classify_tilt(pose: Floats, middle: Floats) -> str:
-    """Classify the tilt of a board pose (6,) in the left camera's frame as one of TILTS.
+    """Return the tilt of a board relative to the line of sight, as one of TILTS.
 
-    Only the direction of the board's normal counts, so rotation within the board's plane has no
-    effect. middle: centre (3,), in m, of the board in its own frame.
+    Only the direction of the board's normal matters. A rotation within the board's plane has no
+    effect.
+
+    pose: pose of the board (6,) in the left camera's frame.
+    middle: centre of the board (3,), in m, in its own frame.
     """
     transform = pose_transform(pose)
     centre = transform[:3, :3] @ middle + transform[:3, 3]
@@ -215,7 +225,10 @@ def classify_tilt(pose: Floats, middle: Floats) -> str:
 
 
 def _measure_shift(pair: BoardPair, other: BoardPair) -> float:
-    """Return the median displacement (px) of common corners; infinite if there are none."""
+    """Return the median displacement (px) of the corners that two left images have in common.
+
+    The result is infinite if the images have no corners in common.
+    """
     _, here, there = np.intersect1d(
         pair.left.ids, other.left.ids, assume_unique=True, return_indices=True
     )

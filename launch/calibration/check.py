@@ -1,8 +1,8 @@
 """Evaluate a stereo calibration by measuring a board of known size.
 
-On image pairs that were used to calibrate, errors are underestimated. Therefore `check_stereo`
-needs further pairs, and `cross_check` measures each pair with a calibration from the remaining
-pairs.
+Errors are underestimated on image pairs that were used to calibrate. Therefore, `check_stereo`
+requires further pairs, and `cross_check` measures each pair with a calibration that does not use
+it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class StereoRig:
-    """A stereo camera in OpenCV's form: matrices (3, 3), distortions (5,), transform (4, 4)."""
+    """The parameters of a stereo camera in OpenCV's form.
+
+    Each camera has a matrix (3, 3), in px, and distortion coefficients (5,). The transform from the
+    left to the right camera is a matrix (4, 4).
+    """
 
     matrices: tuple[Floats, Floats]
     distortions: tuple[Floats, Floats]
@@ -52,13 +56,13 @@ class StereoRig:
 
     @staticmethod
     def from_fit(numbers: Floats) -> StereoRig:
-        """Make the rig from the 22 parameters of a `RigFit`."""
+        """Make the stereo rig from the 22 parameters in a `RigFit`."""
         left, right = lens_arrays(numbers[LEFT]), lens_arrays(numbers[RIGHT])
         return StereoRig((left[0], right[0]), (left[1], right[1]), pose_transform(numbers[STAND]))
 
     @staticmethod
     def from_calibration(calibration: StereoCalibration) -> StereoRig:
-        """Make the rig from a calibration file."""
+        """Make the stereo rig from a calibration."""
         left, right = (
             camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
             for lens in (calibration.left, calibration.right)
@@ -69,11 +73,14 @@ class StereoRig:
 
 @dataclass(frozen=True, slots=True)
 class BoardMeasurement:
-    """The errors (m and px) of a board that was measured with a stereo camera.
+    """The errors of a board that was measured with a stereo camera.
 
-    squares_m: errors of the distances between neighbouring corners. diagonals_m: errors of the
-    lengths of the diagonals. rigid_fit_m: distances of the corners from the fitted board. The
-    arrays have different lengths.
+    squares_m: errors (m) of the distances between neighbouring corners.
+    diagonals_m: errors (m) of the lengths of the diagonals.
+    rigid_fit_m: distances (m) of the measured corners from the fitted board.
+    reprojection_px: distances (px) of the detected corners from the projected corners.
+
+    The arrays have different lengths.
     """
 
     squares_m: Floats
@@ -84,7 +91,10 @@ class BoardMeasurement:
 
 
 def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
-    """Triangulate pixels (n, 2) linearly into points (n, 3), in m, in the left camera's frame."""
+    """Triangulate pixel positions (n, 2) of both images by the linear method.
+
+    Return points (n, 3), in m, in the left camera's frame.
+    """
     normalized = [
         cv2.undistortPoints(pixels[:, None], matrix, distortion)[:, 0].T
         for pixels, matrix, distortion in zip(
@@ -96,7 +106,7 @@ def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
 
 
 def compute_rigid_residuals(points: Floats, model: Floats) -> Floats:
-    """Return the distances (n,) of `points` (n, 3) from `model` (n, 3) after the best rigid fit.
+    """Return the distances (n,) between two sets of points (n, 3) after the best rigid alignment.
 
     Source: Kabsch, A solution for the best rotation to relate two sets of vectors (1976).
     """
@@ -107,7 +117,7 @@ def compute_rigid_residuals(points: Floats, model: Floats) -> Floats:
 
 
 def measure_board(rig: StereoRig, pair: BoardPair, board: Board) -> BoardMeasurement:
-    """Triangulate the corners that both views of a pair show, and compare them with the board."""
+    """Triangulate the corners that both images show, and compare them with the known board."""
     ids, left, right = pair.common()
     points = triangulate_corners(rig, left, right)
     row = {int(corner): number for number, corner in enumerate(ids)}
@@ -134,7 +144,13 @@ def measure_board(rig: StereoRig, pair: BoardPair, board: Board) -> BoardMeasure
 
 
 def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: Floats) -> Floats:
-    """Return distances (2n,), in px, of detected corners from projected points, left then right."""
+    """Return distances (2n,), in px, between detected corners and projected points.
+
+    The n distances in the left image come first.
+
+    left, right: detected corners (n, 2), px.
+    points: triangulated points (n, 3), in m, in the left camera's frame.
+    """
     distances = []
     stands = (np.eye(4), rig.right_from_left)
     for pixels, matrix, distortion, stand in zip(
@@ -147,7 +163,7 @@ def _measure_reprojection(rig: StereoRig, left: Floats, right: Floats, points: F
 
 
 def _rms(values: Floats) -> float | None:
-    """Return the root mean square, or None for an empty array."""
+    """Return the root mean square of an array, or None for an empty array."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
@@ -159,10 +175,10 @@ def _in_mm(values: Floats) -> float | None:
 def summarize(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | None]:
     """Return the root mean squares of the errors of all measured boards.
 
-    square_rms_mm: error of the distances between neighbouring corners. diagonal_rms_mm: error of
-    the lengths of the board's diagonals. rigid_fit_rms_mm: distance of the corners from the board
-    after a rigid fit. reprojection_rms_px: distance of the detected corners from the projections of
-    the triangulated corners.
+    square_rms_mm: error of the distances between neighbouring corners.
+    diagonal_rms_mm: error of the lengths of the board's diagonals.
+    rigid_fit_rms_mm: distance of the corners from the board after a rigid fit.
+    reprojection_rms_px: distance of the detected corners from the projected corners.
     """
     return {
         "pairs": len(boards),
@@ -182,21 +198,25 @@ def check_stereo(
     board: Board,
     progress: Progress = ignore_progress,
 ) -> dict[str, float | int | list[str] | None]:
-    """Measure a board of known size with a calibration, in images that were not used to calibrate.
+    """Evaluate a stereo calibration with images of a board that were not used to calibrate.
 
-    Returns the values of `summarize`, and used_to_calibrate: the left images that were used to
-    calibrate after all, so their errors are underestimated. Raises CalibrationError for images of
-    another size, and if no pair shows the board.
+    Return the values of `summarize`. The value `used_to_calibrate` lists the left images that were
+    also used to calibrate. The errors of these images are underestimated.
+
+    Raises CalibrationError if the images have a wrong size or if no pair shows the board.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     if size != (calibration.width_px, calibration.height_px):
         raise CalibrationError(
-            f"images of {size[0]}x{size[1]} px, but the calibration of {calibration.device} is for "
-            f"{calibration.width_px}x{calibration.height_px} px; use images of that size"
+            f"the images have {size[0]}x{size[1]} px, but the calibration of {calibration.device} "
+            f"is for {calibration.width_px}x{calibration.height_px} px; use images of that size"
         )
     pairs = [pair for pair in found if isinstance(pair, BoardPair)]
     if not pairs:
-        raise CalibrationError(f"none of the {len(found)} pairs is usable; the first: {found[0]}")
+        raise CalibrationError(
+            f"none of the {len(found)} image pairs is usable (first pair: {found[0]}); capture "
+            "images with the board in both views"
+        )
     used = {pair.digest for pair in calibration.pairs if pair.used}
     reused = [
         left.name
@@ -213,9 +233,12 @@ def check_stereo(
 def calibrate_plain_opencv(
     pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
 ) -> StereoRig:
-    """Calibrate as in OpenCV's tutorials, for comparison: first intrinsics, then the pose alone.
+    """Calibrate a stereo camera as in OpenCV's tutorials, for comparison.
+
+    The lens parameters are fitted first, and then only the transform between the cameras.
 
     points: corners of the board (n, 3), m.
+    size: width and height of the images, px.
     """
     model = [points[pair.left.ids].astype(np.float32) for pair in pairs]
     left = [pair.left.pixels.astype(np.float32) for pair in pairs]
@@ -244,7 +267,11 @@ PLAIN_HALF_WINDOW_PX = 5
 
 
 def find_plain_corners(left: Path, right: Path, board: Board) -> BoardPair | None:
-    """Find chessboard corners as in OpenCV's tutorials, refined in a fixed window of 11 px."""
+    """Find chessboard corners as in OpenCV's tutorials, for comparison.
+
+    The corners are refined in a fixed window of 11 px. Return None if the board is not found in
+    both images.
+    """
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
     window = (PLAIN_HALF_WINDOW_PX, PLAIN_HALF_WINDOW_PX)
     views = []
@@ -269,19 +296,23 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Cross-validate: calibrate without `leave_out` pairs at a time, and measure the excluded
-    pairs.
+    """Cross-validate a stereo calibration by measuring image pairs that were not used.
 
+    The calibration is repeated with some pairs left out each time, and these pairs are measured.
     The pairs i, i+G, i+2G, ... form a group that is left out together, because consecutive images
-    are similar. For chessboards, the same is done with plain OpenCV for comparison. Raises
-    CalibrationError for unusable images, and if too few pairs remain.
+    are similar. For chessboards, the calibration of OpenCV's tutorials is evaluated in the same
+    way, for comparison.
+
+    leave_out: number of pairs that are left out together.
+
+    Raises CalibrationError for unusable images, and if too few pairs remain.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     whole = {i: pair for i, pair in enumerate(found) if isinstance(pair, BoardPair)}
     if len(whole) - leave_out < MIN_PAIRS or leave_out < 1:
         raise CalibrationError(
-            f"{len(whole)} of {len(found)} pairs are usable, {leave_out} are excluded at a time; "
-            f"at least {MIN_PAIRS} must remain to calibrate; capture more images"
+            f"{len(whole)} of {len(found)} pairs are usable, and {leave_out} are left out at a "
+            f"time, but at least {MIN_PAIRS} must remain to calibrate; capture more images"
         )
     points = board_points(board)
     plain: dict[int, BoardPair] = {}

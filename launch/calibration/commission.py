@@ -1,9 +1,9 @@
 """Run all calibrations of a laboratory in sequence, and store their results in one folder.
 
-This is commissioning: `flexsheet commission`. The folder holds the state (`commission.json`), the
-calibration files, the scene and the launch file that use them, and a report. A step starts from the
-scene with the results of all steps before it. Therefore a repeated step invalidates all later
-steps, which must be run again.
+This is called commissioning (`flexsheet commission`). The folder contains the state
+(`commission.json`), the calibration files, a scene and a launch file that use them, and a report.
+Each step starts from the scene with the results of all earlier steps. If a step is repeated, all
+later steps must therefore be run again.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ REPORT_FILE, APPARATUS_FILE, CROSSES_FILE = "report.md", "apparatus.yaml", "co-l
 
 
 class CommissionError(FlexsheetError, ValueError):
-    """Raised if the folder of a commissioning cannot be continued, or for invalid data."""
+    """Raised if the commissioning in a folder cannot be continued, or if data are invalid."""
 
     code = "commission"
     remedy = "Correct the option that the error names, or use a new folder."
@@ -42,12 +42,16 @@ class CommissionError(FlexsheetError, ValueError):
 class StepName(StrEnum):
     """The steps of a commissioning (calibration of a whole laboratory), in their order.
 
-    camera: optics of the stereo camera. arms: poses of the arm bases in the frame of the camera.
+    camera: optics of the stereo camera.
+    arms: poses of the arm bases relative to the camera.
     edges: pose of each clamped edge of the sheet on its flange, joint offsets, and compliance of
-    the flanges. sheet: force model of the sheet. projector: pose and lens of the projector. marker:
-    position of the marker on the finger. eyes: positions of the viewer's eyes. delays: servo lags
-    of the arms, offset of the camera's timestamps, latency of the projector. verification: errors
-    during a stroke of the finger.
+        the flanges.
+    sheet: force model of the sheet.
+    projector: pose and lens of the projector.
+    marker: position of the marker on the finger.
+    eyes: positions of the viewer's eyes.
+    delays: servo lags of the arms, offset of the camera's timestamps, and latency of the projector.
+    verification: errors during a stroke of the finger.
     """
 
     CAMERA = "camera"
@@ -65,7 +69,10 @@ STEPS = tuple(StepName)
 
 
 class NodeValue(LimitedModel):
-    """A measured value of a node parameter, for all nodes of a type or for that of one arm."""
+    """A measured value of a node parameter.
+
+    The value applies to all nodes of a type, or only to the node of one arm.
+    """
 
     node_type: str
     parameter: str
@@ -84,14 +91,18 @@ class MissingQuantity(LimitedModel):
 
 
 class StepResult(LimitedModel):
-    """The result of one step of a commissioning.
+    """The result of one step of a commissioning (calibration of a whole laboratory).
 
-    residual: error of the fit in `unit`. advice: remedy if the residual exceeds `limit`.
-    uncertainty: standard deviations, whose names end in their units. scene_values: new values of
-    the scene by dotted path. parameters: names of calibration files in the folder, by node type and
-    parameter (TYPE.PARAMETER). figures: further results. covariances: covariance matrices by name,
-    from which errors are predicted. node_values: further measured values of node parameters.
+    residual: error of the fit in `unit`.
+    advice: text that states what to do if the residual exceeds `limit`.
+    uncertainty: standard deviations. Their names end in their units.
+    scene_values: new values of the scene, by the dotted path of the key.
+    parameters: names of calibration files in the folder, by TYPE.PARAMETER of the nodes that use
+        them.
+    node_values: measured values of other node parameters.
     missing: quantities that were not measured.
+    figures: further results.
+    covariances: covariance matrices by name, from which errors are predicted.
     """
 
     residual: float
@@ -112,7 +123,7 @@ class StepResult(LimitedModel):
 
 
 class StepRecord(LimitedModel):
-    """The entry of one finished or skipped step in the state file."""
+    """The record of one finished or skipped step of a commissioning."""
 
     name: StepName
     date: str
@@ -123,7 +134,7 @@ class StepRecord(LimitedModel):
 
 
 class State(LimitedModel):
-    """The content of the state file: input files of the commissioning, and finished steps."""
+    """The state of a commissioning: its input files, and its finished and skipped steps."""
 
     version: Literal[1] = 1
     launch_file: str
@@ -133,7 +144,10 @@ class State(LimitedModel):
 
 
 class MissingDataError(CommissionError):
-    """Raised by a step that needs data of real devices; its text says how to capture them."""
+    """Raised by a step of a commissioning that needs data of real devices.
+
+    The text states how to capture the data.
+    """
 
     code = "commission-data"
     remedy = "Capture the data as the error says, and give the folder or file by --data STEP=PATH."
@@ -148,11 +162,15 @@ Step = Callable[["Commissioning"], StepResult]
 
 @dataclass(slots=True)
 class Commissioning:
-    """The commissioning of one laboratory, which continues from the state in its folder if there is
-    one.
+    """A sequence of all calibrations of one laboratory, whose state is stored in a folder.
 
-    launch_file, scene_file: files to start from. apparatus: value of --apparatus for a simulated
-    laboratory, or None. Raises CommissionError if the folder belongs to other files.
+    If the folder contains a state, the sequence continues from this state.
+
+    launch_file, scene_file: files to start from.
+    apparatus: true parameters of a simulated laboratory, as given by --apparatus; None for real
+        devices.
+
+    Raises CommissionError if the folder belongs to other files.
     """
 
     folder: Path
@@ -190,21 +208,21 @@ class Commissioning:
             return State.model_validate_json(path.read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, ValidationError) as error:
             raise CommissionError(
-                f"{path}: not a valid state of a commissioning: {error}; use a new folder"
+                f"{path}: this is not a valid state of a commissioning: {error}; use a new folder"
             ) from error
 
     @property
     def scene_copy(self) -> Path:
-        """Return the path of the scene file with the results of all finished steps."""
+        """Return the path of the scene file that contains the results of all finished steps."""
         return self.folder / SCENE_FILE
 
     @property
     def launch_copy(self) -> Path:
-        """Return the path of the launch file with the results of all finished steps."""
+        """Return the path of the launch file that contains the results of all finished steps."""
         return self.folder / LAUNCH_FILE
 
     def find_file(self, name: str) -> Path | None:
-        """Return the path of a calibration file if a finished step wrote it, else None."""
+        """Return the path of a calibration file, or None if no finished step has written it."""
         used = [value for one in self._results(STEPS) for value in one.parameters.values()]
         return self.folder / name if name in used else None
 
@@ -215,16 +233,19 @@ class Commissioning:
                 yield record.result
 
     def pending(self) -> list[StepName]:
-        """Return the steps that are neither finished nor skipped."""
+        """Return the names of the steps that are neither finished nor skipped."""
         return [name for name in STEPS if name not in self.state.steps]
 
     def skip(self, name: StepName, reason: str) -> None:
-        """Skip a step, and invalidate all later steps."""
+        """Mark a step as skipped, and discard the results of all later steps."""
         self._invalidate_from(name)
         self._record(StepRecord(name=name, date=_now(), skipped_because=reason))
 
     def run(self, name: StepName, step: Step) -> StepResult:
-        """Run a step with the results of the previous steps; invalidate all later steps."""
+        """Run a step with the results of all earlier steps, and return its result.
+
+        The results of all later steps are discarded.
+        """
         self._invalidate_from(name)
         started_s, cpu_started_s = time.monotonic(), time.process_time()
         result = step(self)
@@ -248,7 +269,7 @@ class Commissioning:
         self.write()
 
     def write(self) -> None:
-        """Write state, scene, launch file and report."""
+        """Write the state, the scene, the launch file and the report to the folder."""
         self._write_scene()
         self._write_launch_file()
         write_file(self.folder / REPORT_FILE, format_report(self.state))
@@ -295,7 +316,7 @@ class Commissioning:
 
 
 def _make_yaml(value: Any) -> Any:
-    """Convert a value to one of a YAML tree in which lists are written on one line."""
+    """Convert a value for a YAML document, so that a list is written on one line."""
     if not isinstance(value, list):
         return value
     row = CommentedSeq([_make_yaml(one) for one in value])
@@ -314,7 +335,11 @@ MEASURED_IN_OPERATION = (
 
 
 def format_report(state: State) -> str:
-    """Return the report as Markdown: residuals, uncertainties and what limits the accuracy."""
+    """Return the report of a commissioning as Markdown.
+
+    The report contains residuals, uncertainties, predicted errors and the causes of the largest
+    errors.
+    """
     lines = [
         "# Commissioning",
         "",
@@ -355,7 +380,12 @@ def format_report(state: State) -> str:
 
 
 def _format_verdict(figures: Mapping[str, Any]) -> list[str]:
-    """Format the predicted errors as a table, and the verdict on the laboratory with reasons."""
+    """Return a Markdown table of predicted errors, and whether the laboratory meets all tolerances.
+
+    If it does not, the reasons are included.
+
+    figures: results of the step "verification".
+    """
     lines = ["", "## Predicted errors", ""]
     lines += ["| metric | root mean square | 95 % | tolerance |", "|---|---|---|---|"]
     lines += [
@@ -371,10 +401,11 @@ def _format_verdict(figures: Mapping[str, Any]) -> list[str]:
 def list_doubts(
     steps: Mapping[StepName, StepRecord], figures: Mapping[str, Any], tracking: tuple[float, float]
 ) -> list[str]:
-    """List reasons why a laboratory may exceed a tolerance; empty if none is expected.
+    """Return the reasons why a laboratory may exceed a tolerance; empty if there are none.
 
-    figures: results of the verification. tracking: error (mm) of the sheet in the stroke as the
-    devices report it, and its tolerance.
+    figures: results of the step "verification".
+    tracking: error (mm) of the sheet during the stroke as the devices report it, and its tolerance
+        (mm).
     """
     doubts = []
     for name, record in steps.items():
@@ -413,7 +444,7 @@ def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def _rank_uncertainties(state: State) -> list[str]:
-    """List the uncertainties in mm of all steps, the largest first."""
+    """Return a text for each uncertainty in mm that a step found, with the largest first."""
     found = [
         (value, f"{name}: {key.removesuffix('_mm').replace('_', ' ')} {value:.2f} mm")
         for name, record in state.steps.items()

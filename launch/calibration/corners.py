@@ -1,7 +1,7 @@
 """Detect the corners of calibration boards: complete chessboards and partly visible ChArUco boards.
 
-A corner's id is its row in `board_points`, counted along the board's columns first. It denotes the
-same corner in every image.
+The id of a corner is its row in the array of `board_points`, which counts along the board's columns
+first. A corner has the same id in every image.
 """
 
 from __future__ import annotations
@@ -22,37 +22,47 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Ids = NDArray[np.int64]
 Progress = Callable[[int, int, str], None]
-"""A progress callback with (steps done, total number of steps, description of the last step)."""
+"""A function that is called to report progress.
+
+Its arguments are the number of finished steps, the number of all steps, and a description of the
+last step.
+"""
 
 SCALE = 2
-"""The enlargement of the image for the refinement of corners.
+"""The factor by which images are enlarged before corners are refined.
 
-OpenCV's refinement interpolates linearly between pixels. Without enlargement this would shift
-corners by 0.015 px and change the measured size of the board by 3e-5. More markers are detected in
-enlarged images, too.
+OpenCV's refinement interpolates linearly between pixels. Without enlargement, this would shift
+corners by 0.015 px and change the measured size of the board by 3e-5. Also, more markers are
+detected in enlarged images.
 """
 
 MIN_CORNERS = 8
-"""The minimum number of ChArUco corners in a view. Fewer corners do not determine the board's pose
-well."""
+"""The minimum number of ChArUco corners in an image.
+
+With fewer corners, the board's pose is inaccurate.
+"""
 
 MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 15
-"""The bounds of half the side of the refinement window, in pixels of the enlarged image."""
+"""The minimum and maximum half side length (px of the enlarged image) of the refinement window."""
 
 MAX_REFINEMENT_PX = 1.0
-"""The maximum shift (px) of a ChArUco corner by the refinement. A larger shift indicates that the
-refinement found another edge."""
+"""The maximum displacement (px) of a ChArUco corner by the refinement.
+
+A larger displacement indicates that the refinement found another edge.
+"""
 
 CHESSBOARD_SMOOTHING_PX = 1.0
 CHARUCO_SMOOTHING_PX = 0.7
-"""The standard deviation (px) of the smoothing of ChArUco images; markers are close to the corners.
+"""The standard deviation (px) of the Gaussian filter for ChArUco images.
+
+It is small, because markers are close to the corners.
 """
 
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 
 
 class CalibrationError(FlexsheetError, ValueError):
-    """Raised for images that cannot be used for calibration."""
+    """Raised if images cannot be used for a calibration."""
 
     code = "calibration"
     exit_code = 2
@@ -64,7 +74,7 @@ class CalibrationError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class BoardView:
-    """The detected board corners in one image: ids (n,), ascending, and pixel positions (n, 2)."""
+    """The board corners in one image, as ascending ids (n,) and pixel positions (n, 2)."""
 
     ids: Ids
     pixels: Floats
@@ -72,13 +82,19 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True)
 class BoardPair:
-    """The corners of one board pose in both images; the ids may differ for a ChArUco board."""
+    """The board corners in the two images of one board pose.
+
+    For a ChArUco board, the images may show different corners.
+    """
 
     left: BoardView
     right: BoardView
 
     def common(self) -> tuple[Ids, Floats, Floats]:
-        """Return the corners visible in both views: ids (n,), left and right pixels (n, 2)."""
+        """Return the corners that both images show.
+
+        The result contains the ids (n,) and the pixel positions (n, 2) in the left and right image.
+        """
         ids, in_left, in_right = np.intersect1d(
             self.left.ids, self.right.ids, assume_unique=True, return_indices=True
         )
@@ -86,11 +102,14 @@ class BoardPair:
 
 
 def ignore_progress(done: int, total: int, what: str) -> None:
-    """Ignore progress reports, for callers without a display."""
+    """Do nothing. This is the progress callback for callers that do not display progress."""
 
 
 def board_points(board: Board) -> Floats:
-    """Return corners (rows*columns, 3), in m, in the board's frame, counted along columns first."""
+    """Return the corners (rows*columns, 3), in m, in the board's frame.
+
+    Corners are counted along the columns first.
+    """
     points = np.zeros((board.rows * board.columns, 3))
     grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2)
     points[:, :2] = grid * board.square_m
@@ -98,19 +117,20 @@ def board_points(board: Board) -> Floats:
 
 
 def describe(board: Board) -> str:
-    """Describe the board, such as "chessboard of 9x6 inner corners"."""
+    """Return a description of a board, such as "chessboard of 9x6 inner corners"."""
     name = {"chessboard": "chessboard", "charuco": "ChArUco board"}[board.kind]
     return f"{name} of {board.columns}x{board.rows} inner corners"
 
 
 def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """Make OpenCV's ChArUco board; raises CalibrationError for an unsuitable dictionary."""
+    """Make OpenCV's ChArUco board. Raises CalibrationError for an unsuitable marker dictionary."""
     name = board.dictionary or ""
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if board.marker_m is None or number is None:
         raise CalibrationError(
-            f"ChArUco board with markers of {board.marker_m} m, dictionary {board.dictionary!r}: "
-            "give the marker size and an OpenCV dictionary, such as DICT_4X4_50"
+            f"the ChArUco board has the marker size {board.marker_m} m and the dictionary "
+            f"{board.dictionary!r}: give the marker size and an OpenCV dictionary, such as "
+            "DICT_4X4_50"
         )
     if board.marker_m >= board.square_m:
         raise CalibrationError(
@@ -122,17 +142,17 @@ def make_charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     needed, available = squares[0] * squares[1] // 2, len(dictionary.bytesList)
     if needed > available:
         raise CalibrationError(
-            f"a board of {squares[0]}x{squares[1]} squares needs {needed} markers, {name} contains "
-            f"{available}; choose a larger dictionary"
+            f"a board of {squares[0]}x{squares[1]} squares needs {needed} markers, but {name} "
+            f"contains only {available}; choose a larger dictionary"
         )
     return cv2.aruco.CharucoBoard(squares, board.square_m, board.marker_m, dictionary)
 
 
 def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
-    """Make a detector that accepts corners next to a single marker.
+    """Make a ChArUco detector that accepts a corner next to only one marker.
 
-    OpenCV's default of two markers finds a quarter fewer corners, mostly at the image's edge. Wrong
-    corners are refined or dropped later.
+    With OpenCV's default of two markers, a quarter of the corners would be lost, mostly at the
+    image's edge. Later steps correct or exclude wrong corners.
     """
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1
@@ -142,7 +162,7 @@ def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
 class CornerFinder:
     """A detector of the corners of one calibration board.
 
-    quick: whether to use OpenCV's fast check, which rejects images without a board early.
+    quick: whether to use OpenCV's fast check, which quickly rejects images without a board.
     """
 
     def __init__(self, board: Board, *, quick: bool = False) -> None:
@@ -153,7 +173,10 @@ class CornerFinder:
             self._flags |= cv2.CALIB_CB_FAST_CHECK
 
     def find(self, image: Image) -> BoardView | None:
-        """Return the subpixel corners of a grey image (h, w), or None if too few are visible."""
+        """Find the board corners in a grey image (h, w) with subpixel accuracy.
+
+        Return None if too few corners are visible.
+        """
         if self._detector is not None:
             return self._find_charuco(image)
         return self._find_chessboard(image)
@@ -192,19 +215,22 @@ class CornerFinder:
         ids, pixels = ids[sound], pixels[sound]
         columns, rows = np.unique(ids % self.board.columns), np.unique(ids // self.board.columns)
         if len(ids) < MIN_CORNERS or min(len(columns), len(rows)) < 2:
-            return None  # corners in one line do not determine a pose
+            return None  # Corners in one line do not determine a pose.
         return BoardView(ids, pixels)
 
 
 def _measure_spacing(pixels: Floats) -> Floats:
-    """Return the distance (n,), in px, of each corner (n, 2) from the nearest other corner."""
+    """Return the distance (n,), in px, from each corner (n, 2) to the nearest other corner."""
     distances = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
     np.fill_diagonal(distances, np.inf)
     return np.asarray(distances.min(axis=1))
 
 
 def _enlarge(image: Image) -> Image:
-    """Enlarge the image by SCALE; pixel coordinate x becomes SCALE * (x + 1/2) - 1/2."""
+    """Enlarge an image by the factor SCALE.
+
+    The pixel coordinate x becomes SCALE * (x + 1/2) - 1/2.
+    """
     larger = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_CUBIC)
     return np.asarray(larger, dtype=np.uint8)
 
@@ -212,13 +238,18 @@ def _enlarge(image: Image) -> Image:
 def _refine_corners(
     larger: Image, start: Floats, half_px: Floats, *, smoothing_px: float
 ) -> Floats:
-    """Refine corners (n, 2) px to the saddle points of the grey levels around them.
+    """Move corners to the nearby saddle points of the grey levels.
 
-    larger: result of `_enlarge`. half_px: half sides of the windows (n,). All lengths are in pixels
-    of the original image.
+    Return the refined positions (n, 2). A window must not contain edges of a neighbouring corner or
+    marker, because they would shift the corner by several pixels. Smoothing reduces noise and JPEG
+    artefacts in the gradients.
 
-    A window must not contain edges of a neighbouring corner or marker, because they shift the
-    corner by several pixels. Smoothing reduces noise and JPEG artefacts in the gradients.
+    larger: image that `_enlarge` returned.
+    start: initial corners (n, 2).
+    half_px: half side lengths (n,) of the windows.
+    smoothing_px: standard deviation of the Gaussian filter.
+
+    All lengths and positions are in pixels of the original image.
     """
     smooth = cv2.GaussianBlur(larger, (0, 0), SCALE * smoothing_px)
     halves = np.clip(SCALE * half_px, MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX).astype(int)
@@ -233,11 +264,11 @@ def _refine_corners(
 
 
 def align_numbering(left: Floats, right: Floats, board: Board) -> Floats:
-    """Renumber the right image's corners to match the numbering of the left image.
+    """Renumber the corners (n, 2) of the right image, so that they match those of the left image.
 
-    A detector may start at either end of the board, or at any corner of a square board. The cameras
-    of a stereo rig are nearly parallel. The matching numbering therefore has the same axis
-    directions in both images.
+    A detector may start at either end of the board, or at any corner of a square board. Because the
+    cameras of a stereo rig are nearly parallel, the matching numbering has the same directions in
+    both images.
     """
     grid = right.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
@@ -255,7 +286,9 @@ def align_numbering(left: Floats, right: Floats, board: Board) -> Floats:
 def match_views(
     left: BoardView | None, right: BoardView | None, board: Board, names: tuple[str, str]
 ) -> BoardPair | str:
-    """Match the board in a pair of views, or return the reason why that is impossible.
+    """Combine the detected corners of two images of one board pose.
+
+    If this is impossible, return the reason as text.
 
     names: names of the two images, for the reason.
     """
@@ -272,15 +305,15 @@ def match_views(
 
 
 def read_gray(path: Path) -> Image:
-    """Read an image as grey levels; raises CalibrationError if it cannot be read."""
+    """Read an image file as grey levels (h, w). Raises CalibrationError if it cannot be read."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if image is None:
-        raise CalibrationError(f"{path}: cannot read the image; check the path and the format")
+        raise CalibrationError(f"{path}: the image cannot be read; check the path and the format")
     return np.asarray(image, dtype=np.uint8)
 
 
 def compute_digest(left: Path, right: Path) -> str:
-    """Return a digest of the contents of two image files, 16 hexadecimal digits."""
+    """Return a hash of the contents of two image files, as 16 hexadecimal digits."""
     return hashlib.sha256(left.read_bytes() + right.read_bytes()).hexdigest()[:16]
 
 
@@ -292,17 +325,21 @@ def find_pairs(
 ) -> tuple[list[BoardPair | str], tuple[int, int]]:
     """Find the board in all image pairs.
 
-    Return for each pair the board's corners, or the reason why there are none, and the (width,
-    height) of the images. Raises CalibrationError for unequal counts, no images, unreadable images
-    or different sizes.
+    Return a list and the (width, height) of the images, in px. For each pair, the list contains the
+    corners, or the reason why there are none.
+
+    Raises CalibrationError if there are no images, if the numbers of left and right images differ,
+    or if images are unreadable or have different sizes.
     """
     if len(left_paths) != len(right_paths):
         raise CalibrationError(
-            f"{len(left_paths)} left and {len(right_paths)} right images; give the same number, in "
-            "the same order"
+            f"there are {len(left_paths)} left and {len(right_paths)} right images; give the same "
+            "number, in the same order"
         )
     if not left_paths:
-        raise CalibrationError("no images: the file patterns match no file; check the patterns")
+        raise CalibrationError(
+            "there are no images, because the file patterns match no file; check the patterns"
+        )
     finder = CornerFinder(board)
     results: list[BoardPair | str] = []
     size: tuple[int, int] | None = None
@@ -313,8 +350,8 @@ def find_pairs(
             image_size = (image.shape[1], image.shape[0])
             if size is not None and image_size != size:
                 raise CalibrationError(
-                    f"{path}: {image_size[0]}x{image_size[1]} px, expected "
-                    f"{size[0]}x{size[1]} as the other images"
+                    f"{path}: the image has {image_size[0]}x{image_size[1]} px, but the other "
+                    f"images have {size[0]}x{size[1]} px; give images of one size"
                 )
             size = image_size
             views.append(finder.find(image))

@@ -1,4 +1,4 @@
-"""Read the rows of CSV files with measurements, and report mistakes with line and column."""
+"""Read CSV files with measurements, and report errors with line and column."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mea
 
 
 def read_rows(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
-    """Return each row of a CSV file with its location, FILE:LINE.
+    """Return the rows of a CSV file as (location FILE:LINE, values by column).
 
     Raises BadInputError if the file cannot be read, or if one of the columns is missing.
     """
@@ -36,12 +36,16 @@ def read_table(
     check_header: Callable[[str, Sequence[str]], list[Problem]],
     problems: list[Problem],
 ) -> list[tuple[int, dict[str, str]]]:
-    """Return the line number and the texts by column of each row of a CSV file.
+    """Return the rows of a CSV file as (line number, values by column).
 
-    Empty lines and lines that start with # are skipped. Rows with a wrong number of values are
-    omitted, and appended to `problems`. columns: all valid columns. check_header: function of the
-    header's location and its columns that returns further problems. Raises BadInputError for an
-    unreadable or empty file, and for wrong columns.
+    Empty lines and lines that start with # are skipped. A row with a wrong number of values is
+    omitted, and appended to `problems`.
+
+    columns: names of all permitted columns.
+    check_header: function that returns further problems of the header. Its arguments are the
+        location and the column names.
+
+    Raises BadInputError for an unreadable or empty file, and for wrong columns.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -84,14 +88,17 @@ def read_table(
 
 
 def list_missing(where: str, names: Sequence[str], wanted: Sequence[str]) -> list[Problem]:
-    """Return a problem for each wanted column that the header does not contain."""
+    """Return a problem for each wanted column that the header of a file does not contain."""
     return [
         Problem(where, (name,), "missing column", "add it") for name in wanted if name not in names
     ]
 
 
 def parse_finite(where: str, name: str, text: str, problems: list[Problem]) -> float:
-    """Return the number in a column; append a problem if it is not a finite number."""
+    """Convert the text in the column `name` to a number.
+
+    If the text is not a finite number, append a problem to `problems` and return NaN.
+    """
     try:
         value = float(text)
     except ValueError:

@@ -1,13 +1,13 @@
 """Measure the delays of arms and camera.
 
-The servo lag is the time by which an arm follows its commands. Each arm bridge measures it from
-commanded and measured joint angles. The bridge starts with the lag in the launch file, and its
-self-check reports a deviation from that value. Therefore the measured lag is written into the
-launch file.
+The servo lag is the time by which an arm lags behind its commands. The node that controls an arm
+measures the lag from commanded and measured joint angles. It starts with the lag in the launch
+file, and its self-check reports a deviation from that value. Therefore, the measured lag is written
+to the launch file.
 
-The stamp offset is the time by which exposures are later than their timestamps. The camera sees
-the marks on both clamps while the arms move the sheet. Their motion is compared with the motion
-that follows from the measured joints.
+The stamp offset is the time of an exposure minus its timestamp. The camera sees the marks on both
+clamps while the arms move the sheet. The motion of the marks in the images is compared with the
+motion that follows from the measured joint angles.
 """
 
 from __future__ import annotations
@@ -50,24 +50,29 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 SIDES: tuple[Side, Side] = ("left", "right")
 STROKE_S = 5.0
-"""The duration of the simulated stroke."""
+"""The duration (s) of the simulated stroke of the finger."""
 
 BLOCK_S, MIN_BLOCKS = 2.0, 4
-"""The duration of the parts of a recording whose stamp offsets are averaged, in seconds, and the
-minimum number of these parts."""
+"""The duration (s) and the minimum number of the parts into which a recording is divided.
+
+The stamp offset is measured in each part, and the results are averaged.
+"""
 
 STAMP_MODEL_STD_S = 1.5e-4
-"""The standard deviation (s) of the stamp offset that backlash and elasticity of the arms cause.
+"""The standard deviation (s) of the error of the stamp offset due to backlash and elasticity.
 
 The error was 0.1 ms rms in simulated laboratories with seeds 0 to 9.
 """
 
 MARK_SWING_M, MARK_FREQUENCY_HZ, MARK_SECONDS = 0.02, 1.0, 8.0
-"""The simulated motion of the sheet for the stamp offset: amplitude, frequency and duration."""
+"""The amplitude (m), frequency (Hz) and duration (s) of the simulated motion of the sheet.
+
+This motion is used to measure the stamp offset.
+"""
 
 
 class DelaysError(FlexsheetError, ValueError):
-    """Raised for a recording that does not contain the measured servo lag of an arm."""
+    """Raised if a recording does not contain the measured servo lag of an arm."""
 
     code = "delays-calibration"
     remedy = "Record a stroke in which both arms follow the finger for several seconds."
@@ -75,7 +80,7 @@ class DelaysError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredLag:
-    """A measured delay, such as the servo lag of an arm, and its standard deviation, in seconds."""
+    """A measured delay, such as the servo lag of an arm, and its standard deviation (s)."""
 
     lag_s: float
     uncertainty_s: float
@@ -83,10 +88,10 @@ class MeasuredLag:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredDelays:
-    """The measured delays, in seconds.
+    """The measured delays of the arms and the camera.
 
-    servo: lag of each arm, including the command latency. stamp_offset: exposure time minus
-    timestamp; None if the data do not contain it.
+    servo: servo lag of each arm, including the latency of its commands.
+    stamp_offset: exposure time minus timestamp; None if the data do not contain it.
     """
 
     servo: dict[Side, MeasuredLag]
@@ -94,7 +99,10 @@ class MeasuredDelays:
 
 
 def read_measured_lags(bag: Path) -> dict[Side, MeasuredLag]:
-    """Read the last servo lag of each arm from a bag; raises DelaysError if one is missing."""
+    """Read the last measured servo lag of each arm from a bag.
+
+    Raises DelaysError if a servo lag is missing.
+    """
     found: dict[Side, MeasuredLag] = {}
     for _, message, _, _ in BagReader(bag, topics=["arm_left", "arm_right"]):
         if not isinstance(message, ArmState) or message.servo_lag_s is None:
@@ -113,10 +121,13 @@ def read_measured_lags(bag: Path) -> dict[Side, MeasuredLag]:
 def read_delays(
     bag: Path, scene: Scene, calibration: StereoCalibration | None, added_s: float
 ) -> MeasuredDelays:
-    """Read the delays that a bag of the running graph contains.
+    """Measure the servo lags and the stamp offset (exposure time minus timestamp) from a bag.
 
-    The stamp offset requires images of the clamps. added_s: time that the camera node added to the
-    timestamps. Raises DelaysError if a servo lag is missing.
+    The stamp offset requires images of the marks on the clamps.
+
+    added_s: time that the camera node had already added to the timestamps.
+
+    Raises DelaysError if a servo lag is missing.
     """
     servo = read_measured_lags(bag)
     stamp = read_stamp_offset(bag, scene, calibration)
@@ -128,7 +139,10 @@ def read_delays(
 def read_stamp_offset(
     bag: Path, scene: Scene, calibration: StereoCalibration | None
 ) -> MeasuredLag | None:
-    """Measure the stamp offset from the images of the clamps in a bag; None without such images."""
+    """Measure the stamp offset (exposure time minus timestamp) from images of the clamps in a bag.
+
+    Return None if the bag does not contain enough images of moving clamps.
+    """
     geometries = {side: ArmGeometry(scene, side) for side in SIDES}
     rows: dict[Side, list[tuple[int, Floats]]] = {side: [] for side in SIDES}
     for _, message, header, _ in BagReader(bag, topics=["arm_left", "arm_right"]):
@@ -154,11 +168,13 @@ def estimate_stamp_offset(
     edges: Sequence[SampledMotion],
     detector: MarkDetector,
 ) -> MeasuredLag | None:
-    """Estimate exposure time minus timestamp from images of the marks at the clamps' centres.
+    """Estimate the stamp offset (exposure time minus timestamp) from images of marks on the clamps.
 
-    pairs: image pairs with their timestamps (ns). edges: motion of each seen clamp from measured
-    joint angles. Return None if the marks are visible or move for less than MIN_BLOCKS parts of the
-    recording.
+    Return None if the marks are visible and moving in fewer than MIN_BLOCKS parts of the recording.
+
+    pairs: image pairs with their timestamps (ns).
+    edges: motion of each clamp as computed from measured joint angles.
+    detector: detector of the marks.
     """
     seen: list[list[tuple[int, Floats]]] = [[] for _ in edges]
     for at_ns, pair in pairs:
@@ -202,7 +218,7 @@ def _estimate_block(
         return None  # The marks were hidden for most of this time.
     if lag_s is None:
         return None
-    # Backlash displaces the marks against the direction of motion, which resembles a lag. Fit it.
+    # Backlash displaces the marks against the direction of motion, as a lag does, so fit both.
     motion = CubicSpline(known_s, centres)
     for _ in range(3):
         at_s = times_s - lag_s
@@ -223,7 +239,11 @@ def _average(values: Sequence[float], model_std_s: float) -> MeasuredLag:
 
 
 def measure_lags_in_simulation(scene: Scene, apparatus: Apparatus) -> dict[Side, MeasuredLag]:
-    """Simulate a stroke of the finger, and return the servo lags that both bridges measure."""
+    """Simulate a stroke of the finger, and return the measured servo lags of both arms.
+
+    The node that controls an arm measures its servo lag. Raises DelaysError if it cannot be
+    measured.
+    """
     found = follow_in_simulated_time(scene, stroke_path(scene, STROKE_S), apparatus)
     lags_ms, uncertainties_ms = found["servo_lag_ms"], found["servo_lag_uncertainty_ms"]
     lags = {}
@@ -240,7 +260,10 @@ def measure_lags_in_simulation(scene: Scene, apparatus: Apparatus) -> dict[Side,
 def measure_in_simulation(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> MeasuredDelays:
-    """Measure the servo lags and the stamp offset of a simulated laboratory."""
+    """Measure the servo lags and the stamp offset of simulated arms and a simulated camera.
+
+    calibration: stereo calibration with which marks are triangulated; None: the scene's camera.
+    """
     servo = measure_lags_in_simulation(scene, apparatus)
     stamp = simulate_stamp_offset(scene, apparatus, calibration=calibration, seed=seed)
     return MeasuredDelays(servo, stamp)
@@ -251,7 +274,12 @@ def swing_sheet(
 ) -> tuple[tuple[SampledMotion, ...], tuple[SampledMotion, ...]]:
     """Simulate arms that move the sheet periodically along its y axis, after one second at rest.
 
-    Return the true motion of both clamps, and that from measured joint angles.
+    Return the true motions of both clamps, and their motions as computed from measured joint
+    angles.
+
+    swing_m: amplitude of the motion.
+    frequency_hz: frequency of the motion.
+    seconds: duration of the motion.
     """
     start = SheetTrajectoryPlanner(scene, PlannerParameters().trajectory_settings()).motion
     sheet = SimulatedSheet(scene, apparatus, start, LoopSettings())
@@ -274,7 +302,10 @@ def swing_sheet(
 def draw_exposures(
     scene: Scene, apparatus: Apparatus, end_ns: int, seed: int
 ) -> Iterable[tuple[int, int]]:
-    """Yield timestamps and true times (ns) of simulated exposures."""
+    """Yield (timestamp, true time) of each simulated exposure, in ns.
+
+    end_ns: time after which no exposures are simulated.
+    """
     truth, random = apparatus.camera, np.random.default_rng((seed, 1))
     for stamp_s in np.arange(
         0.2, 1e-9 * end_ns - 0.2, 1.0 / (truth.rate_hz or scene.camera.rate_hz)
@@ -286,7 +317,11 @@ def draw_exposures(
 def simulate_stamp_offset(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> MeasuredLag | None:
-    """Measure the stamp offset with simulated images of the marks on the moving clamps."""
+    """Measure the stamp offset (exposure time minus timestamp) of a simulated camera.
+
+    The images of the marks on the moving clamps are simulated. Return None if too few marks are
+    detected.
+    """
     true, reported = swing_sheet(
         scene, apparatus, swing_m=MARK_SWING_M, frequency_hz=MARK_FREQUENCY_HZ, seconds=MARK_SECONDS
     )

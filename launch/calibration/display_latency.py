@@ -1,8 +1,8 @@
 """Measure the latency of the projector with the stereo camera.
 
-The renderer switches the projected image between white and black at random times. The messages of
-its frames state these times, and the images of the sheet show the old or the new state. Each image
-therefore bounds the latency, which is estimated from all images together.
+The renderer switches the projected image between white and black at random times, which the
+messages of its frames contain. Each camera image of the sheet shows the old or the new state, and
+therefore limits the possible latency. The latency is estimated from all images together.
 """
 
 from __future__ import annotations
@@ -28,22 +28,25 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 MIN_SWITCHES = 20
 MAX_LATENCY_S = 0.15
-"""The maximum latency that is considered, in seconds."""
+"""The maximum latency (s) of the projector that the estimation considers."""
 
 STEP_S = 2e-4
 JITTERS_S = (2.5e-4, 5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
 ERROR_RATES = (0.003, 0.01, 0.03, 0.1, 0.2)
-"""The considered standard deviations of the times, and fractions of wrongly classified images."""
+"""The fractions of wrongly classified images that are considered.
+
+`JITTERS_S` contains the standard deviations (s) of the times that are considered.
+"""
 
 MIN_CONTRAST = 3.0
-"""The minimum difference in brightness of the images of both states, in grey levels."""
+"""The minimum difference in grey levels between images of the white and of the black state."""
 
 SIMULATED_SWITCHES, LEVELS = 60, 16
-"""The number of simulated switches, and of brightness levels of a partly lit exposure."""
+"""The numbers of simulated switches, and of brightness levels of a partly lit exposure."""
 
 
 class DisplayLatencyError(FlexsheetError, ValueError):
-    """Raised for images from which the latency of the projector cannot be estimated."""
+    """Raised if the latency of the projector cannot be estimated from the images."""
 
     code = "display-latency-calibration"
     remedy = "Let the camera see the lit sheet, and record a stroke with --switches 60."
@@ -51,10 +54,13 @@ class DisplayLatencyError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class SwitchImage:
-    """An image after a switch of the projected image; times in seconds of one clock.
+    """A camera image that was taken after a switch of the projected image.
 
-    switched_s: time when the renderer showed the new state. start_s, end_s: exposure. is_new:
-    whether the image shows the new state.
+    switched_s: time when the renderer switched to the new state.
+    start_s, end_s: start and end of the exposure.
+    is_new: whether the camera image shows the new state.
+
+    All times are in seconds on one clock.
     """
 
     switched_s: float
@@ -64,17 +70,20 @@ class SwitchImage:
 
 
 def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
-    """Estimate the time from a switch to the change of the light on the sheet.
+    """Estimate the latency (s) from a switch of the image to the change of the light on the sheet.
 
-    An image shows the new state if the light changed before the middle of its exposure, apart from
-    errors of the times and wrongly classified images, whose rates are unknown. The result is mean
-    and standard deviation of the posterior distribution with uniform prior. Raises
-    DisplayLatencyError for too few switches and if the images do not show them.
+    The model assumes that an image shows the new state if the light changed before the middle of
+    its exposure. The times have unknown errors, and an unknown fraction of the images is classified
+    wrongly. The result is the mean and the standard deviation of the posterior distribution with a
+    uniform prior.
+
+    Raises DisplayLatencyError if there are too few switches, or if the images do not show them.
     """
     switches = len({one.switched_s for one in images})
     if switches < MIN_SWITCHES:
         raise DisplayLatencyError(
-            f"{switches} switches of the projected image; at least {MIN_SWITCHES} are required"
+            f"the images contain {switches} switches of the projected image, but at least "
+            f"{MIN_SWITCHES} are required; record more switches"
         )
     start_s, end_s, switched_s = np.array(
         [(one.start_s, one.end_s, one.switched_s) for one in images]
@@ -103,10 +112,12 @@ def estimate_display_latency(images: Sequence[SwitchImage]) -> MeasuredLag:
 def classify_images(
     switches: Sequence[tuple[float, bool]], exposures: Iterable[tuple[float, float, float]]
 ) -> list[SwitchImage]:
-    """Compare the brightness of images with the projected state, which is white or black.
+    """Decide from their brightness whether images show the new or the old projected state.
 
-    switches: times (s) and whether the new state is white. exposures: start, end (s) and mean grey
-    level of each image. Raises DisplayLatencyError if the brightness of all images is similar.
+    switches: (time in s, whether the new state is white) of each switch between white and black.
+    exposures: (start in s, end in s, mean grey level) of each image.
+
+    Raises DisplayLatencyError if all images have a similar brightness.
     """
     times_s = np.array([at_s for at_s, _ in switches])
     seen = [one for one in exposures if times_s[0] < 0.5 * (one[0] + one[1])]
@@ -128,7 +139,9 @@ def classify_images(
 
 
 def read_switch_images(bag: Path, stamp_offset_s: float = 0.0) -> list[SwitchImage]:
-    """Read the images of the switches from a bag; return none if it contains no switch.
+    """Read the camera images after switches of the projected image from a bag.
+
+    Return an empty list if the bag contains no switch.
 
     stamp_offset_s: time of an exposure minus its timestamp.
     """
@@ -159,10 +172,11 @@ def read_switch_images(bag: Path, stamp_offset_s: float = 0.0) -> list[SwitchIma
 def simulate_switch_images(
     scene: Scene, apparatus: Apparatus, *, seed: int, stamp_offset_s: float = 0.0
 ) -> list[SwitchImage]:
-    """Simulate images of the sheet while the projector of an apparatus switches.
+    """Simulate camera images of the sheet while a simulated projector switches its image.
 
-    The simulated projector shows a frame at once when its latency has passed. stamp_offset_s:
-    measured time of an exposure minus its timestamp.
+    The simulated projector displays an image immediately after its latency.
+
+    stamp_offset_s: measured time of an exposure minus its timestamp.
     """
     random = np.random.default_rng((seed, 4))
     true = apply_apparatus(scene, apparatus)

@@ -4,12 +4,15 @@ A mark with the position m in the frame of the clamped edge is measured at the w
 
 world_from_base exp(b) forward(q + d) flange_from_edge exp(e) m + c f
 
-where q are the reported joint angles and f is the force of the stretched sheet on the edge. Unknown
-are the pose errors b of the base and e of the edge (rotation vector and translation; exp gives the
-matrix), the joint offsets d and the compliance c of the flange. The marks do not determine each
-unknown, but their sum, which is sufficient in the measured working range. Therefore each unknown
-has a normal prior, and the maximum of the posterior is taken. The finger is measured by the same
-camera, so errors of the camera's pose and lenses cancel.
+where q are the reported joint angles and f is the force of the stretched sheet on the edge. The
+unknowns are the pose errors b of the base and e of the edge, the joint offsets d, and the
+compliance c of the flange. A pose error consists of a rotation vector and a translation, and exp
+converts it to a matrix.
+
+The marks determine the total effect of the unknowns, but not each unknown. In the measured working
+range, the total effect is sufficient. Each unknown therefore has a normal prior distribution, and
+the fit maximizes the posterior probability. The same camera measures the finger, so errors of the
+camera's pose and lenses cancel.
 """
 
 from __future__ import annotations
@@ -37,27 +40,33 @@ from flexsheet.nodes.models.sheet import edge_force_n
 Floats = NDArray[np.float64]
 
 BASE, JOINTS, EDGE, COMPLIANCE = slice(0, 6), slice(6, 12), slice(12, 18), 18
-"""The indices of the unknowns: error of the base, joint offsets, error of the edge, compliance."""
+"""The indices of the unknowns: base pose error, joint offsets, edge pose error, compliance."""
 
 PRIOR_SIGMA = np.array([*[0.02] * 3, *[0.005] * 3, *[5e-4] * 6, *[0.005] * 3, *[1e-3] * 3, 5e-5])
-"""The standard deviations of the unknowns before the measurement: rad, m, and m/N."""
+"""The standard deviations (19,) of the prior distribution of the unknowns, in rad, m and m/N."""
 
 PRIOR_COMPLIANCE_M_PER_N = 7.5e-5
 MAX_COMPLIANCE_M_PER_N = 1e-2
 
 INITIAL_SIGMA_M, MIN_SIGMA_M = 2e-4, 1e-6
-"""The standard deviation of a measured coordinate: initial value and minimum of the estimate."""
+"""The initial and the minimum standard deviation (m) of a measured coordinate of a mark."""
 
 OUTLIER_SIGMAS = 3.0
-"""The deviation above which a coordinate's influence on the fit no longer grows (Huber 1964)."""
+"""The residual, in standard deviations, above which the Huber loss of the fit is linear.
+
+Source: Huber 1964.
+"""
 
 MIN_POSES = 8
 MAX_RESIDUAL_M = 1e-3
-"""The maximum root mean square of the residuals; a larger one indicates wrong marks or angles."""
+"""The maximum root mean square (m) of the residuals of a valid fit.
+
+Larger residuals indicate that marks, arms or joint angles have been exchanged.
+"""
 
 
 class EdgeFitError(FlexsheetError, ValueError):
-    """Raised for marks that do not determine the pose of the sheet's edge on an arm."""
+    """Raised if the marks do not determine the pose of the sheet's edge on an arm."""
 
     code = "edge-fit"
     remedy = (
@@ -68,9 +77,10 @@ class EdgeFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class EdgeMark:
-    """A mark on a clamp of an arm.
+    """A measured mark on the clamp of an arm.
 
-    mark_edge_m: known position (3,) in the frame of the edge. position_world_m: measured position.
+    mark_edge_m: known position (3,) of the mark in the frame of the edge.
+    position_world_m: measured position (3,) of the mark.
     """
 
     side: Side
@@ -80,7 +90,10 @@ class EdgeMark:
 
 @dataclass(frozen=True, slots=True)
 class HeldPose:
-    """A pose of the sheet at rest, with the reported joint angles (6,), in rad, of both arms."""
+    """A pose of the sheet at rest, with the measured marks on both clamps.
+
+    left_rad, right_rad: reported joint angles (6,) of both arms.
+    """
 
     left_rad: Floats
     right_rad: Floats
@@ -92,11 +105,11 @@ class HeldPose:
 
 @dataclass(frozen=True, slots=True)
 class EdgeFit:
-    """A fitted arm, and the errors of the fit.
+    """The fitted parameters of an arm, with the errors of the fit.
 
-    residual_rms_m: root mean square distance of a mark from its fitted position.
-    edge_std_m: root sum square over the axes of the standard deviation of a mark's fitted
-    position in the measured poses. compliance_std_m_per_n: standard deviation of the compliance.
+    residual_rms_m: rms distance between measured and fitted positions of the marks.
+    edge_std_m: standard deviation of a mark's fitted position, all three axes together.
+    compliance_std_m_per_n: standard deviation of the compliance.
     covariance: covariance (19, 19) of the unknowns.
     """
 
@@ -111,7 +124,10 @@ class EdgeFit:
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """A measured mark, joint angles, and force (3,) of the sheet on the edge in the world frame."""
+    """A measured mark with the arm's joint angles and the force (3,) of the sheet on the edge.
+
+    The force (N) is in the world frame.
+    """
 
     joints_rad: Floats
     mark_edge_m: Floats
@@ -120,7 +136,10 @@ class _Row:
 
 
 def fit_edges(poses: Sequence[HeldPose], scene: Scene) -> dict[Side, EdgeFit]:
-    """Fit the parameters of both arms; raises EdgeFitError for insufficient or wrong marks."""
+    """Fit the edge pose, base pose, joint offsets and compliance of both arms to measured marks.
+
+    Raises EdgeFitError if there are too few poses, or if the marks contradict each other.
+    """
     sides: tuple[tuple[Side, ArmSpec], ...] = (
         ("left", scene.arms.left),
         ("right", scene.arms.right),
@@ -156,7 +175,7 @@ def _make_rows(poses: Sequence[HeldPose], side: Side, sheet: SheetSpec) -> list[
 
 
 class _ArmModel:
-    """The positions of the marks of one arm as a function of the unknowns (19,)."""
+    """A model that computes the positions of an arm's marks from the unknowns (19,) of the fit."""
 
     def __init__(self, arm: ArmSpec, rows: Sequence[_Row]) -> None:
         self._rows = rows
@@ -171,11 +190,11 @@ class _ArmModel:
         self.measured = np.array([row.position_world_m for row in rows])
 
     def transforms(self, unknowns: Floats) -> tuple[Floats, Floats]:
-        """Return world_from_base and flange_from_edge (4, 4)."""
+        """Return world_from_base (4, 4) and flange_from_edge (4, 4) for given unknowns (19,)."""
         return _shift(self._base, unknowns[BASE]), _shift(self._clamp, unknowns[EDGE])
 
     def positions(self, unknowns: Floats) -> Floats:
-        """Return the positions (n, 3) of the marks in the world."""
+        """Return the positions (n, 3), in m, of the marks in the world for given unknowns (19,)."""
         base, clamp = self.transforms(unknowns)
         found = [
             apply(
@@ -216,8 +235,9 @@ def _fit_arm(rows: Sequence[_Row], arm: ArmSpec) -> EdgeFit:
     residual_rms_m = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     if not residual_rms_m <= MAX_RESIDUAL_M:
         raise EdgeFitError(
-            f"the marks are {1e3 * residual_rms_m:.2f} mm (rms) from the fitted edge, maximum "
-            f"{1e3 * MAX_RESIDUAL_M:g} mm; check which mark, arm and joint angles belong together"
+            f"the marks are {1e3 * residual_rms_m:.2f} mm (rms) from the fitted edge, but at most "
+            f"{1e3 * MAX_RESIDUAL_M:g} mm are allowed; check which mark, arm and joint angles "
+            "belong together"
         )
     marks = off.size
     covariance = np.linalg.inv(found.jac.T @ found.jac)
@@ -251,5 +271,5 @@ def _pose(matrix: Floats) -> Pose:
 
 
 def _shift(pose: Floats, error: Floats) -> Floats:
-    """Return a pose rotated by error[:3] about its own origin and moved by error[3:]."""
+    """Rotate a pose (4, 4) about its own origin by error[:3], and translate it by error[3:]."""
     return transform(rotation_from_vector(error[:3]) @ pose[:3, :3], pose[:3, 3] + error[3:])

@@ -1,4 +1,7 @@
-"""Read, record and simulate measured marks on the sheet's clamps: `flexsheet calibrate edges`."""
+"""Read, record and simulate positions of marks on the clamps of the sheet.
+
+`flexsheet calibrate edges` uses these positions.
+"""
 
 from __future__ import annotations
 
@@ -37,33 +40,39 @@ Image = NDArray[np.uint8]
 SIDES: tuple[Side, Side] = ("left", "right")
 JOINT_COLUMNS = tuple(f"{side}_j{number}_deg" for side in SIDES for number in range(1, 7))
 COLUMNS = ("pose", "side", "along_mm", "x_mm", "y_mm", "z_mm", *JOINT_COLUMNS)
-"""The columns of the CSV file, which has one row for each mark in each pose: number of the pose,
-arm, position of the mark along the clamped edge from its centre, measured position in the world,
-and the joint angles of both arms."""
+"""The columns of the CSV file of marks, which has one row for each mark in each pose.
+
+They contain the number of the pose, the arm, and the position of the mark along the clamped edge
+from its centre. The other columns contain the measured position in the world and the joint angles
+of both arms.
+"""
 
 MAX_PROBLEMS = 20
 
 ALONG = (-0.45, 0.0, 0.45)
-"""The positions of the simulated marks along the edge, as fractions of its length."""
+"""The positions of the simulated marks from the edge's centre, as fractions of its length."""
 
 SIMULATED_POSES = 24
 MAX_TRIES = 400
 TILT_RAD = np.array([0.5, 0.35, 0.1])
 CENTRE_MIN_M, CENTRE_MAX_M = np.array([-0.02, -0.03, -0.02]), np.array([0.02, 0.03, 0.03])
 MIN_STRETCH, STRETCH_RANGE = 1.005, 0.9
-"""The minimum stretch ratio, and fraction of the range from there to the maximum that is used."""
+"""The minimum stretch ratio of the simulated sheet, and a factor that limits the maximum.
+
+The factor is the used fraction of the range from the minimum to the scene's maximum stretch ratio.
+"""
 
 SEARCH_M = 0.02
-"""The maximum distance of a mark from its expected position."""
+"""The maximum distance (m) between a detected mark and its expected position."""
 
 MIN_NEW_JOINT_RAD = 0.02
-"""The minimum rotation of a joint between two recorded poses."""
+"""The minimum rotation (rad) of at least one joint between two recorded poses."""
 
 
 def read_edge_marks(path: Path) -> list[HeldPose]:
-    """Read marks from a file with the columns `COLUMNS`.
+    """Read the measured marks from a CSV file with the columns `COLUMNS`.
 
-    Raises BadInputError with file, line, column, value and remedy.
+    Raises BadInputError, which names file, line, column and value, and states the remedy.
     """
     problems: list[Problem] = []
     joints: dict[str, tuple[Floats, Floats]] = {}
@@ -92,7 +101,7 @@ def _make_mark(side: Side, values: dict[str, float]) -> EdgeMark:
 
 
 def make_detector_config() -> DetectorConfig:
-    """Make the settings of a marker detector from the default parameters of the triangulator."""
+    """Return the settings of a marker detector, from the default parameters of the triangulator."""
     given = TriangulatorParameters()
     return DetectorConfig(
         blob_filter=BlobFilter(
@@ -107,7 +116,7 @@ def make_detector_config() -> DetectorConfig:
 
 
 class MarkDetector:
-    """A detector of marks in stereo images, with the triangulator's methods."""
+    """A detector of marks in stereo images, which uses the methods of the triangulator."""
 
     def __init__(self, scene: Scene, calibration: StereoCalibration | None) -> None:
         self._geometry = StereoGeometry.of(scene.camera, calibration)
@@ -122,9 +131,12 @@ class MarkDetector:
         left_origin_px: tuple[int, int] = (0, 0),
         right_origin_px: tuple[int, int] = (0, 0),
     ) -> Floats | None:
-        """Return the position (3,) of the mark near a given position.
+        """Return the position (3,), in m, of the mark near an expected position.
 
-        Return None if there is no clear mark. Origins: first pixels of cropped images.
+        Return None if there is no mark, or if several marks are possible.
+
+        near_world_m: expected position (3,).
+        left_origin_px, right_origin_px: column and row of the first pixel of a cropped image.
         """
         found = detect_all(
             left,
@@ -142,9 +154,10 @@ class MarkDetector:
 
 
 class EdgeMarkRecorder:
-    """A recorder that appends the marks to a CSV file whenever both arms rest in a new pose.
+    """A recorder that writes positions of marks on both clamps to a CSV file.
 
-    Joint angles and images must be added in the order of their times (s, on one clock).
+    It records a pose whenever both arms are at rest in a new pose. Joint angles and images must be
+    added in the order of their times (s, on one clock).
     """
 
     def __init__(self, path: Path, scene: Scene, calibration: StereoCalibration | None) -> None:
@@ -159,13 +172,18 @@ class EdgeMarkRecorder:
             csv.writer(file).writerow(COLUMNS)
 
     def update_joints(self, side: Side, joints_rad: Floats, time_s: float) -> None:
-        """Add measured joint angles (6,), rad, of one arm."""
+        """Add measured joint angles (6,), in rad, of one arm at `time_s`."""
         before = self._joints.get(side)
         if before is None or np.abs(joints_rad - before).max() > MAX_STILL_RAD:
             self._joints[side], self._still_since_s = joints_rad, time_s
 
     def update_images(self, left: Image, right: Image, exposed_s: float) -> str:
-        """Add an image pair (h, w); record its marks if the pose is new; return a user hint."""
+        """Add an image pair, each (h, w), and record the marks if the pose is new.
+
+        Return an instruction to the user, or the reason why the marks were not recorded.
+
+        exposed_s: time of the exposure.
+        """
         if len(self._joints) < len(SIDES):
             return "no joint angles of both arms received yet"
         if exposed_s - self._still_since_s < MIN_STILL_S:
@@ -200,11 +218,14 @@ def simulate_edge_marks(
     seed: int,
     poses: int = SIMULATED_POSES,
 ) -> list[HeldPose]:
-    """Simulate marks on the clamps that the simulated stereo camera measures.
+    """Simulate how the stereo camera measures marks on the clamps of the sheet.
 
-    The arms hold the stretched sheet in random poses. In each pose every joint rests at a random
-    angle within its backlash. Marks that the triangulator's detector rejects are left out.
+    The arms hold the stretched sheet in random poses. In each pose, every joint is at a random
+    angle within its backlash. Marks that the triangulator's detector rejects are omitted.
+
+    apparatus: true parameters of the simulated hardware.
     calibration: camera parameters that the detector uses; None: the scene's parameters.
+    poses: number of poses.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)
@@ -253,7 +274,10 @@ def _see_marks(
     expected_edges: tuple[Floats, Floats],
     true_edges: tuple[Floats, Floats],
 ) -> list[EdgeMark]:
-    """Return the marks of both clamps that the detector accepts."""
+    """Return the marks of both clamps that the detector finds in simulated images.
+
+    expected_edges, true_edges: expected and true poses (4, 4) of the left and right edge.
+    """
     marks = []
     for side, expected, true in zip(SIDES, expected_edges, true_edges, strict=True):
         for fraction in ALONG:

@@ -1,10 +1,11 @@
-"""Measure the positions of the viewer's eyes from pairs of points that appear aligned to an eye.
+"""Measure the positions of the viewer's eyes from pairs of points that appear aligned to one eye.
 
-The projector shows a cross on the sheet. The viewer closes one eye and moves a bead, which stands
-between the eye and the sheet, until it covers the cross. The stereo camera measures both points.
-The eye lies on the straight line through them, and the lines for several bead positions meet at the
-eye. Augmented reality uses the same method (active alignment, Tuceryan and Navab 2000). It measures
-the centre of projection of the eye, and needs no calibration of projector or sheet.
+The projector shows a cross on the sheet. The viewer closes one eye and moves a bead, which is
+between the eye and the sheet, until it covers the cross. The stereo camera measures the positions
+of bead and cross. The eye is on the straight line through both points, and the lines for several
+bead positions intersect at the eye. This method is used in augmented reality (active alignment,
+Tuceryan and Navab 2000). It measures the centre of projection of the eye, and needs no calibration
+of projector or sheet.
 """
 
 from __future__ import annotations
@@ -40,38 +41,42 @@ Floats = NDArray[np.float64]
 SIDES: tuple[Side, Side] = ("left", "right")
 POINTS = ("bead", "cross")
 COLUMNS = ("eye", *(f"{point}_{axis}_mm" for point in POINTS for axis in "xyz"))
-"""The columns of the CSV file with one row per alignment: the open eye (left or right), and the
-measured world positions (mm) of bead and cross."""
+"""The columns of the CSV file of alignments, which has one row for each alignment.
+
+They contain the open eye (left or right), and the measured world positions (mm) of bead and cross.
+"""
 
 MIN_ALIGNMENTS = 6
 OUTLIER_RATIO = 2.0
-"""The multiple of the median distance above which the influence of an alignment on the fit no
-longer grows (Huber 1964)."""
+"""The multiple of the median distance above which the Huber loss of the fit is linear.
+
+Source: Huber 1964.
+"""
 
 MAX_ANGLE_RAD = 0.02
-"""The maximum rms angle between bead and cross at the fitted eye.
+"""The maximum rms angle (rad) between bead and cross, as seen from the fitted eye.
 
 A larger angle indicates that the eyes, or bead and cross, have been exchanged in the file.
 """
 
 MAX_SHIFT_M = 0.3
-"""The maximum distance of a measured eye from its position in the scene."""
+"""The maximum distance (m) of a measured eye from its position in the scene."""
 
 MIN_DISTANCE_M = 0.05
-"""The minimum distance between bead and cross."""
+"""The minimum distance (m) between bead and cross."""
 
 BEADS_M = tuple((x, y, z) for z in (0.10, 0.15) for y in (-0.05, 0.0, 0.05)
                 for x in (-0.05, 0.0, 0.05))  # fmt: skip
-"""The world positions (x, y, z) of the bead in a simulation, used with each eye."""
+"""The simulated positions (x, y, z) of the bead in the world, in m, for each eye."""
 ALIGNMENT_S = 6.0
-"""The time between two simulated alignments."""
+"""The time (s) between two simulated alignments."""
 
 HEAD_REST_SWAY_M = 1.5e-3
-"""The maximum standard deviation of head motion on a chin rest, which the procedure requires."""
+"""The maximum standard deviation (m) of head motion on the chin rest that the viewer must use."""
 
 
 class EyesError(FlexsheetError, ValueError):
-    """Raised for alignments that do not determine the positions of the eyes."""
+    """Raised if the alignments do not determine the positions of the eyes."""
 
     code = "eyes-calibration"
     remedy = (
@@ -82,7 +87,10 @@ class EyesError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """The measured world positions (3,), in m, of a bead and a cross that coincide for one eye."""
+    """A bead and a cross that appear at the same point to one eye.
+
+    The measured positions (3,) of both are in metres in the world frame.
+    """
 
     eye: Side
     bead_m: Floats
@@ -91,11 +99,11 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class EyesFit:
-    """The measured positions of both eyes, with their uncertainty.
+    """The fitted positions of both eyes, with their uncertainty.
 
-    angle_rms_rad: root mean square of the angle between bead and cross at the measured eye.
-    covariance_m2: covariance (3, 3) of the midpoint between the eyes. interocular_std_m: standard
-    deviation of the distance between the eyes.
+    angle_rms_rad: rms angle between bead and cross, as seen from the fitted eye.
+    covariance_m2: covariance (3, 3) of the midpoint between the eyes.
+    interocular_std_m: standard deviation of the distance between the eyes.
     """
 
     eyes: Eyes
@@ -105,31 +113,35 @@ class EyesFit:
 
 
 def fit_eyes(alignments: Sequence[Alignment], guess: Eyes) -> EyesFit:
-    """Fit the positions of both eyes to alignments, starting from `guess`.
+    """Fit the positions of both eyes to alignments, starting from the positions `guess`.
 
-    For each eye, the fit minimizes the distances of the crosses from the lines of sight through
-    their beads, with a Huber loss. It does not minimize angles, because these approach zero for an
-    eye at infinity. Raises EyesError if the alignments do not determine the eyes.
+    For each eye, the fit minimizes the distances from the crosses to the lines of sight through the
+    beads, with a Huber loss. It does not minimize angles, because angles approach zero for an eye
+    at infinity.
+
+    Raises EyesError if the alignments do not determine the eyes.
     """
     positions, covariances, angles = [], [], []
     for sign, side in zip((-0.5, 0.5), SIDES, strict=True):
         given = [one for one in alignments if one.eye == side]
         if len(given) < MIN_ALIGNMENTS:
             raise EyesError(
-                f"{len(given)} alignments of the {side} eye; at least {MIN_ALIGNMENTS} are required"
+                f"there are {len(given)} alignments of the {side} eye, but at least "
+                f"{MIN_ALIGNMENTS} are required; record more alignments"
             )
         start = guess.centre_world_m + sign * guess.interocular_m * np.eye(3)[0]
         position, covariance, rms_rad = _fit_eye(given, start)
         if np.linalg.norm(position - start) > MAX_SHIFT_M:
             raise EyesError(
                 f"the measured {side} eye is {np.linalg.norm(position - start):.2g} m from its "
-                f"position in the scene, at most {MAX_SHIFT_M:g} m are allowed; check "
+                f"position in the scene, but at most {MAX_SHIFT_M:g} m are allowed; check "
                 "eyes.centre_world_m in the scene, and the columns of the CSV file"
             )
         if rms_rad > MAX_ANGLE_RAD:
             raise EyesError(
-                f"{side} eye: the rms angle between bead and cross is {1e3 * rms_rad:.1f} mrad, at "
-                f"most {1e3 * MAX_ANGLE_RAD:.0f} mrad are allowed; check all columns of the CSV"
+                f"{side} eye: the rms angle between bead and cross is {1e3 * rms_rad:.1f} mrad, "
+                f"but at most {1e3 * MAX_ANGLE_RAD:.0f} mrad are allowed; check all columns of the "
+                "CSV file"
             )
         positions.append(position)
         covariances.append(covariance)
@@ -148,7 +160,10 @@ def fit_eyes(alignments: Sequence[Alignment], guess: Eyes) -> EyesFit:
 
 
 def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Floats, float]:
-    """Fit one eye; return its position (3,), the covariance (3, 3) and the rms angle (rad)."""
+    """Fit the position of one eye, starting from the position `start` (3,).
+
+    Return the position (3,), its covariance (3, 3), and the rms angle (rad) between bead and cross.
+    """
     beads = np.array([one.bead_m for one in alignments])
     crosses = np.array([one.cross_m for one in alignments])
     if np.linalg.norm(beads - crosses, axis=1).min() < MIN_DISTANCE_M:
@@ -158,7 +173,10 @@ def _fit_eye(alignments: Sequence[Alignment], start: Floats) -> tuple[Floats, Fl
         )
 
     def offsets(eye: Floats) -> Floats:
-        """Return the shortest vectors (n, 3), in m, from the lines of sight to the crosses."""
+        """Return the shortest vectors (n, 3), in m, from the lines of sight to the crosses.
+
+        eye: position (3,) of the eye.
+        """
         directions, far = beads - eye, crosses - eye
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         return np.asarray(far - np.einsum("ni,ni->n", far, directions)[:, None] * directions)
@@ -211,12 +229,13 @@ def _rest(position: Floats, _time_s: float) -> Floats:
 def simulate_alignments(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> list[Alignment]:
-    """Simulate a viewer's alignments, measured by the simulated stereo camera.
+    """Simulate the alignments of a viewer, as measured by the simulated stereo camera.
 
-    The arms hold the flat sheet at the screen. An alignment is omitted if the viewer does not see
-    the sheet behind the bead, or if the detector rejects one of the points. apparatus: true
-    parameters of the simulated hardware. calibration: camera parameters that the detector uses;
-    None: the scene's parameters.
+    The arms hold the flat sheet at the imaginary screen. An alignment is omitted if the viewer does
+    not see the sheet behind the bead, or if the camera does not detect one of the points.
+
+    apparatus: true parameters of the simulated hardware.
+    calibration: camera parameters that the detector uses; None: the scene's parameters.
     """
     random = np.random.default_rng(seed)
     true_scene = apply_apparatus(scene, apparatus)

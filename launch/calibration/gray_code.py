@@ -1,9 +1,9 @@
 """Generate Gray-code patterns for structured light, and decode camera images of the patterns.
 
 A camera pixel is wider than a projector pixel, so the finest stripes are not resolved. Each image
-is decoded to cells of a few projector pixels. A smooth map is fitted to the cells around a
-projector pixel, and gives its position in the image with subpixel accuracy. Moreno and Taubin
-(2012) fit local homographies instead.
+is decoded to cells of a few projector pixels. To find the image position of a projector pixel with
+subpixel accuracy, a quadratic map is fitted to the cells around it. Moreno and Taubin (2012) fit
+local homographies instead.
 """
 
 from __future__ import annotations
@@ -22,31 +22,34 @@ Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
 MIN_CONTRAST = 24
-"""The minimum difference (grey levels) between the white and the black image at a lit camera pixel.
-"""
+"""The minimum difference in grey levels between white and black at a lit camera pixel."""
 
 MIN_STRIPE_PX = 4
-"""The width of the finest stripes that are decoded, projector pixels."""
+"""The width of the finest stripes that are decoded, in projector pixels."""
 
 WINDOW_HALF_PX = 22.0
-"""The half side length, in projector pixels, of the window that is fitted around a projector pixel.
-"""
+"""Half the side length (projector pixels) of the window in which the map is fitted."""
 
 MIN_CELLS = 60
 MAX_FIT_RMS_PX = 0.6
-"""The maximum rms residual of a fit, camera pixels. A larger residual indicates an edge or a fold
-of the sheet in the window."""
+"""The maximum rms residual of a fit, in camera pixels per projector pixel of the finest stripes.
+
+A larger residual indicates that the window contains an edge or a fold of the sheet.
+"""
 
 
 class DecodeError(FlexsheetError, ValueError):
-    """Raised for images from which the patterns cannot be decoded."""
+    """Raised if the patterns cannot be decoded from the camera images."""
 
     code = "gray-code"
     remedy = "Capture all patterns in order, without over- or underexposure."
 
 
 def make_patterns(width_px: int, height_px: int) -> list[Image]:
-    """Return the images to project: each pattern and its inverse, then white, then black."""
+    """Return the images (height, width) to project.
+
+    Each pattern is followed by its inverse. The last two images are white and black.
+    """
     coder = cv2.structured_light.GrayCodePattern.create(width_px, height_px)
     made, images = coder.generate()
     if not made:
@@ -57,9 +60,11 @@ def make_patterns(width_px: int, height_px: int) -> list[Image]:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """The lit camera pixels (n, 2) and the projector pixels (n, 2) that light them.
+    """The correspondence between camera pixels and projector pixels, as decoded from images.
 
-    The images identify a cell of several projector pixels, whose centre is stored.
+    pixels: lit camera pixels (n, 2).
+    lit_by: projector pixels (n, 2) that light them. Each is the centre of a cell of several
+        projector pixels.
     """
 
     pixels: Floats
@@ -67,14 +72,19 @@ class Decoded:
 
 
 def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> Decoded:
-    """Decode one camera's images (height, width) of the patterns, in the order of `make_patterns`.
+    """Decode the images (height, width) of one camera, in the order of `make_patterns`.
 
-    Raises DecodeError for a wrong number of images, different sizes, or too few lit pixels.
+    width_px, height_px: size of the projected image.
+
+    Raises DecodeError for a wrong number of images, for different sizes, and for too few lit
+    pixels.
     """
     bits = [_bits(width_px), _bits(height_px)]
     expected = 2 * sum(bits) + 2
     if len(images) != expected:
-        raise DecodeError(f"expected {expected} images, one per pattern, found {len(images)}")
+        raise DecodeError(
+            f"there are {len(images)} images of {expected} patterns; give one image per pattern"
+        )
     if len({image.shape for image in images}) != 1:
         raise DecodeError(
             "the images have different sizes; capture all images with the same camera"
@@ -105,9 +115,11 @@ def _bits(size_px: int) -> int:
 
 
 def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
-    """Find the camera pixels (n, 2) of projector pixels (n, 2).
+    """Find the camera pixels that show given projector pixels.
 
-    Return the camera pixels, and a mask (n,) that is true for valid pixels.
+    Return camera pixels (n, 2), and a mask (n,) that is true if the pixel was found.
+
+    projector_px: projector pixels (n, 2).
     """
     found, valid = np.zeros((len(projector_px), 2)), np.zeros(len(projector_px), np.bool_)
     order = np.argsort(view.lit_by[:, 0], kind="stable")
@@ -126,10 +138,13 @@ def find_pixels(view: Decoded, projector_px: Floats) -> tuple[Floats, Bools]:
 
 
 def _fit_pixel(offsets: Floats, pixels: Floats) -> Floats | None:
-    """Fit a quadratic map from offsets to camera pixels (n, 2); return the pixel (2,) at offset 0.
+    """Fit a quadratic map from offsets in the projector image to camera pixels.
 
-    offsets (n, 2): offsets of decoded cells of the projector image, relative to half the window's
-    side (-1..1). Returns None if the residual is too large, or cells are missing on one side.
+    Return the camera pixel (2,) at offset 0. Return None if the residual is too large, or if cells
+    are missing on one side.
+
+    offsets: offsets (n, 2) of decoded cells, divided by half the window's side (-1..1).
+    pixels: camera pixels (n, 2) of these cells.
     """
     for _ in range(2):
         # Require cells on all sides, because the fit would extrapolate beyond the sheet's edge.

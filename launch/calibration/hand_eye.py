@@ -1,18 +1,18 @@
 """Estimate the pose of an arm's base in the world from images of a board on its flange.
 
-This is robot-world/hand-eye calibration. For each of several poses of the arm
+This is robot-world/hand-eye calibration. Each of several poses of the arm satisfies the equation
 
 world_from_base base_from_flange(joints) flange_from_board = world_from_left left_from_board
 
-where the first and third transform are unknown. A closed form gives initial values (Shah, Solving
-the robot-world/hand-eye calibration problem using the Kronecker product, J. Mechanisms Robotics
-5(3), 2013). Then all unknowns are fitted to all corners of all images.
+where the first and the third transform are unknown. A closed form gives initial values (Shah,
+Solving the robot-world/hand-eye calibration problem using the Kronecker product, J. Mechanisms
+Robotics 5(3), 2013). Then all unknowns are fitted to all corners of all images.
 
-The real flange deviates from the forward kinematics by some tenths of a millimetre. This error is
-common to all corners of an image pair. Each pose therefore has a small random flange motion. The
-standard deviations of this mixed model are estimated by restricted maximum likelihood (REML;
-Patterson and Thompson, Biometrika 58(3), 1971). If all corners were treated as independent, the
-uncertainty would be underestimated several times.
+The real flange deviates from the forward kinematics by some tenths of a millimetre. All corners of
+an image pair have this error in common. Therefore, the model contains a small random flange motion
+for each pose. The standard deviations of this mixed model are estimated by restricted maximum
+likelihood (REML; Patterson and Thompson, Biometrika 58(3), 1971). If all corners were treated as
+independent, the uncertainty would be underestimated several times.
 
 A motion (6,) is a rotation vector (rad), then a translation (m).
 """
@@ -43,47 +43,61 @@ from flexsheet.nodes.models.rigid import (
 Floats = NDArray[np.float64]
 
 MIN_POSES = 6
-"""The minimum number of poses; 15 to 20 are recommended."""
+"""The minimum number of poses for a calibration. From 15 to 20 poses are recommended."""
 
 MIN_ROTATION_RAD = float(np.radians(5.0))
-"""The minimum rms rotation of the flange about each of two axes. Smaller rotations do not determine
-all unknowns."""
+"""The minimum rms rotation (rad) of the flange about each of two axes.
+
+With smaller rotations, the poses do not determine all unknowns.
+"""
 
 RANDOM_STARTS = 60
 SUBSET_POSES = 5
-"""The size of the random subsets that give further initial values, in case some poses are wrong."""
+"""The number of poses in each random subset that gives initial values.
+
+Subsets are used in case some poses are wrong.
+"""
 
 LENGTH_M = 0.3
-"""The translation, in metres, that has the same weight in a pose's error as a rotation of one
-radian."""
+"""The translation (m) that contributes as much to a pose's error as a rotation of one radian."""
 
 MAX_MEDIAN_RATIO = 6.0
-"""The maximum ratio of a pose's error to the median error, for the pose to be used in the first
-fit."""
+"""The maximum ratio of a pose's error to the median error in the first fit.
+
+Poses with larger errors are excluded from the first fit.
+"""
 
 MAX_CHI_SQUARE, MEDIAN_CHI_SQUARE = 60.0, 5.348
-"""The limit of the squared deviation above which a pose is an outlier, and the chi-square median.
+"""The limit of the outlier test, and the median of chi-square with six degrees of freedom.
 
-The median is that for six degrees of freedom; deviations are scaled by it. The limit is above the
-maximum (43) of 75 simulated sets of 15 poses without outliers; an arm's error varies over its
-workspace.
+A pose is an outlier if its squared deviation exceeds the limit. The squared deviations are scaled
+so that their median is the median of chi-square. The maximum was 43 in 75 simulated sets of 15
+poses without outliers. The limit is higher, because the error of an arm varies over its workspace.
 """
 
 ROUNDING_PX, ROUNDING_RAD, ROUNDING_M = 1e-4, 1e-8, 1e-8
 MIN_SCALE = 0.01
-"""The lower bound of the scale of deviations, for poses that agree except for rounding."""
+"""The minimum ratio of the median squared deviation to the median of chi-square.
+
+It applies if all poses agree except for rounding errors.
+"""
 
 MAX_READMISSIONS = 5
 
 MAX_PLAUSIBLE_ARM_M, MAX_PLAUSIBLE_ARM_RAD = 0.01, 0.05
-"""The maximum plausible standard deviations of the flange's position (m) and orientation (rad).
-Larger values mean that joint angles are assigned to the wrong joints."""
+"""The maximum plausible standard deviations of the flange's position (m) and rotation (rad).
+
+Larger values indicate that joint angles are assigned to the wrong joints.
+"""
 
 MAX_OUTLIER_RATIO = 1.0 / 3.0
-"""The maximum fraction of outlier poses; more indicate another mistake, such as a wrong board."""
+"""The maximum fraction of outliers among the poses.
+
+A larger fraction indicates another mistake, such as a wrong board.
+"""
 
 MIN_ARM_RAD, MIN_ARM_M = 1e-6, 1e-6
-"""The lower bounds of the estimated standard deviations of the arm."""
+"""The minimum estimated standard deviations of the flange's rotation (rad) and position (m)."""
 
 MAX_ARM_RAD, MAX_ARM_M = 0.1, 0.1
 
@@ -93,18 +107,21 @@ ADVICE = (
 )
 
 INITIAL_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
-"""The initial simplex of the search over the logarithms of the arm's two standard deviations."""
+"""The initial simplex of the optimization, relative to the initial values.
+
+The variables are the logarithms of the standard deviations of the flange's rotation and position.
+"""
 
 MAX_ITERATIONS = 30
 CONVERGED_STEP = 1e-10
-"""The maximum step of any unknown (rad, m) at convergence."""
+"""The step of the unknowns (rad, m) below which the fit has converged."""
 
 INITIAL_STEP = 1e-6
-"""The maximum step at convergence of the fits that compute initial values."""
+"""The step of the unknowns (rad, m) below which a fit of initial values has converged."""
 
 
 class HandEyeError(FlexsheetError, ValueError):
-    """Raised for poses that do not determine the pose of the arm's base."""
+    """Raised if the measured poses do not determine the pose of the arm's base."""
 
     code = "hand-eye"
     remedy = "Measure more poses, with the board rotated about at least two axes."
@@ -112,7 +129,7 @@ class HandEyeError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class CameraLens:
-    """A camera matrix (3, 3), px, and Brown's lens distortion (5,)."""
+    """The camera matrix (3, 3), in px, and Brown's distortion coefficients (5,) of a lens."""
 
     matrix: Floats
     distortion: Floats
@@ -120,7 +137,7 @@ class CameraLens:
 
 @dataclass(frozen=True, slots=True)
 class LensRig:
-    """The lenses and pose of the stereo camera; transforms are (4, 4)."""
+    """The lenses of the stereo camera and their poses as transforms (4, 4)."""
 
     left: CameraLens
     right: CameraLens
@@ -130,7 +147,11 @@ class LensRig:
 
 @dataclass(frozen=True, slots=True)
 class CornerView:
-    """The board corners in one image: points in the board's frame (k, 3), m, and pixels (k, 2)."""
+    """The board corners in one image.
+
+    points_board: positions (k, 3), in m, in the board's frame.
+    pixels: positions (k, 2) in the image, px.
+    """
 
     points_board: Floats
     pixels: Floats
@@ -138,7 +159,10 @@ class CornerView:
 
 @dataclass(frozen=True, slots=True)
 class BoardDetection:
-    """A pose of the arm: joint angles (6,), rad, and the board's corners in both images."""
+    """A pose of the arm, with the corners of the board in both images.
+
+    joints_rad: joint angles (6,).
+    """
 
     name: str
     joints_rad: Floats
@@ -150,9 +174,11 @@ class BoardDetection:
 class PoseResidual:
     """The residual of one pose of the arm.
 
-    shift_m, rotation_rad: difference between the flange poses from the images and from the joint
-    angles. rms_px: rms distance of the corners from their projections with the pose from the joint
-    angles. reason: why the pose was excluded; empty for an inlier.
+    shift_m, rotation_rad: difference between the flange pose from the images and the flange pose
+        from the joint angles.
+    rms_px: rms distance between the detected corners and the corners projected with the pose from
+        the joint angles.
+    reason: reason why the pose was excluded; empty if it was used.
     """
 
     name: str
@@ -166,14 +192,14 @@ class PoseResidual:
 class BaseFit:
     """The estimated pose of the arm's base, with its uncertainty and residuals.
 
-    covariance: covariance (6, 6) of the motion from the estimated to the true world_from_base:
-    rotation about the base's origin in world axes, then translation. It is scaled by the square of
-    `jackknife_ratio` if that is above 1.
-
-    corner_sigma_px: standard deviation of one corner coordinate. arm_sigma_rad, arm_sigma_m:
-    standard deviations of one component of the flange's pose error. jackknife_ratio: ratio of the
-    standard deviations from the jackknife to the standard deviations from the fit (rms over the six
-    components). leave_one_out: motions (n, 6) of the base when one inlier is excluded.
+    covariance: covariance (6, 6) of the motion from the estimated to the true base pose. The motion
+        is a rotation (rad) about the base's origin in world axes, then a translation (m). If
+        `jackknife_ratio` is above 1, the covariance has been multiplied by its square.
+    corner_sigma_px: standard deviation of one coordinate of a corner.
+    arm_sigma_rad, arm_sigma_m: standard deviations of one component of the flange's pose error.
+    jackknife_ratio: standard deviation from the jackknife divided by the standard deviation from
+        the fit, as rms over the six components.
+    leave_one_out: motions (n, 6) of the base when one pose is excluded from the fit.
     """
 
     world_from_base: Floats
@@ -187,10 +213,12 @@ class BaseFit:
     residuals: tuple[PoseResidual, ...]
 
     def compute_std(self, world_m: Floats) -> tuple[float, float]:
-        """Return the standard deviations of a commanded flange pose at a world point (3,).
+        """Return the standard deviations of the position (m) and rotation (rad) of a flange pose.
 
-        The first is that of the position (m), the second that of the rotation (rad), both over all
-        axes.
+        Each value combines all three axes. The pose is computed from joint angles with the fitted
+        base.
+
+        world_m: position (3,) of the flange in the world.
         """
         lever = np.hstack([-skew(world_m - self.world_from_base[:3, 3]), np.eye(3)])
         shift = float(np.sqrt(np.trace(lever @ self.covariance @ lever.T)))
@@ -199,13 +227,16 @@ class BaseFit:
 
 @dataclass(frozen=True, slots=True)
 class _Unknowns:
-    """The estimates of the unknown transforms, both (4, 4)."""
+    """The current estimates of the two unknown transforms (4, 4)."""
 
     world_from_base: Floats
     flange_from_board: Floats
 
     def apply_step(self, step: Floats) -> _Unknowns:
-        """Apply motions (12,) to the base and the board, each about its own origin."""
+        """Apply a motion to the base and a motion to the board, each about its own origin.
+
+        step: motion (6,) of the base, then motion (6,) of the board.
+        """
         return _Unknowns(
             _apply_motion(self.world_from_base, step[:6]),
             _apply_motion(self.flange_from_board, step[6:]),
@@ -214,13 +245,15 @@ class _Unknowns:
 
 @dataclass(frozen=True, slots=True)
 class _LinearizedPose:
-    """A model of one pose, linearized at the current estimates.
+    """The corners of one pose, linearized at the current estimates of the unknowns.
 
-    measured: flange motion (6,), in the flange's frame, that fits the corners best. spread: its
-    covariance (6, 6) per px^2 of corner noise. by_unknowns: derivative (6, 12) of the flange motion
-    by the motions of base and board. inner_px2: sum of squared pixel residuals after the motion
-    `measured`. count: number of corner coordinates. rms_px: rms error of the corners without that
-    motion.
+    measured: flange motion (6,), in the flange's frame, that fits the corners best.
+    spread: covariance (6, 6) of this motion for corner noise of 1 px.
+    by_unknowns: derivatives (6, 12) of the flange motion with respect to the motions of base and
+        board.
+    inner_px2: sum of squared pixel residuals after the flange motion.
+    count: number of corner coordinates.
+    rms_px: rms error of the corners without the flange motion.
     """
 
     measured: Floats
@@ -236,10 +269,16 @@ def calibrate_base(
     rig: LensRig,
     arm: ClosedFormArm | JointChain = RV_1A,
 ) -> BaseFit:
-    """Estimate the pose of the arm's base. Raises HandEyeError if the poses do not determine it.
+    """Estimate the pose of the base of an arm in the world.
 
-    The stereo camera is assumed exact: its errors shift the base and the fingertip equally, since
-    the same camera measures both.
+    The stereo camera is assumed to be exact. Its errors shift the base and the fingertip equally,
+    because the same camera measures both.
+
+    detections: at least MIN_POSES poses of the arm.
+    rig: stereo camera with its pose in the world.
+    arm: kinematic model of the arm.
+
+    Raises HandEyeError if the poses do not determine the pose of the base.
     """
     _check_count(detections)
     forward = make_kinematics(arm).forward
@@ -267,7 +306,8 @@ def calibrate_base(
 def _check_count(detections: Sequence[BoardDetection]) -> None:
     if len(detections) < MIN_POSES:
         raise HandEyeError(
-            f"{len(detections)} arm poses, at least {MIN_POSES} are required; record 15 to 20 poses"
+            f"there are {len(detections)} arm poses, but at least {MIN_POSES} are required; record "
+            "15 to 20 poses"
         )
     for one in detections:
         if not np.isfinite(one.joints_rad).all() or one.joints_rad.shape != (6,):
@@ -294,9 +334,11 @@ def _check_plausible(model: _NoiseModel) -> None:
 
 
 def _check_rotations(flanges: Sequence[Floats]) -> None:
-    """Raise HandEyeError unless the flange rotates about two axes.
+    """Raise HandEyeError if the flange does not rotate about at least two axes.
 
-    Rotations about one axis alone do not determine the translation along it.
+    Rotations about only one axis do not determine the translation along this axis.
+
+    flanges: poses base_from_flange (4, 4).
     """
     mean = _mean_rotation([flange[:3, :3] for flange in flanges])
     rotations = np.array([vector_from_rotation(mean.T @ flange[:3, :3]) for flange in flanges])
@@ -305,20 +347,21 @@ def _check_rotations(flanges: Sequence[Floats]) -> None:
     if spread[2] < MIN_ROTATION_RAD:
         raise HandEyeError(
             f"the flange rotates by only {np.degrees(spread[2]):.1f} degrees rms between the "
-            f"poses, at least {np.degrees(MIN_ROTATION_RAD):.0f} about two axes are required; "
+            f"poses, but at least {np.degrees(MIN_ROTATION_RAD):.0f} about two axes are required; "
             "rotate it by 20 to 40 degrees in both directions"
         )
     if spread[1] < MIN_ROTATION_RAD:
         x, y, z = axes[:, 2]
         raise HandEyeError(
-            f"the flange rotates about one axis only, ({x:.2f}, {y:.2f}, {z:.2f}) in its own frame "
-            f"(about other axes {np.degrees(spread[1]):.1f} degrees rms, at least "
-            f"{np.degrees(MIN_ROTATION_RAD):.0f} required); rotate it about another axis as well"
+            f"the flange rotates about one axis only, ({x:.2f}, {y:.2f}, {z:.2f}) in its own "
+            f"frame; it rotates by {np.degrees(spread[1]):.1f} degrees rms about other axes, but "
+            f"at least {np.degrees(MIN_ROTATION_RAD):.0f} are required; rotate it about another "
+            "axis as well"
         )
 
 
 def _mean_rotation(rotations: Sequence[Floats]) -> Floats:
-    """Return the mean of rotation matrices in the least-squares sense."""
+    """Return the rotation matrix (3, 3) that is nearest to all given rotations in least squares."""
     u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))
     return np.asarray(u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt)
 
@@ -326,7 +369,8 @@ def _mean_rotation(rotations: Sequence[Floats]) -> Floats:
 def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
     """Fit the board's pose left_from_board (4, 4) to the corners of both images.
 
-    One image of a flat board has two similar solutions; the other image decides between them.
+    From one image, the pose of a flat board has two similar solutions. The other image decides
+    between them.
     """
     left = detection.left
     count, rotations, shifts, _ = cv2.solvePnPGeneric(
@@ -356,7 +400,11 @@ def _fit_board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
 def _linearize_pixels(
     detection: BoardDetection, rig: LensRig, left_from_flange: Floats, flange_from_board: Floats
 ) -> tuple[Floats, Floats]:
-    """Return residuals (m,), in px, of the corners, and derivatives (m, 6) by a flange motion."""
+    """Compute the residuals of the corners, and their derivatives for a small flange motion.
+
+    Return residuals (m,), in px, and derivatives (m, 6) with respect to rotation (rad) and
+    translation (m).
+    """
     residuals, slopes = [], []
     for view, lens, eye_from_left in (
         (detection.left, rig.left, np.eye(4)),
@@ -369,7 +417,7 @@ def _linearize_pixels(
         rotation = eye_from_flange[:3, :3]
         by_point = np.empty((len(in_eye), 2, 3))
         for axis in range(3):
-            # A step of half a micrometre: the projection is so smooth that ten digits remain.
+            # With a step of half a micrometre, the derivatives are accurate to ten digits.
             nudge = np.zeros(3)
             nudge[axis] = 5e-7
             ahead, behind = (
@@ -386,7 +434,13 @@ def _linearize_pixels(
 
 
 def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig) -> _Unknowns:
-    """Return initial values: the closed form for all poses, or for the subset that fits best."""
+    """Return initial values of the unknown transforms.
+
+    These are the closed-form solution for all poses or for a random subset, whichever fits best.
+
+    flanges: poses base_from_flange (4, 4).
+    boards: poses left_from_board (4, 4).
+    """
     random = np.random.default_rng(0)
     every = np.arange(len(flanges))
     subsets = [
@@ -409,7 +463,7 @@ def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: Lens
             best, min_score = found, score
     if best is None:
         raise HandEyeError(
-            "no initial solution for these poses; rotate the flange more, about two axes"
+            "these poses have no initial solution; rotate the flange more, about two axes"
         )
     return best
 
@@ -417,12 +471,12 @@ def _find_initial(flanges: Sequence[Floats], boards: Sequence[Floats], rig: Lens
 def _solve_closed_form(
     flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> _Unknowns | None:
-    """Return Shah's solution of B F X = C, or None if the poses have none.
+    """Return Shah's closed-form solution of B F X = C, or None if the poses have no solution.
 
-    Here B is world_from_base, F base_from_flange, X flange_from_board and C world_from_board. With
-    Y the transpose of X's rotation, C Y = B F for all rotations. Therefore the matrix sum(kron(F,
-    C)) maps the stacked columns of Y to n times those of B, and both are its first singular
-    vectors. The translations follow by linear least squares.
+    Here, B is world_from_base, F is base_from_flange, X is flange_from_board and C is
+    world_from_board. With Y as the transpose of X's rotation, C Y = B F holds for all rotations.
+    Therefore, the matrix sum(kron(F, C)) maps the stacked columns of Y to n times those of B. Both
+    are first singular vectors of this matrix. The translations follow by linear least squares.
     """
     worlds = [rig.world_from_left @ board for board in boards]
     stacked = np.sum(
@@ -445,7 +499,7 @@ def _solve_closed_form(
 
 
 def _unstack_rotation(stacked: Floats) -> Floats:
-    """Return the rotation (3, 3) nearest to a multiple of the stacked columns (9,)."""
+    """Return the rotation (3, 3) nearest to a multiple of a matrix with stacked columns (9,)."""
     matrix = stacked.reshape(3, 3).T
     return _mean_rotation([matrix if np.linalg.det(matrix) > 0.0 else -matrix])
 
@@ -453,9 +507,10 @@ def _unstack_rotation(stacked: Floats) -> Floats:
 def _compute_discrepancies(
     unknowns: _Unknowns, flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> Floats:
-    """Return the differences (n, 6) between flange poses from joint angles and from images.
+    """Return the differences between the flange poses from joint angles and from images.
 
-    A difference is a rotation vector and a translation in the frame of the flange.
+    A difference (6,) is a rotation vector (rad) and a translation (m) in the frame of the flange.
+    The result has the shape (n, 6) for n poses.
     """
     found = []
     for flange, board in zip(flanges, boards, strict=True):
@@ -466,7 +521,12 @@ def _compute_discrepancies(
 
 
 def _find_rough_inliers(discrepancies: Floats) -> NDArray[np.bool_]:
-    """Return a mask (n,) of poses with errors below a multiple of the median, for the first fit."""
+    """Return a mask (n,) of the poses with which the first fit is made.
+
+    Poses with errors above a multiple of the median are excluded.
+
+    discrepancies: differences (n, 6) that `_compute_discrepancies` returned.
+    """
     good = np.ones(len(discrepancies), dtype=bool)
     for part, min_error in ((slice(0, 3), MIN_ARM_RAD), (slice(3, 6), MIN_ARM_M)):
         error = np.linalg.norm(discrepancies[:, part], axis=1)
@@ -476,23 +536,27 @@ def _find_rough_inliers(discrepancies: Floats) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, slots=True)
 class _NoiseModel:
-    """The standard deviations of corner coordinates (px) and of the flange's pose (rad and m)."""
+    """The standard deviations of corner coordinates (px) and of a flange pose (rad and m)."""
 
     corner_px: float
     arm_rad: float
     arm_m: float
 
     def compute_weights(self, poses: Sequence[_LinearizedPose]) -> Floats:
-        """Return the information matrix of each flange motion (n, 6, 6), with the arm's error."""
+        """Return the information matrices (n, 6, 6) of the flange motions of n poses.
+
+        They include the errors of the corners and of the arm.
+        """
         arm = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
         spreads = np.array([one.spread for one in poses])
         return np.asarray(np.linalg.inv(self.corner_px**2 * spreads + arm))
 
 
 def _find_inliers(poses: Sequence[_LinearizedPose], model: _NoiseModel) -> NDArray[np.bool_]:
-    """Return a mask (n,) of inliers by a chi-square test of deviations scaled by their median.
+    """Return a mask (n,) of the poses that are not outliers.
 
-    Deviations within rounding are inliers even if the other poses are exact.
+    The mask is the result of a chi-square test of deviations that are scaled by their median. A
+    pose with deviations as small as rounding errors is never an outlier.
     """
     measured = np.array([one.measured for one in poses])
     bounded = _NoiseModel(
@@ -511,7 +575,12 @@ def _fit_unknowns(
     flanges: Sequence[Floats],
     rig: LensRig,
 ) -> tuple[_Unknowns, _NoiseModel]:
-    """Fit the unknowns and the standard deviations by Gauss-Newton steps."""
+    """Fit the unknown transforms and the standard deviations by Gauss-Newton steps.
+
+    unknowns: initial transforms.
+
+    Raises HandEyeError if the poses do not determine the base.
+    """
     model: _NoiseModel | None = None
     for _ in range(MAX_ITERATIONS):
         poses = _linearize(unknowns, detections, flanges, rig)
@@ -578,7 +647,13 @@ def _normal_equations(
 def _estimate_deviations(
     poses: Sequence[_LinearizedPose], before: _NoiseModel | None
 ) -> _NoiseModel:
-    """Estimate the corner noise from residuals within poses, and the arm's error by REML."""
+    """Estimate the standard deviations of the corners and of the flange's pose.
+
+    The corner noise is estimated from residuals within poses, and the flange's error by restricted
+    maximum likelihood.
+
+    before: result of the previous iteration; None in the first iteration.
+    """
     freedom = sum(one.count - 6 for one in poses)
     corner = float(np.sqrt(max(sum(one.inner_px2 for one in poses), 0.0) / max(freedom, 1)))
     corner = max(corner, 1e-6)
@@ -586,7 +661,10 @@ def _estimate_deviations(
     slopes = np.array([one.by_unknowns for one in poses])
 
     def neg_log_likelihood(logs: Floats) -> float:
-        """Return -2 times the logarithm of the restricted likelihood, without its constant."""
+        """Return -2 times the logarithm of the restricted likelihood, up to a constant.
+
+        logs: logarithms (2,) of the standard deviations of the flange's rotation and position.
+        """
         logs = np.clip(
             logs,
             [np.log(MIN_ARM_RAD), np.log(MIN_ARM_M)],
@@ -612,7 +690,10 @@ def _estimate_deviations(
 
 
 def _apply_motion(pose: Floats, motion: Floats) -> Floats:
-    """Rotate a pose about its own origin and translate it, both in the parent frame's axes."""
+    """Rotate a pose (4, 4) about its own origin, and translate it.
+
+    Both parts of the motion (6,) are in the axes of the parent frame.
+    """
     rotation = rotation_from_vector(motion[:3])
     return transform(rotation @ pose[:3, :3], pose[:3, 3] + motion[3:])
 

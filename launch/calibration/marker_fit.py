@@ -1,14 +1,14 @@
 """Fit the marker's position on the finger to touches of known points in several orientations.
 
-The marker's centre is at p + e + R o + b + noise. Here p is the touched point, e the error of its
-position, which all touches of this point share, R the finger's orientation, and o the unknown
-offset in the finger's frame. b is an error that all touches in one orientation share: the detected
-centre of a tilted marker is biased. A touched plane, such as the sheet, only determines the
-component along its normal.
+The measured centre of the marker is p + e + R o + b + noise. Here, p is the touched point, and e is
+the error of its position, which all touches of this point have in common. R is the finger's
+orientation, and o is the unknown offset of the marker in the finger's frame. All touches in one
+orientation have the error b in common, because the detected centre of a tilted marker is biased. A
+touched plane, such as the sheet, only determines the component along its normal.
 
-This is a linear model with random effects e and b. Their variances are estimated with the offset by
-restricted maximum likelihood and prior distributions, so the covariance of the offset follows from
-the residuals (Searle, Casella and McCulloch 1992, chapter 6).
+This is a linear model with random effects e and b. Their variances and the offset are estimated by
+restricted maximum likelihood with prior distributions. The covariance of the offset therefore
+follows from the residuals (Searle, Casella and McCulloch 1992, chapter 6).
 """
 
 from __future__ import annotations
@@ -25,41 +25,51 @@ from flexsheet.messages.errors import FlexsheetError
 Floats = NDArray[np.float64]
 
 TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M = 2e-4, 1e-4, 1e-4
-"""The expected standard deviations per axis: of a touch, from camera, hand and measured angle; of
-the error that all touches in one orientation share; of the position of a touched point."""
+"""The expected standard deviations (m) per axis of three kinds of errors.
+
+The first is the error of a single touch. The second is an error that all touches in one orientation
+have in common. The third is the error of the position of a touched point.
+"""
 
 COMMON_ERROR_M = 6.5e-5
-"""The standard deviation per axis of the error that all touches share, which residuals cannot show.
+"""The standard deviation (m) per axis of the error that all touches have in common.
 
-The causes are the mean bias of the detected centre of a tilted marker and the stereo calibration.
-The value makes the stated error equal the true one in simulated laboratories with seeds 0 to 11.
+The residuals do not show this error. Its causes are the mean bias of the detected centre of a
+tilted marker and the stereo calibration. With this value, the stated error equals the true error in
+simulated laboratories with seeds 0 to 11.
 """
 
 PRIOR_STD_LN = np.array([0.5, 0.7, 0.4])
-"""The standard deviations of the logarithms of the three standard deviations above."""
+"""The standard deviations (3,) of the logarithms of the expected standard deviations.
+
+They describe the prior distributions of the errors of touches, orientations and points.
+"""
 
 POINT_GRID_M = 1e-6
-"""The grid, in metres, to which points are rounded to find touches of the same point."""
+"""The spacing (m) of the grid to which points are rounded to find touches of the same point."""
 
 MIN_TOUCHES, MIN_ORIENTATIONS = 4, 3
 MIN_ANGLE_RAD = np.radians(8.0)
-"""The minimum angle between orientations that count as different."""
+"""The minimum angle (rad) between two orientations that count as different."""
 
 MAX_DEVIATION_M = 5e-4
-"""The maximum standard deviation of a component of the offset that counts as determined."""
+"""The maximum standard deviation (m) of each coordinate of a valid marker position."""
 
 MAX_RESIDUAL_M = 1e-3
-"""The maximum root mean square residual of touches that count as consistent."""
+"""The maximum root mean square (m) of the residuals of a valid fit."""
 
 MAX_CONDITION = 1e6
-"""The maximum condition number of touches that determine all components of the offset."""
+"""The maximum condition number of the matrix of the linear fit.
+
+If it is larger, the touches do not determine all components of the offset.
+"""
 
 MAX_OFFSET_M = 0.05
-"""The maximum plausible distance between the marker and the finger's pad."""
+"""The maximum plausible distance (m) between the marker and the finger's pad."""
 
 
 class MarkerFitError(FlexsheetError, ValueError):
-    """Raised for touches that do not determine the marker's position on the finger."""
+    """Raised if the touches do not determine the marker's position on the finger."""
 
     code = "marker-fit"
     remedy = "Touch known points in at least three orientations that differ by 15 degrees or more."
@@ -67,10 +77,12 @@ class MarkerFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Touch:
-    """A touch of a known point or plane, during which the finger was at rest.
+    """A touch of a known point or plane by the resting finger.
 
-    marker_m, point_m: measured marker and touched point (3,), world. normal: (3,) of a touched
-    plane; None: the pad was at the point. world_from_finger: rotation (3, 3).
+    marker_m: measured position (3,) of the marker in the world.
+    point_m: position (3,) of the touched point in the world.
+    normal: unit normal (3,) of a touched plane; None if the pad touched the point itself.
+    world_from_finger: orientation of the finger as a rotation matrix (3, 3).
     """
 
     marker_m: Floats
@@ -81,10 +93,13 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class MarkerFit:
-    """A fitted marker offset (3,), in m, in the finger's frame, and its covariance (3, 3), in m².
+    """The fitted position of the marker on the finger, with its uncertainty.
 
-    point_offset_m: mean of the estimated errors of the touched points, world. residuals_m: residual
-    distances (touches,). points, orientations: numbers of different points and orientations.
+    marker_from_pad_m: position (3,) of the marker in the finger's frame.
+    covariance_m2: covariance (3, 3) of the position.
+    point_offset_m: mean (3,) of the estimated errors of the touched points, in the world frame.
+    residuals_m: residual distance (touches,) of each touch.
+    points, orientations: numbers of different points and orientations.
     """
 
     marker_from_pad_m: Floats
@@ -96,29 +111,29 @@ class MarkerFit:
 
     @property
     def standard_deviations_m(self) -> Floats:
-        """Return the standard deviations (3,), in m, of the offset's components."""
+        """Return the standard deviations (3,), in m, of the components of the marker's position."""
         return np.sqrt(np.diag(self.covariance_m2))
 
     @property
     def residual_rms_m(self) -> float:
-        """Return the root mean square (m) of the residuals."""
+        """Return the root mean square (m) of the residual distances."""
         return float(np.sqrt(np.mean(self.residuals_m**2)))
 
 
 def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
-    """Fit the marker's offset by restricted maximum likelihood.
+    """Fit the marker's position on the finger by restricted maximum likelihood.
 
     Raises MarkerFitError for too few touches or orientations, for touches that contradict each
-    other, and for an implausible or undetermined offset.
+    other, and for an implausible or undetermined position.
     """
     orientation = np.array(group_orientations([touch.world_from_finger for touch in touches]))
     orientations = len(set(orientation))
     if len(touches) < MIN_TOUCHES or orientations < MIN_ORIENTATIONS:
         missing = max(MIN_ORIENTATIONS - orientations, MIN_TOUCHES - len(touches))
         raise MarkerFitError(
-            f"{len(touches)} touches in {orientations} orientations; at least {MIN_TOUCHES} "
-            f"touches in {MIN_ORIENTATIONS} orientations are needed: touch in at least {missing} "
-            "more orientations"
+            f"there are {len(touches)} touches in {orientations} orientations, but at least "
+            f"{MIN_TOUCHES} touches in {MIN_ORIENTATIONS} orientations are needed: touch in at "
+            f"least {missing} more orientations"
         )
     rounded = np.rint(np.array([touch.point_m for touch in touches]) / POINT_GRID_M)
     places, point = np.unique(rounded, axis=0, return_inverse=True)
@@ -141,7 +156,10 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     expected_m = np.array([TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M])
 
     def solve(logarithms: Floats) -> tuple[float, Floats, Floats, Floats]:
-        """Return the cost, the offset, its covariance, and the weighted residuals."""
+        """Return the cost, the offset (3,), its covariance (3, 3), and the weighted residuals.
+
+        logarithms: logarithms (3,) of the standard deviations relative to their expected values.
+        """
         noise, turned, placed = (expected_m * np.exp(logarithms)) ** 2
         covariance = fixed + turned * same_orientation + placed * same_point
         covariance[np.diag_indices_from(covariance)] += noise
@@ -176,26 +194,30 @@ def _check_fit(fit: MarkerFit) -> None:
     worst = int(np.argmax(fit.residuals_m))
     if fit.residual_rms_m > MAX_RESIDUAL_M:
         raise MarkerFitError(
-            f"the touches contradict each other: rms residual {1e3 * fit.residual_rms_m:.2f} mm, "
-            f"maximum {1e3 * fit.residuals_m[worst]:.2f} mm in touch {worst + 1}; limit of the rms "
-            f"{1e3 * MAX_RESIDUAL_M:g} mm; check units, signs and orientations"
+            f"the touches contradict each other: the rms residual is "
+            f"{1e3 * fit.residual_rms_m:.2f} mm, but at most {1e3 * MAX_RESIDUAL_M:g} mm are "
+            f"allowed; the residual of touch {worst + 1} is {1e3 * fit.residuals_m[worst]:.2f} mm; "
+            "check units, signs and orientations"
         )
     for axis, deviation_m in zip("xyz", fit.standard_deviations_m, strict=True):
         if deviation_m > MAX_DEVIATION_M:
             raise MarkerFitError(
-                f"{axis} of the offset has an uncertainty of {1e3 * deviation_m:.2f} mm, maximum "
-                f"{1e3 * MAX_DEVIATION_M:g} mm; add orientations that differ more"
+                f"{axis} of the offset has an uncertainty of {1e3 * deviation_m:.2f} mm, but at "
+                f"most {1e3 * MAX_DEVIATION_M:g} mm are allowed; add orientations that differ more"
             )
     length_m = float(np.linalg.norm(fit.marker_from_pad_m))
     if length_m > MAX_OFFSET_M:
         raise MarkerFitError(
-            f"the marker would be {1e3 * length_m:.0f} mm from the pad, at most "
-            f"{1e3 * MAX_OFFSET_M:g} mm; check units and touched points"
+            f"the marker would be {1e3 * length_m:.0f} mm from the pad, but at most "
+            f"{1e3 * MAX_OFFSET_M:g} mm are plausible; check units and touched points"
         )
 
 
 def group_orientations(rotations: Sequence[Floats]) -> list[int]:
-    """Group similar rotations (3, 3), and return the index of each rotation's group."""
+    """Group similar orientations, and return the index of the group of each orientation.
+
+    rotations: rotation matrices (3, 3).
+    """
     different: list[Floats] = []
     groups = []
     for rotation in rotations:

@@ -1,11 +1,11 @@
-"""Predict the errors of a commissioned laboratory from the uncertainties of its calibrations.
+"""Predict the errors of a calibrated laboratory from the uncertainties of its calibrations.
 
-The scene contains the calibrated parameters of the devices. The prediction is a Monte Carlo
-simulation: it samples apparatuses, which are sets of possible true parameters of the devices. Their
-deviations from the scene have the covariances of the calibrations. Parameters that no calibration
-measures deviate by the standard deviations below. All errors of sheet, image, force and fingertip
-are computed from the same samples, so errors with a common cause are counted once. The true
-parameters of simulated devices are not read.
+The prediction is a Monte Carlo simulation. It samples apparatuses, which are sets of possible true
+parameters of the devices. Their deviations from the calibrated parameters in the scene have the
+covariances of the calibrations. Parameters that no calibration measures deviate by the standard
+deviations below. All errors of sheet, image, force and fingertip are computed from the same
+samples, so errors with a common cause are counted once. The true parameters of simulated devices
+are not used.
 """
 
 from __future__ import annotations
@@ -45,56 +45,66 @@ Random = np.random.Generator
 DRAWS = 12
 DRAW_SEED = 20_000
 PIXEL_M = 0.0025
-"""The size (m) of a pixel of the predicted images. Their error is averaged over about 100 mm²."""
+"""The size (m) of a pixel of the predicted images. Image errors are averaged over about 100 mm²."""
 
 CELLS = 16
-"""The number of mesh intervals per side of the sheet in a prediction."""
+"""The number of mesh intervals along each side of the simulated sheet."""
 
 NORMAL_95 = 1.645
 """The 95 % quantile of the standard normal distribution."""
 
 RADIUS_STD_M = 3e-4
-"""The standard deviation of the finger radius, measured with a calliper on a soft fingertip."""
+"""The standard deviation (m) of the radius of a soft fingertip measured with a calliper."""
 
 EYE_STD_M = 5e-3
-"""The standard deviation per axis of a head tracker, used if no step has measured the eyes."""
+"""The standard deviation (m) per axis of an eye position from a head tracker.
+
+It is used if no calibration has measured the eyes.
+"""
 
 STAMP_STD_S = 3e-3
-"""The standard deviation of exposure time minus timestamp, used if no step has measured it.
+"""The standard deviation (s) of exposure time minus timestamp.
 
-The value assumes a uniform distribution within an exposure of 10 ms.
+It is used if no calibration has measured the offset. The value assumes a uniform distribution
+within an exposure of 10 ms.
 """
 
 THICKNESS_GRADIENT_STD, SHEET_MASS_STD_RATIO = 0.03, 0.07
-"""The standard deviations of the thickness gradient of the sheet, and of its relative mass per area
-if no step has measured it: 4 % of density and 6 % of thickness.
+"""The standard deviations of the sheet's thickness gradient and of its relative mass per area.
 
-Sources: ISO 3302-1 class M1 for rubber sheets; densities of natural rubber compounds.
+The second value is used if the mass per area was not measured. It combines 4 % for the density and
+6 % for the thickness. Sources: ISO 3302-1 class M1 for rubber sheets; densities of natural rubber
+compounds.
 """
 
 FRICTION, FRICTION_STD_LN = 1.24, 0.3
-"""The friction coefficient between rubber and a finger at 1 N, and standard deviation of its
-logarithm (Seo et al. 2009)."""
+"""The friction coefficient between rubber and a finger at 1 N, and its logarithmic deviation.
+
+The second value is the standard deviation of the natural logarithm. Source: Seo et al. 2009.
+"""
 
 CREEP_RATIO_PER_DECADE, CREEP_STD = 0.05, 0.02
-"""The relative decrease of the force of natural rubber per decade of time, and standard deviation.
+"""The relative decrease of the force of natural rubber per decade of time, with its deviation.
+
+The second value is the standard deviation of the first value.
 """
 
 MAX_HYSTERESIS_RATIO = 0.9
 
 IMAGE_MODEL_STD_M = 6e-5
-"""Image error that remains if all calibrated parameters are exact, m (root mean square).
+"""The rms image error (m) that remains if all calibrated parameters are exact.
 
-The causes are the lens of the projector and the calculated shape of the sheet. The value is from
+It is caused by the lens of the projector and the calculated shape of the sheet. The value is from
 simulated laboratories with seeds 0 to 11.
 """
 
 
 class PredictedError(LimitedModel):
-    """The predicted error of one metric, in the unit of the metric.
+    """The predicted error of one quantity, in the unit of this quantity.
 
-    typical: root mean square error. limit_95: 95 % quantile of the error. tolerance: maximum error
-    that the scene allows.
+    typical: root mean square error.
+    limit_95: 95 % quantile of the error.
+    tolerance: maximum error that the scene permits.
     """
 
     typical: float
@@ -105,12 +115,14 @@ class PredictedError(LimitedModel):
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """The results of a commissioning from which errors are predicted.
+    """The results of calibrations from which errors are predicted.
 
-    calibrations: calibrations that the nodes use. edges: by side, covariance (19, 19) of the
-    unknowns of `fit_edges`; a side that was not calibrated is absent. projector_px2: covariance
-    (2, 2) of the displacement of the projected image. eyes_m2: covariance (3, 3) of the midpoint
-    between the eyes. stamp_std_s: standard deviation of exposure time minus timestamp.
+    calibrations: calibrations that the nodes use.
+    edges: covariance (19, 19) of the unknowns of `fit_edges`, by side. A side without calibration
+        is absent.
+    projector_px2: covariance (2, 2) of the displacement of the projected image.
+    eyes_m2: covariance (3, 3) of the midpoint between the eyes.
+    stamp_std_s: standard deviation of exposure time minus timestamp.
     sheet_mass_std_ratio: relative standard deviation of the sheet's mass per area.
     """
 
@@ -131,8 +143,8 @@ def predict_errors(
     The finger moves at the working speed of the scene.
 
     tracking_m: mean tracking error of the sheet that the devices report during a stroke. It is
-    independent of the calibration errors, so it is added to them in quadrature. draws: number of
-    random apparatuses.
+        independent of the calibration errors, so it is added to them in quadrature.
+    draws: number of random samples.
     """
     random = np.random.default_rng(DRAW_SEED)
     scene = known.scene
@@ -174,7 +186,7 @@ def predict_errors(
 
 
 def draw_apparatus(known: Knowledge, random: Random) -> Apparatus:
-    """Draw a random apparatus (true parameters) that is consistent with the calibrations."""
+    """Return random true parameters of the devices that are consistent with the calibrations."""
     scene, given = known.scene, known.calibrations
     apparatus = nominal_apparatus(scene)
     seen_m = dict.fromkeys(("left", "right"), np.zeros(3))
@@ -228,10 +240,10 @@ def draw_apparatus(known: Knowledge, random: Random) -> Apparatus:
 def draw_camera_errors(
     scene: Scene, calibration: StereoCalibration, random: Random
 ) -> dict[str, Floats]:
-    """Draw random errors (3,) of the measured clamp positions relative to the finger, m, by side.
+    """Return random errors (3,), in m, of the measured positions of the clamps, by side.
 
-    Only the difference from the error at the finger matters, because a common error displaces
-    clamps and finger equally.
+    The errors are relative to the finger, because an error that clamps and finger have in common
+    displaces both equally.
     """
     left, right, stand = calibration.left, calibration.right, calibration.right_from_left
     rig = np.zeros(22)
@@ -250,10 +262,11 @@ def draw_camera_errors(
 
 
 def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: Random) -> ArmTruth:
-    """Draw random true parameters of an arm.
+    """Return random true parameters of an arm.
 
-    covariance: covariance (19, 19) of `fit_edges`; None returns the arm unchanged. seen_m: error
-    (3,) of the measured position of its clamp.
+    arm: parameters without errors.
+    covariance: covariance (19, 19) from `fit_edges`. If it is None, the arm is returned unchanged.
+    seen_m: error (3,) of the measured position of the arm's clamp.
     """
     if covariance is None:
         return arm
@@ -272,9 +285,10 @@ def draw_arm(arm: ArmTruth, covariance: Floats | None, seen_m: Floats, random: R
 
 
 def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
-    """Draw a random modulus and slack width of the sheet.
+    """Return a random modulus and a random unstretched width of the sheet.
 
-    Return an empty mapping without a sheet calibration.
+    The result contains the fields `modulus_ratio` and `slack_width_offset_m`. It is empty without a
+    sheet calibration.
     """
     sheet = known.calibrations.sheet
     if sheet is None:
@@ -288,11 +302,10 @@ def draw_rubber(known: Knowledge, random: Random) -> dict[str, float]:
 
 
 def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Random) -> Apparatus:
-    """Draw a random hysteresis that is consistent with the calibration; return the changed
-    apparatus.
+    """Return the apparatus with a random hysteresis that is consistent with the calibration.
 
-    The calibration measures how much smaller the force is while unloading than while loading, at
-    the same depth. Creep explains a part of this difference, and the hysteresis the remainder.
+    The calibration measures how much smaller the force is during unloading than during loading at
+    the same depth. Creep causes a part of this difference, and the hysteresis causes the remainder.
     """
     if sheet.hysteresis_ratio is None:
         return apparatus
@@ -313,7 +326,7 @@ def draw_hysteresis(apparatus: Apparatus, sheet: SheetCalibration, random: Rando
 
 
 def draw_marker(scene: Scene, given: NodeCalibrations, random: Random) -> tuple[float, ...]:
-    """Draw a random true position (3,), in m, of the marker in the simulator's finger frame."""
+    """Return a random true position (3,), in m, of the marker in the simulator's finger frame."""
     world_m = given.find_marker_offset_m(scene)
     if (marker := given.marker) is not None:
         covariance_m2 = (
@@ -329,7 +342,10 @@ def draw_marker(scene: Scene, given: NodeCalibrations, random: Random) -> tuple[
 
 
 def _draw(covariance: Floats, random: Random) -> Floats:
-    """Draw a random vector with normal distribution and mean 0; the covariance may be singular."""
+    """Return a random vector with a normal distribution of mean 0.
+
+    The covariance may be singular.
+    """
     values, vectors = np.linalg.eigh(covariance)
     scales = np.sqrt(np.maximum(values, 0.0))
     return np.asarray(vectors @ (scales * random.standard_normal(len(values))))

@@ -1,4 +1,4 @@
-"""Write calibration boards as SVG or PNG, to be printed at true size.
+"""Write calibration boards as SVG or PNG files, to be printed at true size.
 
 The first square is black. The white squares of a ChArUco board contain the markers, numbered by row
 as OpenCV's detector expects.
@@ -19,7 +19,7 @@ from flexsheet.messages.files import write_file
 Floats = NDArray[np.float64]
 
 BORDER_SQUARES = 1.0
-"""The width of the white border around the squares, which detectors need."""
+"""The width of the white border around the board, in squares. Detectors need this border."""
 
 CAPTION_MM = 8.0
 RULER_MM = 100.0
@@ -27,9 +27,10 @@ PNG_DOTS_PER_INCH = 300
 
 
 def find_black_rectangles(board: Board) -> Floats:
-    """Return the black rectangles (n, 4): x, y, width, height, m, from the first square's corner.
+    """Return the black rectangles (n, 4) of a board as x, y, width and height, in m.
 
-    Raises CalibrationError for markers that do not fit the board.
+    The origin is the corner of the first square. Raises CalibrationError if the markers do not fit
+    the board.
     """
     columns, rows, side = board.columns + 1, board.rows + 1, board.square_m
     squares = [
@@ -57,7 +58,10 @@ def find_black_rectangles(board: Board) -> Floats:
 
 
 def _find_runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
-    """Return (row, first column, length) of each run of black cells in a marker image."""
+    """Return each horizontal run of black cells in a marker image as (row, first column, length).
+
+    black: marker image (rows, columns); true for black cells.
+    """
     runs = []
     for y, row in enumerate(black):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
@@ -66,7 +70,7 @@ def _find_runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
 
 
 def make_caption(board: Board) -> str:
-    """Describe the board and the print scale, for the text below the board."""
+    """Return the text below the board, which describes the board and the print scale."""
     text = f"{describe(board)}, squares of {1e3 * board.square_m:g} mm"
     if board.marker_m is not None:
         text += f", markers of {1e3 * board.marker_m:g} mm, {board.dictionary}"
@@ -74,7 +78,7 @@ def make_caption(board: Board) -> str:
 
 
 def make_svg(board: Board) -> str:
-    """Return the board as SVG in millimetres, with a caption and a ruler line."""
+    """Return the board as SVG in millimetres, with a caption and a ruler."""
     border = 1e3 * BORDER_SQUARES * board.square_m
     width = 1e3 * (board.columns + 1) * board.square_m + 2 * border
     height = 1e3 * (board.rows + 1) * board.square_m + 2 * border
@@ -101,7 +105,10 @@ def make_svg(board: Board) -> str:
 
 
 def rasterize(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
-    """Return the board as an image (h, w): 0 where a pixel's centre is black, else 255."""
+    """Return the board as an image (h, w) with 0 for black and 255 for white.
+
+    A pixel is black if its centre is inside a black rectangle.
+    """
     border = BORDER_SQUARES * board.square_m
     across = np.array([board.columns + 1, board.rows + 1]) * board.square_m + 2 * border
     width, height = np.ceil(across * dots_per_m).astype(int)
@@ -114,7 +121,10 @@ def rasterize(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
 
 
 def write_board(board: Board, path: Path) -> None:
-    """Write the board in the format of the path's suffix.  Raises CalibrationError."""
+    """Write the board to a file, in the format of the file's suffix.
+
+    Raises CalibrationError for an unknown suffix or an unsuitable board.
+    """
     suffix = path.suffix.lower()
     if suffix == ".svg":
         write_file(path, make_svg(board))

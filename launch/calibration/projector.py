@@ -1,7 +1,7 @@
-"""Calibrate the optics and the pose of the projector from the points that its pixels light.
+"""Calibrate the optics and the pose of the projector from points that its pixels light.
 
-A projector is an inverse camera: each of its pixels lights a point, whose position two cameras
-measure. The poses of the sheet on which the points lie therefore need not be known.
+A projector is an inverse camera: each of its pixels lights a point. Two cameras measure the
+position of this point. Therefore, the poses of the sheet on which the points lie need not be known.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 GRID_PX = 20
-"""The distance (px) between the sampled projector pixels."""
+"""The distance (px) between neighbouring projector pixels that are measured."""
 
 MIN_POSES, MIN_POINTS = 3, 200
 MIN_DEPTH_RANGE_M = 0.03
@@ -41,14 +41,15 @@ MAX_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
 OUTLIER_RATIO = 4.0
 TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
-"""The typical errors of a projector in a scene that was measured by tape; only their ratios matter.
+"""The typical errors (9,) of a projector in a scene that was measured by tape.
 
-Rotation (rad), position (m), focal length (relative), principal point (px).
+They are the rotation (rad), position (m), focal length (relative) and principal point (px). Only
+their ratios matter.
 """
 
 
 class ProjectorError(FlexsheetError, ValueError):
-    """Raised for images or points that do not determine the projector."""
+    """Raised if images or points do not determine the optics and pose of the projector."""
 
     code = "projector-calibration"
     exit_code = 2
@@ -57,10 +58,12 @@ class ProjectorError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ProjectorPoints:
-    """The points that projector pixels light.
+    """The points that projector pixels light, measured by two cameras.
 
-    world: positions (n, 3), m. pixels: projector pixels (n, 2). pose: index (n,) of the sheet's
-    pose. skew_m: distance (n,) between the rays of the two cameras.
+    world: positions (n, 3) in the world, m.
+    pixels: projector pixels (n, 2).
+    pose: index (n,) of the sheet's pose.
+    skew_m: distance (n,) between the rays of the two cameras.
     """
 
     world: Floats
@@ -73,10 +76,11 @@ class ProjectorPoints:
 class ProjectorFit:
     """A calibrated projector and its residuals, in projector pixels and in metres on the sheet.
 
-    held_out_rms_px: rms residual of poses that were excluded from the fit. before_rms_px: rms
-    residual of the initial projector. coverage_ratio: fraction of the image's cells that contain
-    points. shift_covariance_px2: covariance (2, 2) of the mean displacement of the image, from the
-    fits without one pose each (delete-one jackknife).
+    held_out_rms_px: rms residual of poses that were excluded from the fit.
+    before_rms_px: rms residual of the initial projector.
+    coverage_ratio: fraction of the image's cells that contain points.
+    shift_covariance_px2: covariance (2, 2) of the mean displacement of the image. It is computed
+        from fits that each omit one pose (delete-one jackknife).
     """
 
     projector: Projector
@@ -97,10 +101,13 @@ def measure_points(
     camera: StereoCamera,
     projector: Projector,
 ) -> ProjectorPoints:
-    """Triangulate the points lit by projector pixels, from images of each sheet pose.
+    """Triangulate the points that projector pixels light, from images of each sheet pose.
 
-    camera: stereo camera with calibrated optics, and `world_from_left` from the scene. Raises
-    ProjectorError if the patterns cannot be decoded.
+    poses: images of the Gray-code patterns from the left and from the right camera, for each pose.
+    camera: stereo camera with calibrated optics and with `world_from_left` from the scene.
+    projector: projector, of which only the image size is used.
+
+    Raises ProjectorError if the patterns cannot be decoded.
     """
     size = projector.width_px, projector.height_px
     columns, rows = (np.arange(GRID_PX // 2, side, GRID_PX, dtype=np.float64) for side in size)
@@ -121,7 +128,11 @@ def measure_points(
 
 
 def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
-    """Triangulate pixels (n, 2); return midpoints (n, 3) between the rays, m, and ray distances."""
+    """Triangulate pixels (n, 2) of the left and the right image.
+
+    Return world points (n, 3) midway between the two rays, and the distances (n,) between the rays,
+    m.
+    """
     from_right = inverse(camera.right_from_left)
     slopes = [
         normalize(
@@ -145,7 +156,7 @@ def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tup
 
 
 def project_points(projector: Projector, world: Floats) -> Floats:
-    """Return the projector pixels (n, 2) that light world points (n, 3)."""
+    """Return the projector pixels (n, 2) that light world points (n, 3), in m."""
     lens, pose = projector.lens, projector.world_from_projector
     local = apply(inverse(pose_matrix(pose)), world)
     matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
@@ -153,18 +164,20 @@ def project_points(projector: Projector, world: Floats) -> Floats:
 
 
 def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorFit:
-    """Fit a projector to the points that its pixels light.
+    """Fit the optics and the pose of a projector to the points that its pixels light.
 
-    guess: initial projector. Raises ProjectorError for too few points, a small depth range or
-    coverage, and large residuals.
+    guess: projector with which the fit starts.
+
+    Raises ProjectorError for too few points or poses, a small depth range or coverage, and large
+    residuals.
     """
     inliers = np.ones(len(points.world), np.bool_)
     poses, depth_m = len(np.unique(points.pose)), _measure_depth_range(points, guess)
     coverage = _measure_coverage(points.pixels, guess)
     if poses < MIN_POSES or len(points.world) < MIN_POINTS:
         raise ProjectorError(
-            f"{len(points.world)} points in {poses} poses; capture at least {MIN_POSES} poses "
-            f"and {MIN_POINTS} points that both cameras see"
+            f"there are {len(points.world)} points in {poses} poses; capture at least {MIN_POSES} "
+            f"poses and {MIN_POINTS} points that both cameras see"
         )
     if depth_m < MIN_DEPTH_RANGE_M:
         raise ProjectorError(
@@ -173,7 +186,7 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
         )
     if coverage < MIN_COVERAGE:
         raise ProjectorError(
-            f"the points cover {100 * coverage:.0f} % of the projector's image, at least "
+            f"the points cover {100 * coverage:.0f} % of the projector's image, but at least "
             f"{100 * MIN_COVERAGE:.0f} % are required; move the sheet over the image"
         )
     for _ in range(3):
@@ -188,8 +201,9 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
     rms = _rms(residual_px[inliers])
     if rms > MAX_RMS_PX or inliers.mean() < 0.8:
         raise ProjectorError(
-            f"{rms:.2f} px rms and {int((~inliers).sum())} outliers of {len(inliers)} points; keep "
-            "the sheet still during each pose, and check the cameras (flexsheet calibrate check)"
+            f"the fit has a residual of {rms:.2f} px rms, and {int((~inliers).sum())} of "
+            f"{len(inliers)} points are outliers; keep the sheet still during each pose, and check "
+            "the cameras (flexsheet calibrate check)"
         )
     held_out, shifts = [], []
     for pose in np.unique(points.pose):
@@ -224,7 +238,7 @@ def _rms(values: Floats) -> float:
 
 
 def _measure_depth_range(points: ProjectorPoints, guess: Projector) -> float:
-    """Return the depth range (m) of the central 90 % of the points, along the projector's axis."""
+    """Return the depth range (m) of the central 90 % of the points along the projector's axis."""
     pose = guess.world_from_projector
     along = apply(inverse(pose_matrix(pose)), points.world)[:, 2]
     return float(np.ptp(np.quantile(along, [0.05, 0.95]))) if len(along) else 0.0
@@ -239,10 +253,12 @@ def _measure_coverage(pixels: Floats, projector: Projector) -> float:
 def _fit_projector(
     points: ProjectorPoints, inliers: NDArray[np.bool_], guess: Projector
 ) -> Projector:
-    """Fit a projector by least squares: one focal length, principal point, k1, k2, p1, p2.
+    """Fit the pose, one focal length, the principal point, k1, k2, p1 and p2 by least squares.
 
-    The aspect ratio and k3 are fixed to the values of the guess. OpenCV's fit is not used, because
-    it rejects a principal point outside the image, which lens shift causes.
+    The aspect ratio and k3 are fixed to the values of `guess`. OpenCV's fit is not used, because it
+    rejects a principal point outside the image, which is typical of a projector with lens shift.
+
+    inliers: mask (n,) of the points to use.
     """
     world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
@@ -263,7 +279,11 @@ def _fit_projector(
         return np.asarray((projected.reshape(-1, 2) - pixels).ravel())
 
     def derivatives(x: Floats) -> Floats:
-        """Return derivatives by rotation, translation, focal length, principal point, k1 to p2."""
+        """Return the derivatives (2n, 13) of the residuals with respect to the unknowns.
+
+        The unknowns are rotation (3), translation (3), focal length, principal point (2), and k1,
+        k2, p1, p2.
+        """
         _, by = cv2.projectPoints(world, x[:3], x[3:6], *split(x))
         focal = by[:, 6:7] + aspect * by[:, 7:8]
         return np.hstack([by[:, :6], focal, by[:, 8:14]])
@@ -298,12 +318,16 @@ def _make_projector(
 def fit_keystone(
     corners_px: Floats, half_width_m: float, half_height_m: float, guess: Projector
 ) -> ProjectorFit:
-    """Fit a projector whose pixels (4, 2) light the corners of a rectangle on the imaginary screen.
+    """Fit a projector to the pixels that light the corners of a rectangle on the imaginary screen.
 
-    corners_px: bottom left, bottom right, top right, top left, as the user sees them. Many
-    projectors match these four corners (a homography) exactly. The result is the one nearest to the
-    guess, with the distortion of the guess. Raises ProjectorError if the corners are not a convex
-    quadrangle.
+    Many projectors match four corners (a homography) exactly. The result is the projector nearest
+    to `guess`, with the distortion of `guess`.
+
+    corners_px: projector pixels (4, 2) of bottom left, bottom right, top right, top left, as the
+        user sees them.
+    half_width_m, half_height_m: half the size of the rectangle.
+
+    Raises ProjectorError if the corners are not a convex quadrangle, or if no projector fits them.
     """
     x, y = half_width_m, half_height_m
     world = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], dtype=np.float64)
@@ -312,7 +336,7 @@ def fit_keystone(
     cross_products = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
     if not ((cross_products > 1.0).all() or (cross_products < -1.0).all()):
         raise ProjectorError(
-            f"corners {corners_px.tolist()} are not a convex quadrangle; give bottom left, "
+            f"the corners {corners_px.tolist()} are not a convex quadrangle; give bottom left, "
             "bottom right, top right, top left, as the user sees them"
         )
     lens, pose = guess.lens, guess.world_from_projector
@@ -337,7 +361,7 @@ def fit_keystone(
     before = np.linalg.norm(project_points(guess, world) - corners_px, axis=1)
     if _rms(residual_px) > MAX_RMS_PX:
         raise ProjectorError(
-            f"no projector pose near the scene's fits these corners (residual "
+            f"no projector near the pose in the scene fits these corners (residual "
             f"{_rms(residual_px):.1f} px rms); check their order and the pose in the scene"
         )
     distance_m = float(np.linalg.norm(fitted.world_from_projector.position_m))

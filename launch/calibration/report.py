@@ -1,6 +1,7 @@
-"""Write a report of a stereo calibration: corner residuals, pair quality, coverage, uncertainty.
+"""Write a report of a stereo calibration as an HTML page.
 
-The report is one self-contained HTML page; its images are also written as PNG.
+The report shows corner residuals, the quality of the pairs, the coverage and the uncertainty. The
+page is self-contained, and its images are also written as PNG files.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Floats = NDArray[np.float64]
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0
-"""The length of the arrow that shows the 95th percentile of the residuals, image px."""
+"""The length (px of the image) of an arrow that shows the 95 % quantile of the residuals."""
 
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
@@ -41,10 +42,10 @@ img { max-width: 100%; } figcaption { color: #444; }
 
 
 def compute_epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
-    """Compute how far corners in the right image are from the epipolar lines of the left corners.
+    """Compute the distances between corners in the right image and their epipolar lines.
 
-    Return the right pixels (n, 2) of all common corners and their distances (n,), in px, in
-    undistorted coordinates of the right camera. The distances are signed.
+    Return the right pixels (n, 2) of all common corners, and their signed distances (n,), in px.
+    The distances are in undistorted coordinates of the right camera.
     """
     rig = StereoRig.from_fit(calibrated.fit.rig)
     rotation, position = rig.right_from_left[:3, :3], rig.right_from_left[:3, 3]
@@ -158,7 +159,7 @@ def _format_image_axis(axis: Axes, size: tuple[int, int], title: str) -> None:
 
 
 def list_parameters(calibrated: CalibrationResult) -> list[tuple[str, float, float]]:
-    """Return (name, value, standard deviation) of the 22 parameters of the rig."""
+    """Return (name, value, standard deviation) of each of the 22 parameters of the stereo rig."""
     uncertainty = calibrated.calibration.uncertainty
     assert uncertainty is not None
     deviations = np.sqrt(np.diag(uncertainty.covariance))
@@ -169,7 +170,7 @@ def list_parameters(calibrated: CalibrationResult) -> list[tuple[str, float, flo
 
 
 def write_report(calibrated: CalibrationResult, folder: Path) -> Path:
-    """Write `index.html` and its images to a folder; return the path of the page.
+    """Write the report `index.html` and its images to a folder, and return the path of the page.
 
     The folder is created if it does not exist.
     """

@@ -1,8 +1,8 @@
 """Select reliable image pairs and corners, and fit the stereo rig to them.
 
-Zhang's method (A flexible new technique for camera calibration, 2000) fits each camera alone. Then
-both cameras are fitted together with all parameters free (`bundle`). This predicts images that were
-not used better than a fit with fixed intrinsics does.
+Each camera is first fitted alone by Zhang's method (A flexible new technique for camera
+calibration, 2000). Then both cameras are fitted together with all parameters free (`bundle`). This
+predicts unused images more accurately than a fit with fixed intrinsics.
 """
 
 from __future__ import annotations
@@ -34,20 +34,21 @@ MISFIT_RATIO = 5.0
 MIN_MISFIT_PX = 5.0
 MISFIT = "inconsistent with the other pairs:"
 CORNER_RATIO = 6.0
-"""The residual above which a corner is an outlier, in standard deviations."""
+"""The residual, in standard deviations, above which a corner is an outlier."""
 
 CORNER_ROUNDS = 2
 MAX_OUTLIER_FRACTION = 0.15
-"""The maximum fraction of outlier corners in a pair; a pair with more is excluded."""
+"""The maximum fraction of outliers among the corners of a pair that is used."""
 
 REPEAT_PX = 1.0
-"""The maximum distance of corners (px) between two pairs that count as the same board pose."""
+"""The maximum median distance (px) of corners between two pairs with the same board pose."""
 
 
 def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) -> Floats:
-    """Fit the lens parameters (8,) of one camera to its views of the board.
+    """Fit the lens parameters (8,) of one camera to its images of the board.
 
     points: corners of the board (n, 3), m.
+    size: width and height of the images, px.
     """
     _, matrix, distortion, *_ = cv2.calibrateCamera(
         [points[view.ids].astype(np.float32) for view in views],
@@ -65,14 +66,17 @@ def fit_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) 
 def compute_misfits(
     pairs: Sequence[BoardPair], points: Floats, left: Floats, right: Floats
 ) -> tuple[Floats, Floats]:
-    """Measure the deviation of each pair from a reference pair, to find wrongly matched images.
+    """Compute how much each image pair deviates from a reference pair, to find wrong pairs.
 
     Each pair alone determines the relative pose of the cameras. The reference is the pair whose
-    pose has the smallest median deviation over all pairs (least median of squares, Rousseeuw 1984).
-    Unlike a common fit, it is not distorted by wrong pairs. left, right: lenses (8,).
+    relative pose has the smallest median deviation over all pairs (least median of squares,
+    Rousseeuw 1984). Unlike a fit to all pairs, the reference is not affected by wrong pairs.
 
-    Return each pair's deviation (n,) from the reference, rms px in the right image, and the pose
-    right_from_left (6,) of the reference.
+    Return the deviations (n,), rms px in the right image, and the relative pose right_from_left
+    (6,) of the reference.
+
+    points: corners of the board (n, 3), m.
+    left, right: lens parameters (8,).
     """
     left_poses = [pose_transform(board_pose(pair.left, points, left)) for pair in pairs]
     right_poses = [pose_transform(board_pose(pair.right, points, right)) for pair in pairs]
@@ -91,9 +95,10 @@ def compute_misfits(
 
 
 def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> RigFit:
-    """Fit both cameras together, with initial values from the pairs alone.
+    """Fit both cameras together. The initial values are from fits to single cameras and pairs.
 
     points: corners of the board (n, 3), m.
+    size: width and height of the images, px.
     """
     left = fit_lens([pair.left for pair in pairs], points, size)
     right = fit_lens([pair.right for pair in pairs], points, size)
@@ -103,15 +108,15 @@ def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int])
 
 
 def count_corners(pair: BoardPair) -> int:
-    """Return the total number of corners in both views of a pair."""
+    """Return the total number of detected corners in both images of a pair."""
     return len(pair.left.ids) + len(pair.right.ids)
 
 
 def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardPair]:
-    """Return the pairs without outlier corners.
+    """Return the image pairs without outlier corners.
 
-    The standard deviation is estimated from the median distance, because outliers hardly affect it.
-    For a two-dimensional normal distribution the median is 1.1774 standard deviations.
+    The standard deviation of the residuals is estimated from their median, because outliers hardly
+    affect it. For a two-dimensional normal distribution, the median is 1.1774 standard deviations.
     """
     distances = [[np.linalg.norm(view, axis=1) for view in views] for views in fit.residuals]
     every = np.concatenate([view for views in distances for view in views])
@@ -128,9 +133,12 @@ def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardP
 
 
 def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
-    """Map the index of each pair that repeats a board pose to the index of the earlier pair.
+    """Find the pairs whose board pose repeats that of an earlier pair.
 
-    Repeated pairs have the same errors, so they must not count as independent measurements.
+    Return a mapping from the index of the repeated pair to the index of the earlier pair. Repeated
+    pairs have the same errors, so they must not count as independent measurements.
+
+    found: corners of each pair, or the reason why there are none.
     """
     unique: dict[int, BoardPair] = {}
     repeated: dict[int, int] = {}
@@ -147,7 +155,11 @@ def find_repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
 
 
 def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
-    """Return the larger of both views' median distances (px) between common corners."""
+    """Return the median distance (px) between the corners that two pairs have in common.
+
+    The result is the larger of the medians of the left and of the right images. It is infinite if
+    there are no common corners.
+    """
     medians = []
     for here, there in ((pair.left, other.left), (pair.right, other.right)):
         _, a, b = np.intersect1d(here.ids, there.ids, assume_unique=True, return_indices=True)
@@ -158,10 +170,13 @@ def _measure_distance(pair: BoardPair, other: BoardPair) -> float:
 
 
 class PairSelection:
-    """The pairs that remain in a calibration, and the reasons for which others were excluded.
+    """The image pairs that are used in a calibration, and the reasons for the excluded pairs.
 
-    good: indices of the remaining pairs. reasons: reason for each excluded pair, by index.
-    residuals: rms (2,) px of the left and right view by index, including excluded pairs.
+    found: corners of each pair, or the reason why there are none.
+    good: corners of each used pair, by index.
+    reasons: reason for each excluded pair, by index.
+    residuals: rms residual (2,), in px, of the left and the right image, by index. It includes
+        excluded pairs.
     """
 
     def __init__(self, found: Sequence[BoardPair | str], names: Sequence[str]) -> None:
@@ -175,19 +190,22 @@ class PairSelection:
             del self.good[i]
 
     def pairs(self) -> list[BoardPair]:
-        """Return the remaining pairs; raises CalibrationError if there are fewer than MIN_PAIRS."""
+        """Return the used pairs. Raises CalibrationError if they are fewer than MIN_PAIRS."""
         if len(self.good) < MIN_PAIRS:
             listed = "".join(f"\n  {self._names[i]}: {text}" for i, text in self.reasons.items())
             raise CalibrationError(
-                f"{len(self.good)} of {len(self.found)} pairs are usable, at least {MIN_PAIRS} are "
-                f"required; capture more images with the board in both views{listed}"
+                f"{len(self.good)} of {len(self.found)} pairs are usable, but at least {MIN_PAIRS} "
+                f"are required; capture more images with the board in both views{listed}"
             )
         return list(self.good.values())
 
     def exclude_pairs(self, errors_px: Floats, ratio: float, min_px: float, what: str) -> bool:
-        """Exclude pairs with errors above `min_px` and `ratio` medians.
+        """Exclude pairs with large errors, and return whether any pair was excluded.
 
-        Return whether a pair was excluded.
+        The limit is the larger of `min_px` and `ratio` times the median error.
+
+        errors_px: errors (n,) of the used pairs.
+        what: description of the error, for the reason.
         """
         limit_px = max(ratio * float(np.median(errors_px)), min_px)
         bad = [
@@ -199,7 +217,10 @@ class PairSelection:
         return bool(bad)
 
     def replace_pairs(self, cleaned: Sequence[BoardPair]) -> None:
-        """Replace the pairs by `cleaned`; exclude pairs that lost too many corners as outliers."""
+        """Replace the used pairs by pairs from which outlier corners have been removed.
+
+        Pairs that have lost too many corners are excluded.
+        """
         for i, pair in zip(list(self.good), cleaned, strict=True):
             whole = self.found[i]
             assert isinstance(whole, BoardPair)
@@ -211,8 +232,9 @@ class PairSelection:
                 self.good[i] = pair
 
     def stray_corners(self, number: int) -> int:
-        """Return the number of corners that were removed from both views of the pair with index
-        `number`.
+        """Return the number of corners that were removed from a used pair as outliers.
+
+        number: index of the pair.
         """
         whole = self.found[number]
         if isinstance(whole, str) or number not in self.good:
@@ -221,10 +243,15 @@ class PairSelection:
 
 
 def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int]) -> RigFit:
-    """Fit the rig to the reliable pairs and corners, and exclude unreliable pairs.
+    """Exclude unreliable pairs and corners, and fit the stereo rig to the remaining ones.
 
-    Excludes pairs that contradict the others (`compute_misfits`), corners with residuals above six
-    standard deviations, and pairs whose residual exceeds half a pixel and three times the median.
+    Excluded are pairs that contradict the other pairs (`compute_misfits`), corners with residuals
+    above six standard deviations, and pairs with large residuals. A residual is large if it exceeds
+    half a pixel and three times the median.
+
+    points: corners of the board (n, 3), m.
+    size: width and height of the images, px.
+
     Raises CalibrationError if too few pairs remain or if they do not determine the rig.
     """
     try:
@@ -249,7 +276,10 @@ def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int
 
 
 def make_undetermined_error(pairs: int, reason: str) -> CalibrationError:
-    """Make the error for pairs that do not determine the rig."""
+    """Make the error that reports that the pairs do not determine the stereo rig.
+
+    pairs: number of pairs.
+    """
     return CalibrationError(
         f"the {pairs} pairs do not determine the rig ({reason}); change the tilt of the board "
         "between images"

@@ -1,4 +1,7 @@
-"""Read measured pushes of a finger into the sheet from a recording with the topic `force`."""
+"""Read measured pushes of a finger into the sheet from a bag with the topic `force`.
+
+A push is a measured force together with the depth and position of the finger in the sheet.
+"""
 
 from __future__ import annotations
 
@@ -17,28 +20,33 @@ from flexsheet.nodes.models.rigid import pose_matrix
 Floats = NDArray[np.float64]
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""The time before and after a measured force, and maximum change of the depth in this time.
+"""The time (s) before and after a measured force, and the maximum change of depth (m) in this time.
 
-Gauges lag, so forces during a motion cannot be used.
+Force gauges lag, so forces that were measured during a motion are not used.
 """
 
 MAX_GAP_S = 0.05
-"""The maximum time between a force and the nearest messages of fingertip and arms."""
+"""The maximum time (s) between a force and the nearest messages of fingertip and arms."""
 
 MIN_DEPTH_M = 0.003
-"""The minimum depth; below it, errors of the fingertip's position dominate the force."""
+"""The minimum depth (m) of a push.
+
+At smaller depths, the error of the fingertip's position dominates the force.
+"""
 
 REVERSAL_M = 0.001
-"""The minimum change of the depth that counts as loading or unloading, in metres."""
+"""The minimum change of depth (m) after which a motion counts as loading or unloading."""
 
 MAX_ROWS = 300
 
 
 def read_pushes(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
-    """Return the scene of a bag, and the pushes in which the finger rested in the sheet.
+    """Return the scene in a bag, and the pushes during which the finger rested in the sheet.
 
-    The pushes are computed from the fingertip and arm poses that the nodes measured. Raises
-    SheetModelFitError if the bag has no scene, or no pushes with a valid contact force.
+    The pushes are computed from the measured fingertip positions and arm poses.
+
+    Raises SheetModelFitError if the bag contains no scene, or no push with a valid force on the
+    sheet.
     """
     scene: Scene | None = None
     tips: list[tuple[int, Floats]] = []
@@ -93,10 +101,11 @@ def select_pushes(
     left: SampledMotion,
     right: SampledMotion,
 ) -> list[MeasuredPush]:
-    """Return a push for each force that was measured while the finger rested.
+    """Return a push for each force that was measured while the finger rested in the sheet.
 
-    forces: times (ns) and forces (N). tips: positions (3,) of the fingertip; left, right: flange
-    poses as rows (16,).
+    forces: (time in ns, force in N) of each measurement.
+    tips: positions (3,) of the fingertip.
+    left, right: flange poses of the arms, as rows (16,).
     """
     clamps = [pose_matrix(arm.flange_from_edge) for arm in (scene.arms.left, scene.arms.right)]
     half_height_m = 0.5 * scene.sheet.height_m
@@ -144,9 +153,13 @@ def _gap_s(motion: SampledMotion, at_ns: int) -> float:
 
 
 def _locate(tip: Floats, left: Floats, right: Floats) -> tuple[float, tuple[float, float], float]:
-    """Return depth and position of a fingertip, and the distance of the edges, all in m.
+    """Return the depth and the position (x, y) of a fingertip, and the distance of the edges, in m.
 
-    The depth is measured behind the plane of the sheet. The position (x, y) is on the sheet.
+    The depth is the distance behind the flat sheet between the edges. The position is relative to
+    the sheet's centre.
+
+    tip: position (3,) of the fingertip.
+    left, right: poses (4, 4) of the clamped edges.
     """
     across = right[:3, 3] - left[:3, 3]
     distance_m = float(np.linalg.norm(across))

@@ -1,6 +1,7 @@
-"""Fit the scaled sheet model to measured pushes: the rubber's stiffness and the unstretched width.
+"""Fit the sheet's force model to measured pushes.
 
-A push is a measured force of a finger that is pressed into the sheet by a known depth.
+A push is a measured force of a finger that is pressed into the sheet to a known depth. The fit
+determines the stiffness of the rubber and the unstretched width of the sheet.
 """
 
 from __future__ import annotations
@@ -28,26 +29,31 @@ Bools = NDArray[np.bool_]
 FORCE_NOISE_N = 0.01
 EDGE_NOISE_N = 0.1
 MODEL_ERROR_RATIO = 0.03
-"""The model error as a fraction of the force; residuals are divided by it and the noise combined.
+"""The assumed error of the force model, as a fraction of the force.
+
+Residuals are divided by the combination of this error and the noise.
 """
 
 OUTLIER_SIGMAS = 5.0
-"""The residual above which a measured push is an outlier, in standard deviations. The fit is
-repeated without outliers."""
+"""The residual, in standard deviations, above which a push is an outlier.
+
+The fit is repeated without outliers.
+"""
 
 MAX_RMS_SIGMAS = 1.0
 """The maximum rms residual of a valid fit, in assumed standard deviations.
 
-Above it, noise and model error exceed the values above, and the predicted force error is too small.
-A relative residual is no criterion: noise dominates it at small forces, which are not felt.
+If it is exceeded, noise and model error are larger than assumed, and the predicted force error is
+too small. A limit for relative residuals is not useful, because noise dominates small forces, which
+a user does not feel.
 """
 
 MAX_RELATIVE_DEVIATION = 0.5
-"""The maximum relative standard deviation of a parameter that counts as determined."""
+"""The maximum relative standard deviation of a fitted parameter in a valid fit."""
 
 
 class SheetModelFitError(FlexsheetError, ValueError):
-    """Raised for measured pushes that do not determine the parameters of the model."""
+    """Raised if measured pushes do not determine the parameters of the sheet's force model."""
 
     code = "sheet-model-fit"
     remedy = "Add pushes at other stretches and depths."
@@ -55,10 +61,14 @@ class SheetModelFitError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPush:
-    """A measured push of a finger into the sheet; lengths in metres, forces in newtons.
+    """A measured push of a finger into the sheet.
 
-    position_m: contact on the stretched sheet, from its centre. edge_force_n: force on a clamped
-    edge; None if not measured. unloading: whether the finger was deeper before; None if unknown.
+    edge_distance_m: distance between the clamped edges.
+    depth_m: depth of the finger behind the plane of the sheet.
+    force_n: normal force of the finger on the sheet.
+    position_m: contact point (x, y) on the stretched sheet, from its centre.
+    edge_force_n: force on a clamped edge; None if it was not measured.
+    unloading: whether the finger was deeper before; None if unknown.
     """
 
     edge_distance_m: float
@@ -72,14 +82,16 @@ class MeasuredPush:
 
 @dataclass(frozen=True, slots=True)
 class SheetModelFit:
-    """A fitted sheet model and its uncertainty.
+    """A fitted force model of the sheet, with its uncertainty.
 
-    law: force model; it takes the stretch ratio relative to the nominal width. names, values,
-    standard_deviations: fitted parameters, in the same order. used: mask (n,) of the rows that are
-    not outliers. residual_ratio: measured force divided by fitted force, minus one (n,). rms_ratio,
-    worst_ratio: rms and maximum residual ratio of the used rows with forces above the noise.
-    rms_sigmas: rms of the residuals of all rows, divided by their assumed standard deviations; the
-    larger of the values for contact and edge forces. Outliers count as OUTLIER_SIGMAS.
+    law: force model. Its stretch ratio is relative to the nominal width.
+    names, values, standard_deviations: fitted parameters.
+    used: mask (n,) of the pushes that are not outliers.
+    residual_ratio: measured force divided by fitted force, minus one (n,).
+    rms_ratio, worst_ratio: rms and maximum of `residual_ratio` for used pushes with forces above
+        the noise.
+    rms_sigmas: rms of the residuals divided by their assumed standard deviations. It is the larger
+        of the values for contact forces and edge forces. Outliers count as OUTLIER_SIGMAS.
     """
 
     law: ScaledSheetModel
@@ -95,29 +107,30 @@ class SheetModelFit:
 
 
 MIN_HYSTERESIS_ROWS = 3
-"""The minimum number of pushes with loading, and with unloading, to estimate the hysteresis."""
+"""The minimum number of pushes, for each of loading and unloading, to estimate the hysteresis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Hysteresis:
-    """The fraction of the loading energy that is lost in a cycle, with its standard deviation."""
+    """The fraction of the loading energy that is lost in a cycle, and its standard deviation."""
 
     ratio: float
     standard_deviation: float
 
     @property
     def amplitude(self) -> float:
-        """Return the relative amplitude h of the hysteresis. The force is 1 + h times the elastic
-        force during loading, and 1 - h times during unloading.
+        """Return the relative amplitude h of the hysteresis.
+
+        The force is 1 + h times the elastic force during loading, and 1 - h times during unloading.
         """
         return self.ratio / (2.0 - self.ratio)
 
 
 def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> Hysteresis | None:
-    """Estimate the hysteresis from the residuals of the pushes with loading and with unloading.
+    """Estimate the hysteresis from the measured forces during loading and unloading.
 
-    pushes: measured pushes. Returns None for fewer than three used pushes of either kind. Raises
-    SheetModelFitError if unloading needs more force than loading.
+    Return None if there are fewer than three used pushes of either kind. Raises SheetModelFitError
+    if the force is larger during unloading than during loading.
     """
     elastic_n, _ = _predict(fit.law, pushes, fit.nominal_width_m)
     ratios = np.array([push.force_n for push in pushes]) / np.maximum(elastic_n, 1e-6)
@@ -144,7 +157,7 @@ def estimate_hysteresis(fit: SheetModelFit, pushes: Sequence[MeasuredPush]) -> H
 
 
 def remove_hysteresis(pushes: Sequence[MeasuredPush], hysteresis: Hysteresis) -> list[MeasuredPush]:
-    """Return the pushes with hysteresis removed from forces of loading and unloading."""
+    """Return the pushes with forces from which the effect of hysteresis has been removed."""
     signs = {None: 0.0, False: 1.0, True: -1.0}
     return [
         replace(push, force_n=push.force_n / (1.0 + signs[push.unloading] * hysteresis.amplitude))
@@ -156,8 +169,11 @@ NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_ra
 
 
 PRIOR_WIDTH_M, PRIOR_LOG_CUBIC = 0.0005, 0.2
-"""The standard deviations of a width that was measured with a ruler (tolerance of the slack width),
-and of the logarithm of the cubic ratio, which is 1 for ideal rubber."""
+"""The standard deviations of the prior distributions of two parameters.
+
+The first is that of the unstretched width (m), for a measurement with a ruler. The second is that
+of the logarithm of the cubic ratio, which is 1 for ideal rubber.
+"""
 
 
 def fit_sheet_model(
@@ -167,21 +183,24 @@ def fit_sheet_model(
     with_mooney: bool = False,
     with_prior: bool = False,
 ) -> SheetModelFit:
-    """Fit modulus times thickness, unstretched width, cubic ratio and optionally Mooney weight.
+    """Fit the parameters of the sheet's force model to measured pushes.
 
-    The last two are the ratio of the cubic term and the weight of the Mooney term. The
-    least-squares fit is robust: first with soft-L1 loss, then without outliers.
+    The parameters are modulus times thickness, unstretched width, and the ratio of the cubic term
+    of the force to that of ideal rubber. The weight of the Mooney term is optional. The
+    least-squares fit is robust: it first uses a soft-L1 loss, and then omits outliers.
 
-    with_prior: also use the nominal width and ideal rubber as measurements, for rows that have
-    almost one stretch and so do not determine the width.
+    nominal: rubber with which the fit starts.
+    with_mooney: whether the weight of the Mooney term is fitted.
+    with_prior: whether nominal width and ideal rubber are used as prior values. This is needed if
+        all pushes have almost the same stretch, so that they do not determine the width.
 
-    Raises SheetModelFitError for too few rows, and for rows that do not determine a parameter.
+    Raises SheetModelFitError if there are too few pushes, or if they do not determine a parameter.
     """
     names = NAMES if with_mooney else NAMES[:3]
     if len(pushes) < 2 * len(names):
         raise SheetModelFitError(
-            f"{len(pushes)} measured pushes; fitting {', '.join(names)} requires "
-            f"{2 * len(names)}; measure more"
+            f"there are {len(pushes)} measured pushes, but fitting {', '.join(names)} requires "
+            f"{2 * len(names)}; measure more pushes"
         )
     start = np.array([np.log(nominal.young_modulus_pa * nominal.thickness_m), 0.0, 0.0, 0.1])
     low = np.array([start[0] - 7.0, -0.1, -2.0, 0.0])
@@ -271,7 +290,10 @@ def fit_sheet_model(
 def _predict(
     law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float
 ) -> tuple[Floats, Floats]:
-    """Compute the contact forces (n,) and the edge forces (n,), in N, of pushes."""
+    """Compute the contact forces (n,) and the edge forces (n,), in N, of n pushes.
+
+    width_m: nominal width, to which stretch ratios refer.
+    """
     forces, edges = np.empty(len(pushes)), np.empty(len(pushes))
     groups: dict[tuple[float, tuple[float, float], float], list[int]] = {}
     for number, push in enumerate(pushes):
@@ -285,9 +307,11 @@ def _predict(
 
 
 def _residuals(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
-    """Return the residuals (2, n) of contact and edge forces, divided by their standard deviations.
+    """Return the residuals (2, n) of contact and edge forces, in assumed standard deviations.
 
-    A residual is NaN if the edge force was not measured.
+    The residual of an edge force that was not measured is NaN.
+
+    width_m: nominal width, to which stretch ratios refer.
     """
     forces, edges = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
@@ -303,7 +327,7 @@ def _residuals(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: fl
 
 
 def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
-    """Return measured force divided by fitted force, minus one (n,)."""
+    """Return measured force divided by modelled force, minus one (n,), for n pushes."""
     forces, _ = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
     ratios: Floats = measured / np.maximum(forces, 1e-6) - 1.0
@@ -313,11 +337,15 @@ def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m:
 def tabulate_pushes(
     law: ScaledSheetModel, pushes: Sequence[MeasuredPush], used: Bools, nominal_width_m: float
 ) -> TabulatedSheetModel:
-    """Tabulate the measured corrections of the model, from the used pushes.
+    """Make a table of the ratio of measured to modelled force, from the used pushes.
 
-    Every combination of stretch, x and y must occur; points are identified by their distance from
-    the sheet's centre. Depths may differ. Corrections are interpolated at depths that all
-    combinations cover. Raises SheetModelFitError for an incomplete grid.
+    The axes of the table are stretch, depth, and the distances of the push from the sheet's centre
+    along x and y. Pushes must exist at every combination of stretch, x and y, but their depths may
+    differ. The ratios are interpolated at depths that all combinations cover.
+
+    used: mask (n,) of the pushes to use.
+
+    Raises SheetModelFitError if a combination is missing.
     """
     cells: dict[tuple[float, float, float], list[tuple[float, float]]] = {}
     ratios = _force_ratios(law, pushes, nominal_width_m) + 1.0
@@ -334,9 +362,10 @@ def tabulate_pushes(
         (s, x, y) for s in axes[0] for x in axes[1] for y in axes[2] if (s, x, y) not in cells
     ]
     if not cells or missing:
-        what = f"no rows at stretch, x, y {missing[0]}" if missing else "no usable rows"
+        where = f" at stretch, x, y {missing[0]}" if missing else ""
         raise SheetModelFitError(
-            f"{what}; a table requires all combinations of stretch and position"
+            f"there are no usable rows{where}; a table requires all combinations of stretch and "
+            "position"
         )
     shallowest = max(min(depth for depth, _ in rows) for rows in cells.values())
     deepest = min(max(depth for depth, _ in rows) for rows in cells.values())

@@ -1,4 +1,4 @@
-"""Read measured pushes of a finger into a sheet from a CSV file, or simulate them."""
+"""Read measured pushes of a finger into the sheet from a CSV file, or simulate them."""
 
 from __future__ import annotations
 
@@ -22,23 +22,29 @@ OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm", "unloading")
 COLUMNS = (*STRETCH, *REQUIRED, *OPTIONAL)
 
 MAX_PROBLEMS = 20
-"""The maximum number of problems that are listed; further problems are only counted."""
+"""The maximum number of problems of a file that are listed. Further problems are only counted."""
 
 MAX_LENGTH_RATIO = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
-"""The maximum plausible length divided by the sheet's width, by column. A larger length probably
-has another unit."""
+"""The maximum plausible length divided by the sheet's width, by column.
+
+A larger length is probably in another unit.
+"""
 
 
 def read_rows(
     path: Path, sheet: SheetSpec, finger_radius_m: float
 ) -> tuple[list[MeasuredPush], list[int]]:
-    """Read measured pushes from a file, and return them with their line numbers.
+    """Read measured pushes from a CSV file, and return them with their line numbers.
 
-    The first line contains the names of the columns: `depth_mm`, `force_n`, and `edge_distance_mm`
-    or `stretch_ratio` (edge distance divided by the scene's sheet width). Optional columns: `x_mm`,
-    `y_mm` (from the sheet's centre), `edge_force_n`, `finger_radius_mm`, `unloading` (1 if the
-    finger was deeper before, else 0). Empty lines and lines that start with # are skipped. Raises
-    BadInputError with file, line and column.
+    The first line contains the names of the columns. The columns `depth_mm` and `force_n` are
+    required, and either `edge_distance_mm` or `stretch_ratio` (edge distance divided by the scene's
+    sheet width). The columns `x_mm` and `y_mm` (from the sheet's centre), `edge_force_n`,
+    `finger_radius_mm` and `unloading` (1 if the finger was deeper before, else 0) are optional.
+    Empty lines and lines that start with # are skipped.
+
+    finger_radius_m: radius for pushes without the column `finger_radius_mm`.
+
+    Raises BadInputError, which names file, line and column.
     """
     problems: list[Problem] = []
     pushes: list[MeasuredPush] = []
@@ -75,7 +81,12 @@ def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
 def _parse_row(
     where: str, cells: Mapping[str, str], sheet: SheetSpec, problems: list[Problem]
 ) -> dict[str, float]:
-    """Return the values of a CSV row by column; append errors in the row to `problems`."""
+    """Convert a row of the CSV file to numbers, by column.
+
+    Errors in the row are appended to `problems`.
+
+    where: location of the row, as FILE:LINE.
+    """
     values: dict[str, float] = {}
     for name, text in cells.items():
         if not text and name in OPTIONAL:
@@ -139,7 +150,10 @@ def _make_push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: floa
 SIMULATED_DEPTHS_M = (0.002, 0.004, 0.007, 0.012, 0.020, 0.030, 0.040, 0.050)
 SIMULATED_STRETCHES = 4
 SIMULATED_XS, SIMULATED_YS = (0.0, 0.13, 0.25), (0.0, 0.19, 0.36)
-"""The pushed points from the sheet's centre, as fractions of its width (x) and height (y)."""
+"""The simulated contact points relative to the sheet's centre.
+
+They are given as fractions of the sheet's width (x) and height (y).
+"""
 
 
 def simulate_rows(
@@ -151,12 +165,16 @@ def simulate_rows(
     apparatus: Apparatus | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[MeasuredPush]:
-    """Simulate measured pushes over the scene's stretches and depths.
+    """Simulate measured pushes of a finger into the sheet at all stretches and depths of a scene.
 
-    places: whether to push at points all over the sheet, not only at its centre. noise_n: standard
-    deviation (N) of the noise of the force gauge; that of the edge force is ten times as large.
-    apparatus: true parameters of arms and sheet; None: the scene's parameters. Each depth gives one
-    push; rubber with hysteresis gives one for loading and one for unloading.
+    Each depth gives one push. For rubber with hysteresis, it gives one push for loading and one for
+    unloading.
+
+    places: whether to push at several points of the sheet, not only at its centre.
+    noise_n: standard deviation of the noise of the contact force, N. The noise of the edge force is
+        ten times as large.
+    apparatus: true parameters of arms and sheet; None: the scene's parameters.
+    progress: function that is called with the numbers of finished and of all combinations.
     """
     rng = np.random.default_rng(seed)
     sheet = SimulatedSheet(scene, apparatus or nominal_apparatus(scene))
@@ -189,7 +207,10 @@ def simulate_rows(
 
 
 def _simulated_cases(scene: Scene, places: bool) -> Iterator[tuple[float, tuple[float, float]]]:
-    """Yield each simulated combination of a stretch ratio and a pushed point (x, y), in m."""
+    """Yield each simulated combination of a stretch ratio and a contact point (x, y), in m.
+
+    places: whether the points are all over the sheet, not only at its centre.
+    """
     sheet = scene.sheet
     stretches = np.linspace(
         max(sheet.min_stretch_ratio, 1.005), sheet.max_stretch_ratio, SIMULATED_STRETCHES

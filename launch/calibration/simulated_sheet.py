@@ -32,15 +32,18 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 JUST_TAUT_TENSION = 2e-6
-"""The residual tension of slack rubber, in shear moduli, for a sheet that is almost taut.
+"""The residual tension of slack rubber, divided by the shear modulus, for an almost taut sheet.
 
-The simulator of a running graph uses a hundred times as much, because its sheet may hang. In a
-sheet that is barely slack, that tension would triple the force of a small push.
+The simulator in a running graph uses a value a hundred times as large, because its sheet may hang.
+In a sheet that is barely slack, that tension would triple the force of a small push.
 """
 
 PUSHED_CELLS, UNTOUCHED_CELLS = 24, 16
-"""The numbers of node intervals per side of a sheet that a gauge pushes, and of one that nothing
-touches. With 24, forces differ by 0.5 % from those with 32, at 2 mm depth by 1 %."""
+"""The numbers of mesh intervals along each side of a pushed sheet and of an untouched sheet.
+
+With 24 intervals, forces differ by 0.5 % from those with 32 intervals, and by 1 % at a depth of 2
+mm.
+"""
 
 
 def simulate_push(
@@ -52,9 +55,10 @@ def simulate_push(
     *,
     cells: int = CELLS,
 ) -> tuple[float, float]:
-    """Return the normal force (N) of a push and the mean force (N) on a clamped edge.
+    """Simulate a push, and return the normal force (N) and the mean force (N) on a clamped edge.
 
-    point_m: pushed point on the sheet (x, y from its centre).
+    point_m: pushed point on the sheet (x, y) from its centre.
+    cells: number of mesh intervals along each side of the sheet.
     """
     edges = place_edges(np.eye(4), sheet.width_m * stretch_ratio)
     rubber = true_rubber(sheet, None)
@@ -70,9 +74,12 @@ def _push(
     *,
     cells: int = CELLS,
 ) -> list[tuple[float, float]]:
-    """Return normal force and clamp force at each depth of a push between two edges (4, 4).
+    """Simulate a push, and return (normal force, force on a clamped edge), in N, at each depth.
 
-    The ascending depths and point_m are relative to the flat sheet halfway between the edges.
+    edges: poses (4, 4) of the left and the right clamped edge.
+    depths_m: ascending depths behind the flat sheet midway between the edges.
+    point_m: pushed point (x, y) from the centre of the flat sheet.
+    cells: number of mesh intervals along each side of the sheet.
     """
     x, y, normal, middle = _flat_axes(*edges)
     distance_m = float((edges[1][:3, 3] - edges[0][:3, 3]) @ x)
@@ -95,7 +102,10 @@ def _push(
 
 
 def _flat_axes(left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return x, y, normal and centre (3,) of the flat sheet between two edges (4, 4)."""
+    """Return the x axis, y axis, normal and centre, each (3,), of the flat sheet between two edges.
+
+    left, right: poses (4, 4) of the clamped edges.
+    """
     x = right[:3, 3] - left[:3, 3]
     x = x / np.linalg.norm(x)
     normal = np.cross(x, left[:3, 1] + right[:3, 1])
@@ -104,11 +114,13 @@ def _flat_axes(left: Floats, right: Floats) -> tuple[Floats, Floats, Floats, Flo
 
 
 class SimulatedSheet:
-    """A sheet between simulated arms with the true parameters of an apparatus.
+    """A simulated sheet between two simulated arms, with parameters that differ from the scene.
 
     The commanded poses of the edges are computed with the arm parameters of the scene. The true
-    edges deviate from them by the errors of bases, joint angles and clamps, and by the compliance
-    of the arms.
+    poses deviate from them because of the errors of bases, joint angles and clamps, and because of
+    the compliance of the arms.
+
+    apparatus: true parameters of the hardware.
     """
 
     def __init__(self, scene: Scene, apparatus: Apparatus) -> None:
@@ -124,10 +136,14 @@ class SimulatedSheet:
         point_m: tuple[float, float],
         radius_m: float,
     ) -> list[tuple[tuple[float, float], float]]:
-        """Return per depth the normal forces (loading, unloading) and the clamp force, in N.
+        """Simulate a push, and return the forces (N) at each depth.
 
-        distance_m: commanded distance of the edges. depths_m: ascending. radius_m: radius of the
-        pushing ball, to which touched rubber sticks.
+        Each entry is ((normal force during loading, during unloading), force on a clamped edge).
+
+        distance_m: commanded distance of the edges.
+        depths_m: ascending depths.
+        point_m: pushed point (x, y) from the sheet's centre.
+        radius_m: radius of the pushing ball, to which touched rubber sticks.
         """
         edges = self._arms.hold(place_edges(np.eye(4), distance_m))
         moving_in, moving_out = (float(ratio) for ratio in self._history_ratios)
@@ -139,10 +155,10 @@ class SimulatedSheet:
         ]
 
     def hold(self, world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Floats]:
-        """Hold the sheet at a commanded pose (4, 4).
+        """Simulate the sheet at a commanded pose (4, 4), without a push.
 
-        Returns the true pose (4, 4) of the flat sheet between the edges, and the true points (n, 3)
-        of the sheet, which its weight bends.
+        Return the true pose (4, 4) of the flat sheet between the edges. Also return points (n, 3),
+        in m, of the true sheet, which sags under its weight.
         """
         left, right = self._arms.hold(place_edges(world_from_sheet, distance_m))
         x, y, normal, middle = _flat_axes(left, right)
@@ -158,14 +174,21 @@ def simulate_force(
     point_m: tuple[float, float],
     finger_radius_m: float,
 ) -> float:
-    """Simulate a push as `simulate_push` does, and return only the normal force (N)."""
+    """Simulate a push, and return the normal force (N).
+
+    point_m: pushed point on the sheet (x, y) from its centre.
+    """
     return simulate_push(sheet, stretch_ratio, depth_m, point_m, finger_radius_m)[0]
 
 
 def simulate_points(
     scene: Scene, world_from_left_edge: Floats, world_from_right_edge: Floats, finger_tip: Floats
 ) -> Floats:
-    """Return points (n, 3), in m, of the simulated sheet between two edges under a fingertip."""
+    """Return points (n, 3), in m, of the simulated sheet between two edges under a fingertip.
+
+    world_from_left_edge, world_from_right_edge: poses (4, 4) of the clamped edges.
+    finger_tip: position (3,) of the fingertip.
+    """
     pushed = solve_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     return pushed.positions.reshape(-1, 3)
 
@@ -176,7 +199,11 @@ def solve_sheet(
     world_from_right_edge: Floats,
     finger_tip: Floats | None,
 ) -> DeformedSheet:
-    """Solve the simulated sheet between two edges (4, 4), under a fingertip (3,) or without one."""
+    """Compute the shape of the simulated sheet between two edges, with or without a fingertip.
+
+    world_from_left_edge, world_from_right_edge: poses (4, 4) of the clamped edges.
+    finger_tip: position (3,) of the fingertip; None: nothing touches the sheet.
+    """
     return solve(
         true_rubber(scene.sheet, None),
         world_from_left_edge,
@@ -192,9 +219,10 @@ def make_error_function(
     world_from_right_edge: Floats,
     finger_tip: Floats | None,
 ) -> Callable[[Image, Image], Floats]:
-    """Make a function that computes image errors from projector images of both coordinate ramps.
+    """Return a function that computes the errors of the image that the user sees on the sheet.
 
-    It returns the errors (n,), m, at all points of the simulated sheet that the eye can see.
+    The arguments of the function are the projector images of the two coordinate ramps. Its result
+    is the error (n,), in m, at each point of the simulated sheet that the eye can see.
     """
     sheet = solve_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     eye = scene.eyes.centre_world_m

@@ -1,7 +1,7 @@
-"""Calibrate a stereo camera (rig) from images of a board.
+"""Calibrate a stereo camera (rig) from images of a calibration board.
 
-The lens model is a pinhole with distortion k1, k2, p1, p2. The coefficient k3 is fixed to 0,
-because boards that do not fill the image cannot separate it from k2.
+The lens model is a pinhole with the distortion coefficients k1, k2, p1, p2. The coefficient k3 is
+fixed to 0, because boards that do not fill the image cannot separate it from k2.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from flexsheet.messages.scene import Lens
 Floats = NDArray[np.float64]
 
 MAX_DEPTH_ERROR_FRACTION = 0.05
-"""The maximum depth error as a fraction of the working distance; above it, the rig is undetermined.
-"""
+"""The maximum depth error of a valid calibration, as a fraction of the working distance."""
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResult:
-    """A calibration with its fit and board pairs, for a report.
+    """A stereo calibration with its fit and its image pairs, for a report.
 
-    pairs: pairs that were used, by their index among all pairs.
+    pairs: board corners of the used pairs, by index among all pairs.
+    size: width and height of the images, px.
     """
 
     calibration: StereoCalibration
@@ -76,18 +76,18 @@ def calibrate_stereo(
     working_distance_m: float | None = None,
     progress: Progress = ignore_progress,
 ) -> CalibrationResult:
-    """Calibrate a stereo rig from pairs of images of a board.
+    """Calibrate a stereo camera from pairs of images of a board.
 
-    Excludes pairs without the board, repeated pairs, and pairs that contradict the others
-    (`compute_misfits`). Then excludes corners with residuals above six standard deviations, and
-    pairs whose residual exceeds half a pixel and three times the median.  The result contains the
-    reasons.
+    Excluded are pairs without the board, repeated pairs, and pairs that contradict the others
+    (`compute_misfits`). Also excluded are corners with residuals above six standard deviations. A
+    pair is excluded if its residual exceeds both half a pixel and three times the median. The
+    result contains the reasons.
 
     working_distance_m: distance to which the uncertainty applies; None: median distance of the
-    boards.
+        boards.
 
-    Raises CalibrationError for unusable images, fewer than MIN_PAIRS remaining pairs, or an
-    undetermined rig.
+    Raises CalibrationError for unusable images, if fewer than MIN_PAIRS pairs remain, or if the
+    pairs do not determine the rig.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     selection = PairSelection(found, [path.name for path in left_paths])
@@ -150,10 +150,14 @@ def compute_uncertainty(
     distance_m: float | None,
     progress: Progress = ignore_progress,
 ) -> Uncertainty:
-    """Compute the rig's covariance and the resulting uncertainty of a fingertip at `distance_m`.
+    """Compute the covariance of a rig, and the resulting uncertainty of a measured fingertip.
 
-    If jackknife refits scatter more than the covariance predicts, the covariance is scaled up to
-    match.
+    If the results of jackknife refits scatter more than the covariance of the fit predicts, the
+    covariance is increased accordingly.
+
+    points: corners of the board (n, 3), m.
+    size: width and height of the images, px.
+    distance_m: distance of the fingertip from the camera; None: median distance of the boards.
     """
     if distance_m is None:
         middles = [pose_transform(pose) @ [*points.mean(axis=0), 1.0] for pose in fit.poses]
@@ -176,6 +180,6 @@ def compute_uncertainty(
 
 
 def make_lens(numbers: Floats) -> Lens:
-    """Make a lens from eight numbers: fx, fy, cx, cy (px) and the distortion k1, k2, p1, p2."""
+    """Make a lens from eight numbers: fx, fy, cx, cy (px), and the distortion k1, k2, p1, p2."""
     fx, fy, cx, cy, k1, k2, p1, p2 = (float(number) for number in numbers)
     return Lens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=(k1, k2, p1, p2, 0.0))

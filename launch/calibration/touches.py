@@ -1,4 +1,7 @@
-"""Read touches of known points from a CSV file (`flexsheet calibrate marker`), or simulate them."""
+"""Read touches of known points by a finger with a marker from a CSV file, or simulate them.
+
+`flexsheet calibrate marker` uses the touches.
+"""
 
 from __future__ import annotations
 
@@ -35,13 +38,13 @@ COLUMNS = (*REQUIRED, *NORMAL)
 MAX_PROBLEMS = 20
 MAX_TILT_DEG = 120.0
 MAX_LENGTH_MM = 5000.0
-"""The maximum plausible coordinate; a larger number is probably in another unit."""
+"""The maximum plausible coordinate (mm). A larger number is probably in another unit."""
 
 
 def read_touches(path: Path, scene: Scene) -> list[Touch]:
-    """Read touches from a file; docs/set-up-marker.md lists the columns.
+    """Read touches from a CSV file. The document docs/set-up-marker.md lists the columns.
 
-    Raises BadInputError with file, line, column, value and remedy.
+    Raises BadInputError, which names file, line, column and value, and states the remedy.
     """
     problems: list[Problem] = []
     touches = []
@@ -62,7 +65,12 @@ def _check_header(where: str, names: Sequence[str]) -> list[Problem]:
 
 
 def _parse_row(where: str, cells: Mapping[str, str], problems: list[Problem]) -> dict[str, float]:
-    """Return the values of a CSV row by column; append errors in the row to `problems`."""
+    """Convert a row of the CSV file to numbers, by column.
+
+    Errors in the row are appended to `problems`.
+
+    where: location of the row, as FILE:LINE.
+    """
     values: dict[str, float] = {}
     for name, text in cells.items():
         if not text and name in NORMAL:
@@ -106,16 +114,19 @@ SIMULATED_TILTS_DEG = ((0, 0), (-20, 0), (15, 0), (0, -25), (0, 25), (-15, -20),
                        (10, -10), (-10, -10), (-10, 0), (25, 10), (25, -10), (0, 18),
                        (30, 0), (20, 20), (-25, 10), (8, 25), (40, 0), (35, 20),
                        (35, -20))  # fmt: skip
-"""The orientations of the finger, as tilts about x and y in degrees, in which the marker is
-measured before the touches."""
-TOUCHED_ORIENTATIONS = 6
-"""The number of orientations in which points are touched. These are the orientations with the
-smallest uncertainty of the marker."""
-SIMULATED_POINTS_M = np.array([[x, y, 0.01] for y in (0.0, 0.04) for x in (-0.03, 0.01, 0.05)])
-"""The touched corners of a simulated board (n, 3), in metres."""
-SIMULATED_CORNER_M, SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, 1e-4, math.radians(1.0)
-"""The standard deviations per axis of the measured corners, of the pad's position, and of angles.
+"""The orientations of the finger in which the marker is measured before the touches.
+
+Each orientation is given as tilts about x and y, in degrees.
 """
+TOUCHED_ORIENTATIONS = 6
+"""The number of orientations in which points are touched.
+
+These are the orientations in which the measured marker has the smallest uncertainty.
+"""
+SIMULATED_POINTS_M = np.array([[x, y, 0.01] for y in (0.0, 0.04) for x in (-0.03, 0.01, 0.05)])
+"""The touched points (n, 3) of a simulation, in m: corners of a simulated board."""
+SIMULATED_CORNER_M, SIMULATED_HAND_M, SIMULATED_TILT_RAD = 1e-4, 1e-4, math.radians(1.0)
+"""The standard deviations per axis of measured corners (m), pad positions (m) and tilts (rad)."""
 
 
 def simulate_touches(
@@ -125,13 +136,16 @@ def simulate_touches(
     calibration: StereoCalibration | None,
     seed: int,
 ) -> list[Touch]:
-    """Simulate touches of known points that the simulated stereo camera observes.
+    """Simulate touches of known points, as observed by the simulated stereo camera.
 
-    The finger shows the marker in all orientations of `SIMULATED_TILTS_DEG`, relative to its usual
-    orientation. It then touches each point in the orientations with the smallest uncertainty of the
-    marker that the triangulator's detector states. The fit takes the usual orientation for
-    `direction_world`, so that its offset is right in use. A touch whose marker the detector does
-    not accept is left out. calibration: optics that the detector uses; None: the scene's optics.
+    First, the marker is measured in all orientations of `SIMULATED_TILTS_DEG`, relative to the
+    usual orientation of the finger. Then the finger touches each point in the orientations in which
+    the detector states the smallest uncertainty. The fit assumes that the usual orientation equals
+    `direction_world`, so the fitted offset is valid in use. A touch is omitted if the detector does
+    not accept the marker.
+
+    apparatus: true parameters of the simulated hardware.
+    calibration: camera parameters that the detector uses; None: the scene's parameters.
     """
     geometry = StereoGeometry.of(scene.camera, calibration)
     true_scene = apply_apparatus(scene, apparatus)
@@ -174,7 +188,10 @@ def simulate_touches(
 def _see_marker(
     camera: TwinCamera, scene: Scene, geometry: StereoGeometry, pad: Floats
 ) -> TriangulatedPoint | None:
-    """Return the detected marker for a pad position; None if it is not accepted."""
+    """Return the marker that the detector finds in simulated images, or None if it finds no marker.
+
+    pad: position (3,) of the fingertip's pad.
+    """
     left, right = camera.picture(lambda _: pad, exposure_s=scene.camera.exposure_s)
     found = detect_all(
         left,

@@ -1,8 +1,8 @@
 """Compute the error of a measured fingertip that results from the uncertainty of the stereo rig.
 
 To first order, the error follows from the covariance of the rig's parameters. A delete-a-group
-jackknife (refits without some pairs) also covers errors that corners have in common, a warped board
-and deviations from the lens model.
+jackknife repeats the fit without some pairs. It also covers errors that corners have in common, a
+warped board, and deviations from the lens model.
 """
 
 from __future__ import annotations
@@ -30,15 +30,20 @@ from flexsheet.nodes.models import rigid
 Floats = NDArray[np.float64]
 
 GROUPS = 20
-"""The maximum number of jackknife refits. If there are more pairs, each refit leaves out several
-pairs."""
+"""The maximum number of jackknife refits.
+
+If there are more pairs, each refit leaves out several pairs.
+"""
 
 
 def sample_working_plane(rig: Floats, size: tuple[int, int], distance_m: float) -> Floats:
-    """Sample points (n, 3), m, at depth `distance_m` in the left camera's frame.
+    """Return points (n, 3), in m, at the depth `distance_m` in the left camera's frame.
 
     The points are a grid of 5 x 5 over the central half of the left image's width and height.
     Points outside the right image are omitted.
+
+    rig: parameters of the stereo rig (22,).
+    size: width and height of the images, px.
     """
     matrix, distortion = lens_arrays(rig[LEFT])
     width, height = size
@@ -54,11 +59,14 @@ def sample_working_plane(rig: Floats, size: tuple[int, int], distance_m: float) 
 
 
 def compute_position_jacobian(rig: Floats, points: Floats) -> Floats:
-    """Return the derivatives (n, 3, 22) of triangulated positions (n, 3) by the rig's parameters.
+    """Return the derivatives of triangulated points with respect to the rig's parameters.
 
-    For fixed pixels p = f(x, rig), the position x with the least squared image error changes so
-    that A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig. Therefore
-    dx/drig = -(A'A)^-1 A'B.
+    The pixels p = f(x, rig) are fixed, and the position x has the least squared image error.
+    Therefore, A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig. The
+    derivative is dx/drig = -(A'A)^-1 A'B, with the shape (n, 3, 22).
+
+    rig: parameters of the stereo rig (22,).
+    points: triangulated points (n, 3), m.
     """
     count = len(points)
     by_point, by_rig = np.empty((count, 4, 3)), np.zeros((count, 4, len(PARAMETERS)))
@@ -78,10 +86,12 @@ def compute_position_jacobian(rig: Floats, points: Floats) -> Floats:
 
 
 def compute_position_std(slopes: Floats, covariance: Floats) -> tuple[float, float]:
-    """Return the standard deviations (depth, lateral), m, as root mean square over the points.
+    """Return the standard deviations (depth, lateral), in m, of triangulated points.
 
-    slopes: derivatives (n, 3, 22) of the positions. covariance: covariance matrix (22, 22) of the
-    rig. Lateral combines x and y.
+    Each is a root mean square over the points. The lateral value combines x and y.
+
+    slopes: derivatives (n, 3, 22) of the positions with respect to the rig's parameters.
+    covariance: covariance matrix (22, 22) of the rig's parameters.
     """
     variances = np.einsum("nip,pq,niq->ni", slopes, covariance, slopes).mean(axis=0)
     return float(np.sqrt(variances[2])), float(np.sqrt(variances[0] + variances[1]))
@@ -93,10 +103,12 @@ def compute_jackknife_covariance(
     board: Floats,
     progress: Progress = ignore_progress,
 ) -> Floats:
-    """Return the covariance (22, 22) of the rig from refits that each leave out some pairs.
+    """Return the covariance (22, 22) of the rig's parameters from refits that leave out some pairs.
 
     This is the delete-a-group jackknife (Shao and Tu, The Jackknife and Bootstrap, 1995, section
-    5.5): (G - 1)/G times the scatter of the G refits about their mean.
+    5.5). The covariance is (G - 1)/G times the scatter of the G refits about their mean.
+
+    board: corners of the board (n, 3), m.
     """
     groups = min(GROUPS, len(pairs))
     rigs = []
@@ -110,5 +122,8 @@ def compute_jackknife_covariance(
 
 
 def compute_right_from_left(rig: Floats) -> Floats:
-    """Return the transform (4, 4) from the left to the right camera of a rig (22,)."""
+    """Return the transform (4, 4) from the left to the right camera frame.
+
+    rig: parameters of the stereo rig (22,).
+    """
     return rigid.transform(pose_transform(rig[STAND])[:3, :3], rig[STAND][3:])

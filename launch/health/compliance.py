@@ -1,4 +1,4 @@
-"""Compute how well the sheet of a scene can render its object's force at each push depth.
+"""Compute how accurately the sheet can render the force of the virtual object at each push depth.
 
 The planner renders the force by moving the sheet along its normal.
 """
@@ -44,10 +44,13 @@ from flexsheet.nodes.planner.sheet_force import make_force_model
 SKIN_SPACING_M = 0.0045
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 FINGERTIP_AGE_S = 0.012
-"""The age of a published fingertip position: half an exposure, read-out and computation."""
+"""The assumed age (s) of a fingertip position when it is published.
+
+It consists of half an exposure, the read-out of the camera, and the computation.
+"""
 
 SHOWN_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""The push depths in the report, as fractions of the maximum push depth."""
+"""The push depths that the report lists, as fractions of the maximum push depth."""
 
 
 def compute_front_curve(
@@ -56,11 +59,14 @@ def compute_front_curve(
     *,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Floats:
-    """Return depth (m) and force (N) of the object, (n, 2), on the side that faces the user.
+    """Return the force of the object on the side that faces the user, as a function of push depth.
 
-    The linear method is used only if the scene chooses it. Otherwise, a missing nonlinear table of
-    the object is computed and cached, which takes minutes. cache_dir: None for the user's cache
-    folder. on_progress: called with the numbers of finished and of all steps.
+    The result has rows (n, 2) of depth (m) and force (N). The linear method is used only if the
+    scene chooses it. Otherwise, if the nonlinear table of the object is not cached, it is computed
+    and cached, which takes minutes.
+
+    cache_dir: folder of the cache; None: the user's cache folder.
+    on_progress: function that is called with the numbers of finished and of all steps.
     """
     factory = SoftBodyFactory(
         skin_spacing_m=SKIN_SPACING_M,
@@ -85,10 +91,13 @@ def compute_compliance(
     max_depth_m: float | None = None,
     bounds: OffsetBounds | None = None,
 ) -> Compliance:
-    """Compute the sheet offsets by which the planner renders the object's force.
+    """Compute the offsets of the sheet by which the planner renders the object's force.
 
-    max_depth_m: maximum push depth; None for the depth in the scene. bounds: limits that keep the
-    control loop of sheet and hand stable; None for no limits.
+    law: force model of the sheet.
+    curve: force of the object as a function of push depth.
+    max_depth_m: maximum push depth; None: the depth in the scene.
+    bounds: limits of the offset that keep the control loop of sheet and hand stable; None: no
+        limits.
     """
     limits = make_stretch_limits(scene.sheet, law, bounds)
     return fit_compliance(curve, law, limits, scene, max_depth_m=max_depth_m)
@@ -98,7 +107,7 @@ class LoopRisk(StrEnum):
     """The risk that the control loop of sheet and hand is unstable or renders a wrong force.
 
     OSCILLATION: a hand of low damping can oscillate, because the sheet moves away too late.
-    DELAY: the delay limits the stable offset of the sheet too much to render the object's force.
+    DELAY: because of the delay, the sheet cannot render the object's force with a stable offset.
     SHEET: the sheet cannot render the object's force, even without delay.
     """
 
@@ -109,10 +118,10 @@ class LoopRisk(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LoopFinding:
-    """The risk of the control loop of sheet and hand, as found by `find_loop_risk`.
+    """A risk of the control loop of sheet and hand, as found by `find_loop_risk`.
 
-    delay_s: time from the measurement of a depth until the sheet has moved. error_ratio: largest
-    relative error of the rendered force within the stable bounds.
+    delay_s: time from the measurement of a push depth until the sheet has moved.
+    error_ratio: maximum relative error of the rendered force within the stability limits.
     """
 
     risk: LoopRisk
@@ -120,7 +129,7 @@ class LoopFinding:
     error_ratio: float
 
     def describe(self) -> str:
-        """Return a text that states the risk and its remedy."""
+        """Return a text that describes the risk and what to do about it."""
         delay_ms, error_percent = 1e3 * self.delay_s, 100.0 * self.error_ratio
         match self.risk:
             case LoopRisk.OSCILLATION:
@@ -148,9 +157,12 @@ def find_loop_risk(
     table: OffsetBoundsTable,
     delay_s: float,
 ) -> LoopFinding | None:
-    """Return the risk of the control loop of sheet and hand at the given delay.
+    """Return the risk of the control loop of sheet and hand at a given delay, or None without risk.
 
-    Return None if there is no risk.
+    law: force model of the sheet.
+    curve: force of the object as a function of push depth.
+    table: limits of the sheet's offset for a stable loop, by delay.
+    delay_s: time from the measurement of a push depth until the sheet has moved.
     """
     bounded = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))
     error_ratio = float(np.abs(bounded.centre.error_ratio).max())
@@ -164,11 +176,11 @@ def find_loop_risk(
 
 
 def check_graph(plan: ResolvedGraph) -> LoopFinding | None:
-    """Return the risk of the control loop of sheet and hand in a graph, before the graph starts.
+    """Return the risk of the control loop of sheet and hand, before a graph of nodes starts.
 
-    The planner's parameters determine the delay. Only cached data are used, because their
-    computation takes up to minutes. Return None if there is no risk, or if the stability bounds or
-    the soft body are not cached; the planner reports the risk later.
+    The parameters of the planner determine the delay. Only cached data are used, because their
+    computation takes up to minutes. Return None if there is no risk, or if the stability limits or
+    the soft body are not cached. In the second case, the planner reports the risk later.
     """
     scene = plan.scene_message()
     planners, solvers = plan.nodes_of_type("planner"), plan.nodes_of_type("fem_solver")
@@ -207,7 +219,9 @@ def compliance_result(
 ) -> dict[str, Any]:
     """Return the result of `flexsheet doctor compliance --json`.
 
-    delay_s: time from the measurement of a depth until the sheet has moved.
+    law: force model of the sheet.
+    curve: force of the object as a function of push depth.
+    delay_s: time from the measurement of a push depth until the sheet has moved.
     """
     table = load_or_compute_bounds(scene.camera.rate_hz, None)
     shown = compute_compliance(scene, law, curve, bounds=table.at_delay(delay_s))

@@ -1,4 +1,4 @@
-"""Check the computer that runs flexsheet, and name a remedy for each problem."""
+"""Check the computer on which flexsheet runs, and state a remedy for each problem."""
 
 from __future__ import annotations
 
@@ -28,15 +28,19 @@ FAST_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_coun
 MIN_FREE_DISK_BYTES = 2 << 30
 MIN_CORES = 2
 PROBE_S = 1.0
-"""The duration of the check of the processor load."""
+"""The duration (s) of the measurement of the processor load."""
 
 PROBE_PERIOD_S, PROBE_RUN_S = 1.0 / 140.0, 0.001
-"""The cycle period of an arm bridge, and the processor time per cycle."""
+"""The cycle period (s) of a node that controls an arm, and its processor time (s) per cycle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The result of a check. `what` is the finding; `remedy` is empty if the check passed."""
+    """The result of a check of this computer.
+
+    what: text that describes the result.
+    remedy: text that states what the user can do; empty if the check passed.
+    """
 
     check: str
     state: Literal["ok", "warning", "failed"]
@@ -45,7 +49,7 @@ class Finding:
 
 
 def check_all() -> Iterator[Finding]:
-    """Run all checks, one after another."""
+    """Run all checks of this computer, and yield each result."""
     checks: tuple[Callable[[], Finding], ...] = (
         check_load,
         check_python,
@@ -65,10 +69,10 @@ def check_all() -> Iterator[Finding]:
 
 
 def check_load() -> Finding:
-    """Check whether a process with the load of an arm bridge gets a processor in time.
+    """Check whether a process with the load of an arm control node gets a processor in time.
 
-    The calling process computes for PROBE_RUN_S in each PROBE_PERIOD_S and measures its waiting
-    time.
+    The function computes for PROBE_RUN_S in each PROBE_PERIOD_S, and measures how long it waits for
+    a processor.
     """
     watch, own = CpuWatch(), {"this check": os.getpid()}
     watch.update(own, measure_programs=True)
@@ -92,7 +96,7 @@ def check_load() -> Finding:
 
 
 def check_python() -> Finding:
-    """Report the Python version; with a version that is too old, this module cannot be imported."""
+    """Report the Python version. This module cannot be imported if the version is too old."""
     return Finding("python", "ok", f"{sys.version.split()[0]} at {sys.executable}")
 
 
@@ -133,7 +137,7 @@ def check_opencv() -> Finding:
 
 
 def check_cameras() -> Finding:
-    """List the cameras that are found by V4L2, Aravis and RealSense."""
+    """List the cameras that V4L2, Aravis and RealSense find."""
     from flexsheet.nodes.camera.captures import list_devices
 
     found = list_devices()
@@ -141,7 +145,7 @@ def check_cameras() -> Finding:
 
 
 def check_opengl() -> Finding:
-    """Check that a headless OpenGL context can be created."""
+    """Check that an OpenGL context can be created without a display."""
     problem = find_opengl_problem()
     if problem is None:
         return Finding("opengl", "ok", "a headless context can be created (EGL)")
@@ -149,7 +153,7 @@ def check_opengl() -> Finding:
 
 
 def check_cores() -> Finding:
-    """Check the number of processor cores."""
+    """Check that this computer has enough processor cores."""
     cores = len(os.sched_getaffinity(0))
     if cores < MIN_CORES:
         what = f"this computer has only {cores} processor core"
@@ -158,7 +162,7 @@ def check_cores() -> Finding:
 
 
 def check_disk() -> Finding:
-    """Check the free disk space of the working folder."""
+    """Check that the disk of the working folder has enough free space."""
     free = shutil.disk_usage(Path.cwd()).free
     text = f"{free / 2**30:.1f} GiB free at {Path.cwd()}"
     if free < MIN_FREE_DISK_BYTES:
@@ -169,7 +173,7 @@ def check_disk() -> Finding:
 
 
 def check_clock() -> Finding:
-    """Check the source and resolution of the clock from which all messages get their timestamps."""
+    """Check the source and the resolution of the clock that provides the timestamps of messages."""
     try:
         source = (CLOCK_SOURCES / "current_clocksource").read_text().strip()
     except OSError:
@@ -187,7 +191,7 @@ def check_clock() -> Finding:
 
 
 def check_sockets() -> Finding:
-    """Check that the folder for the files of running graphs (runs) can be used."""
+    """Check that the folder for the files and sockets of running graphs can be used."""
     directory = root()
     if not directory.exists():
         return Finding("sockets", "ok", f"{directory} will be created")
@@ -203,7 +207,7 @@ def check_sockets() -> Finding:
 
 
 def check_leftovers() -> Finding:
-    """Find node processes that are left over from ended launchers."""
+    """Check that no node processes are left over from launchers that have ended."""
     found = find_orphans()
     if found:
         pids = ", ".join(str(process.pid) for process in found)
@@ -217,7 +221,7 @@ def check_leftovers() -> Finding:
 
 
 def check_demo() -> Finding:
-    """Check that the demo's launch file resolves and that its ports are free."""
+    """Check that the launch file of the demo is valid and that its ports are free."""
     try:
         plan = load_graph(DEMO)
     except BadInputError as error:

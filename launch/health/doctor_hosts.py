@@ -1,7 +1,7 @@
-"""Evaluate the probes of hosts: return one finding for each host and check, with a remedy.
+"""Evaluate the probes of hosts, and return findings with remedies.
 
-A probe (`launch.health.probe`) asks a host for its state. Further findings come from checks of this
-computer.
+A probe (`launch.health.probe`) contains the messages from one host. Each check of a host gives one
+finding. Further findings are from checks of this computer.
 """
 
 from __future__ import annotations
@@ -51,7 +51,11 @@ MAX_NAMES_SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class HostFinding:
-    """The result of a check of a host. `what` is the finding; `remedy` is empty after success."""
+    """The result of a check of a host.
+
+    what: text that describes the result.
+    remedy: text that states what the user can do; empty if the check passed.
+    """
 
     host: str
     check: str
@@ -78,7 +82,7 @@ NETWORK_FAULTS: dict[Reachability, tuple[str, str]] = {
         "open the TCP ports {first}-{last} of {address} for the other hosts in the firewall",
     ),
 }
-"""The finding and remedy by cause, for hosts that cannot be reached."""
+"""The texts of finding and remedy for each reason why a host cannot be reached."""
 
 LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
     Reachability.CLOSED: (
@@ -118,7 +122,10 @@ LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
         "correct the key of this computer first; see the findings of {here}",
     ),
 }
-"""The check, finding and remedy by cause, for hosts that are on, but whose launcher is silent."""
+"""The name of the check, the finding and the remedy for hosts whose launcher does not respond.
+
+The keys are the reasons why a launcher does not respond although its host is on.
+"""
 
 SAME_COMMIT_REMEDY = "use the same commit on all hosts: git pull, make setup, and start again"
 SELF_CHECK = "self-check"
@@ -160,13 +167,16 @@ REQUIRED_FOR_CHECKS = {
     "touch_point_world_m": "the marker on the finger",
     "sheet_calibration": "the sheet's modulus (`flexsheet calibrate sheet`)",
 }
-"""The names of the optional checks, by the node parameter that enables the check."""
+"""The quantity that an optional self-check tests, by the node parameter that enables the check."""
 
 
 def check_apparatus(
     probe: HostProbe, nodes: Sequence[ResolvedNode], scene: Scene | None = None
 ) -> Iterator[HostFinding]:
-    """Report calibration errors that the nodes' self-checks suspect, and disabled self-checks."""
+    """Yield the calibration errors that self-checks of nodes suspect, and the disabled self-checks.
+
+    nodes: nodes of the host in the launch file.
+    """
     checks = [one for status in probe.nodes.values() for one in status.self_checks]
     suspected = [one for one in checks if one.suspected]
     for one in suspected:
@@ -288,7 +298,10 @@ def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFi
 def _check_clocks(
     plan: ResolvedGraph, probe: HostProbe, probes: Mapping[str, HostProbe]
 ) -> HostFinding:
-    """Compare the measured clock offsets to the other hosts with the limit of the graph."""
+    """Check that the clock offsets from a host to the other hosts are known accurately enough.
+
+    The limit is that of the clock node in the graph.
+    """
     finding = partial(HostFinding, probe.host, "clocks")
     if probe.clocks is None:
         what = "the clock node of the host does not publish"
@@ -365,7 +378,7 @@ def _check_rates(probe: HostProbe) -> HostFinding:
 
 
 def find_rate_problem(port: PortStatus) -> str | None:
-    """Return why a port's message rate is outside the range of its topic, or None if it is not."""
+    """Return why the message rate of a port is not as expected, or None if it is as expected."""
     topic = TOPICS.get(port.topic)
     if topic is None or topic.rate_hz is None or topic.many_writers:
         return None
@@ -385,7 +398,7 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
         f"check OpenGL on that host: flexsheet doctor; {OPENGL_REMEDY}",
     ),
 }
-"""The name and the remedy of the check that a node publishes, by role of the node."""
+"""The name and the remedy of the check that a node publishes messages, by the role of the node."""
 
 
 def _report_devices(
@@ -493,7 +506,10 @@ def _shorten(texts: Sequence[str]) -> list[str]:
 
 
 def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
-    """Return why the key of this computer cannot be used to probe hosts, or None if it can."""
+    """Return why the key of this computer cannot be used to connect to hosts, or None if it can.
+
+    here: name of this computer in the launch file.
+    """
     if not plan.keys:
         return None
     file = secret_file(here)
@@ -566,7 +582,7 @@ def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
 
 
 def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
-    """Check that an arm's controller accepts connections, while no graph is running."""
+    """Check that the controller of an arm accepts connections. No graph may be running."""
     finding = partial(HostFinding, here, f"arm {node.arm_side}")
     if node.device_address is None:
         return finding("not asked", f"{node.name} uses its own driver")
@@ -584,7 +600,7 @@ def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
 
 
 def list_own_addresses() -> set[str]:
-    """Return the IP addresses of this computer."""
+    """Return the IP addresses of all network interfaces of this computer."""
     families = (socket.AF_INET, socket.AF_INET6)
     return {
         one.address.partition("%")[0]

@@ -1,9 +1,10 @@
-"""Check whether two arms reach a scene's whole working range, and suggest remedies.
+"""Check whether two arms reach the whole working range of a scene, and suggest remedies.
 
 The range is sampled over contact points on the object, sheet poses, push depths, stretches and
-motions. "Rolling" tilts the sheet over the object without slip, so the contact also moves on the
-sheet. The sheet poses follow the planner's rules (`flexsheet.nodes.planner.rolling`). The reach of
-an arm follows the rules of its bridge (`flexsheet.nodes.arm_bridge.reach`).
+motions. Some sheet poses result from rolling, which tilts the sheet over the object without slip,
+so that the contact also moves on the sheet. The sheet poses follow the rules of the planner
+(`flexsheet.nodes.planner.rolling`). The reach of an arm follows the rules of its control node
+(`flexsheet.nodes.arm_bridge.reach`).
 """
 
 from __future__ import annotations
@@ -46,26 +47,28 @@ from flexsheet.nodes.planner.rolling import (
 Progress = Callable[[str], None]
 
 TILTS, SIDE_TILTS, DEPTHS = 17, 5, 6
-"""The number of samples over the vertical tilts, the horizontal tilts and the depths."""
+"""The numbers of sampled vertical tilts, horizontal tilts and push depths."""
 
 VIEW_DISTANCE_M = 1.0
 DUPLICATE_DISTANCE_M, DUPLICATE_NORMAL = 0.004, 0.02
-"""The maximum differences of the positions and of the unit normals of two duplicate contacts."""
+"""The maximum differences between two duplicate contacts: position (m) and unit normal."""
 
 ROLL_STARTS = 24
-"""The number of contacts from which the sheet is rolled to other contacts."""
+"""The approximate number of contacts from which the sheet is rolled to other contacts."""
 
 CLAMP_MARGIN_M = 0.03
-"""The minimum distance between the finger and a clamped edge of the sheet."""
+"""The minimum distance (m) between the finger and a clamped edge of the sheet."""
 
 OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
-"""The offsets of an arm's base along each world axis that are tried as a remedy."""
+"""The offsets (m) of an arm's base along each world axis that are tried as a remedy."""
 
 REACHED_COLOR = "#dcefdc"
 
 THINNED_COUNT = 600
-"""The number of samples that are checked first. All samples are checked only for a base position
-from which the arm reaches these."""
+"""The approximate number of samples with which a base position is checked first.
+
+All samples are checked only for a base position from which the arm reaches these samples.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +76,9 @@ class ContactSample:
     """A contact of the finger with the object, and the pose of the sheet before a push.
 
     tilt_rad: angle between the surface normal and the direction towards the user, positive upwards.
-    world_from_sheet: (4, 4). twists_world: velocities (k, 6) of the sheet when the finger strokes
-    at the scene's working speed.
+    contact_world_m: contact point (3,).
+    world_from_sheet: pose of the sheet (4, 4).
+    twists_world: velocities (k, 6) of the sheet for strokes at the working speed, m/s and rad/s.
     """
 
     tilt_rad: float
@@ -85,7 +89,12 @@ class ContactSample:
 
 @dataclass(frozen=True, slots=True)
 class LayoutSamples:
-    """The sheet poses that the arms must reach: tilts (n,), push depths (n,), contacts (n, 3)."""
+    """The n sampled sheet poses that the arms must reach.
+
+    tilt_rad: tilts (n,) of the contact.
+    depth_m: push depths (n,).
+    contact_world_m: contact points (n, 3).
+    """
 
     poses: SheetPoses
     tilt_rad: Floats
@@ -95,7 +104,11 @@ class LayoutSamples:
 
 @dataclass(frozen=True, slots=True)
 class LayoutRemedy:
-    """A change that makes the whole range reachable, as text and as values."""
+    """A change of the scene after which the arms reach the whole working range.
+
+    what: description of the change.
+    values: changed values by name.
+    """
 
     what: str
     values: dict[str, Any]
@@ -125,9 +138,11 @@ class Layout:
         return bool(self.reached.all()) and not self.blocked_paths
 
     def speed_m_per_s(self, fraction: float) -> float:
-        """Return the finger speed that the arms can follow at a fraction of reachable positions.
+        """Return the finger speed (m/s) that both arms can follow at a fraction of the samples.
 
-        fraction: 0 to 1. Return 0 if no sampled position is reachable.
+        Only reachable samples are considered. Return 0 if there are none.
+
+        fraction: fraction from 0 to 1.
         """
         if not self.reached.any():
             return 0.0
@@ -135,10 +150,10 @@ class Layout:
         return float(np.quantile(speeds[self.reached], 1.0 - fraction))
 
     def speeds_m_per_s(self, reach: ArmReach) -> Floats:
-        """Return the maximum finger speeds (n,), m/s, that an arm can follow.
+        """Return the maximum finger speed (n,), in m/s, that an arm can follow at each sample.
 
-        The speed is NaN at unreachable samples. The speeds of arm and sheet are proportional to the
-        speed of the finger.
+        The speeds of arm and sheet are assumed to be proportional to the speed of the finger. The
+        speed is NaN at unreachable samples.
         """
         used = np.max([1.0 - reach.margins[limit] for limit in SPEED_LIMITS], axis=0)
         return np.asarray(self.scene.working_range.speed_m_per_s / used)
@@ -148,12 +163,12 @@ class Layout:
 
 
 def sample_contacts(scene: Scene) -> list[ContactSample]:
-    """Sample contact points on the object, and the poses of the sheet at each point.
+    """Sample contact points on the object, with sheet poses at each point.
 
-    The object is viewed from all directions within the scene's tilt. At each point, the contact is
-    the centre of the sheet, or the point of the sheet that results from rolling the sheet from
-    another contact. For each axis of the sheet, the two rolls that end farthest from its centre are
-    used, limited to the sheet's usable size.
+    The object is viewed from all directions within the scene's tilt. At each point, the sheet
+    touches the object at its centre, or at another point after it has rolled from another contact.
+    For each axis of the sheet, the two rolls that end farthest from its centre are used, limited to
+    the sheet's usable size.
     """
     shape = make_shape(dict(scene.object.geometry))
     world_from_object = pose_matrix(scene.object.world_from_object)
@@ -238,10 +253,10 @@ def _list_contacts(
 
 
 def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSamples:
-    """Combine every contact with every push depth and with the minimum and maximum stretch.
+    """Combine every contact with every push depth, and with the minimum and the maximum stretch.
 
-    A push moves the sheet along its normal. A push at the working speed is one of the motions that
-    the arms must follow.
+    A push moves the sheet along its normal. The arms must also follow a push at the scene's working
+    speed.
     """
     sheet = scene.sheet
     longest = stretch_for_edge_force(sheet.max_edge_force_n, sheet)
@@ -270,7 +285,10 @@ def make_samples(scene: Scene, contacts: Sequence[ContactSample]) -> LayoutSampl
 
 
 def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Layout:
-    """Check both arms over the scene's working range, and search for remedies if one arm fails."""
+    """Check whether both arms reach the working range, and search for remedies if one does not.
+
+    progress: function that is called with a description of each step.
+    """
     progress("finding the contacts on the object")
     samples = make_samples(scene, sample_contacts(scene))
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
@@ -319,7 +337,10 @@ def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -
 
 
 def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]:
-    """Yield changes after which all samples are reachable: base positions, tilt or push depth."""
+    """Yield changes of the scene after which the arms reach all samples.
+
+    The changes are other base positions, a smaller tilt range, or a smaller push depth.
+    """
     moved: dict[Side, Floats] = {}
     for side, reach in layout.arms():
         if not reach.reachable.all():
@@ -354,7 +375,10 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
 
 
 def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
-    """Return the scene with the base of one arm moved by an offset (3,), m, in the world frame."""
+    """Return a copy of the scene in which the base of one arm is moved.
+
+    offset_m: displacement (3,) in the world frame.
+    """
     arms = scene.arms
     arm: ArmSpec = getattr(arms, side)
     base = Pose(
@@ -366,7 +390,10 @@ def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:
 
 
 def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
-    """Return the smallest base offset (3,), m, with which the arm reaches all samples, or None."""
+    """Return the smallest displacement (3,), in m, of a base with which all samples are reachable.
+
+    Return None if no tested displacement is sufficient.
+    """
     other: Side = "right" if side == "left" else "left"
     reach = layout.left if side == "left" else layout.right
     bad = np.flatnonzero(~reach.reachable)
@@ -397,7 +424,7 @@ def _find_base_offset(layout: Layout, side: Side) -> Floats | None:
 
 
 def make_layout_result(layout: Layout) -> dict[str, Any]:
-    """Return the result of `doctor scene --json`."""
+    """Return the result of `flexsheet doctor scene --json`."""
     return {
         "scene": layout.scene.name,
         "reachable": layout.reachable,
@@ -425,7 +452,13 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
 
 
 def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> dict[str, Any]:
-    """Return the fraction of samples that violate a limit, and the sample nearest to the front."""
+    """Return the fraction of samples for which a limit is the most violated one.
+
+    The result also contains the sample with the smallest tilt among them.
+
+    number: index of the limit.
+    binding: index (n,) of the most violated limit of each sample; -1 for reachable samples.
+    """
     where = np.flatnonzero(binding == number)
     samples = layout.samples
     order = np.lexsort((samples.depth_m[where], np.round(np.abs(samples.tilt_rad[where]), 6)))
@@ -440,7 +473,10 @@ def _summarize_limit(layout: Layout, number: int, binding: NDArray[np.intp]) -> 
 
 
 def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, float | str]]:
-    """Return the minimum margin of each kind of limit, with the limit, tilt and push depth."""
+    """Return the minimum margin of each kind of limit, and the sample that has this margin.
+
+    Each value contains the limit, the margin with its unit, the tilt (rad) and the push depth (m).
+    """
     kinds = {
         "joint range": (RANGES, "rad"),
         "shoulder singularity": (("shoulder singularity",), "m"),
@@ -470,7 +506,12 @@ def find_min_margins(layout: Layout, reach: ArmReach) -> dict[str, dict[str, flo
 
 
 def draw_layout(layout: Layout, path: Path) -> None:
-    """Draw the violated limits and the possible speeds of both arms over tilt and push depth."""
+    """Draw the limits that each arm violates, and the finger speeds that it can follow.
+
+    The axes of the image are the tilt of the contact and the push depth.
+
+    path: image file to write.
+    """
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
@@ -502,15 +543,16 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
 
 def _binding_limits(reach: ArmReach) -> NDArray[np.intp]:
-    """Return the index (n,) of the limit that each sample violates most; -1 if it is reached."""
+    """Return the index (n,) of the limit that each sample violates most; -1 if it is reachable."""
     return np.where(reach.reachable, -1, reach.binding)
 
 
 @dataclass(frozen=True, slots=True)
 class _TiltDepthGrid:
-    """A grid of cells over tilt and depth.
+    """A grid over the tilt and push depth of samples.
 
-    rows, columns: cell indices (n,) of the samples. frame: plot options.
+    rows, columns: indices (n,) of the cell of each sample.
+    frame: options of the plot.
     """
 
     rows: NDArray[np.intp]
@@ -530,16 +572,19 @@ class _TiltDepthGrid:
         return cls(rows, np.clip(columns, 0, TILTS - 1), frame)
 
     def minimum(self, values: Floats) -> Floats:
-        """Return the minimum of the samples' values in each cell; NaN for an empty cell."""
+        """Return the minimum (DEPTHS, TILTS) of values (n,) in each cell; NaN for an empty cell."""
         cells = np.full((DEPTHS, TILTS), np.inf)
         finite = np.isfinite(values)
         np.minimum.at(cells, (self.rows[finite], self.columns[finite]), values[finite])
         return np.where(np.isfinite(cells), cells, np.nan)
 
     def colored(self, binding: NDArray[np.intp], colors: dict[int, str]) -> Floats:
-        """Return the colour (DEPTHS, TILTS, 3) of the most frequent limit in each cell.
+        """Return the colour (DEPTHS, TILTS, 3) of the limit violated most often in each cell.
 
         The colour is paler if fewer samples violate a limit.
+
+        binding: index (n,) of the most violated limit of each sample; -1 for reachable samples.
+        colors: colour of each limit, by index.
         """
         from matplotlib.colors import to_rgb
 

@@ -1,6 +1,7 @@
 """Check whether OpenGL works without a display.
 
-This module imports only the standard library, because the set-up of a computer uses it first.
+This module imports only the standard library, because it is used before the other libraries are
+installed.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ OPENGL_REMEDY = f"on Debian: sudo apt-get install -y {' '.join(OPENGL_PACKAGES)}
 
 
 def find_opengl_problem() -> str | None:
-    """Return why no headless OpenGL context can be created, or None if a context can be created.
+    """Return why no OpenGL context can be created without a display, or None if it can be created.
 
-    Another process tries to create the context, because a driver that has failed once fails again
+    A separate process tries to create the context. A driver that has failed once would fail again
     in the same process.
     """
     code = "import moderngl; moderngl.create_standalone_context(backend='egl').release()"

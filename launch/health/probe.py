@@ -1,7 +1,7 @@
-"""Probe every host of a graph over the network, from one of its hosts.
+"""Read the state of every host of a graph over the network, from one of its hosts.
 
 A running launcher publishes the state of its host on the topics `host`, `status`, `clocks`, and the
-topics of its arms. If nothing arrives from another host, the probe finds the step at which the
+topics of its arms. If no message arrives from another host, the probe finds the step at which the
 connection fails.
 """
 
@@ -30,40 +30,49 @@ from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
 
 CONNECT_S = 4.0
-"""The time limit of a connection; the kernel needs 3 s to report that no host has the address."""
+"""The time limit (s) of a connection attempt.
+
+The kernel needs 3 s to report that no host has the address.
+"""
 
 HANDSHAKE_S = 3.0
 MIN_LISTEN_S = 1.2
-"""The minimum listening time, because nodes publish their message rates once per second."""
+"""The minimum time (s) for which messages are read.
+
+Nodes publish their message rates once per second.
+"""
 
 POLL_PERIOD_S = 0.02
 SSH_PORT = 22
-"""The port whose reply, open or closed, shows that a host is on."""
+"""The port that is tried to find out whether a host is on.
+
+An accepted or a refused connection to this port shows that the host is on.
+"""
 
 
 class Reachability(StrEnum):
-    """The outcome of an attempt to connect to a host's launcher."""
+    """The result of an attempt to connect to the launcher of a host."""
 
     RESPONDING = "responding"
     LOCAL = "local"
-    """The host is this computer, and no graph runs here."""
+    """The host is this computer, and no graph is running here."""
     NO_ROUTE = "no_route"
     UNREACHABLE = "unreachable"
-    """No host has this address."""
+    """No host has the address in the launch file."""
     NO_REPLY = "no_reply"
     BLOCKED = "blocked"
     """The host is on, but a firewall drops packets to the port."""
     CLOSED = "closed"
     HANDSHAKE_TIMEOUT = "handshake_timeout"
     KEY_MISMATCH = "key_mismatch"
-    """The host does not have the key that the launch file gives for it."""
+    """The key of the host differs from its key in the launch file of this computer."""
     KEY_REJECTED = "key_rejected"
-    """The host does not accept this computer's key."""
+    """The host rejects the key of this computer."""
     UNENCRYPTED = "unencrypted"
     NO_RESPONSE = "no_response"
-    """The handshake succeeded, but no host status arrived."""
+    """The host completed the handshake, but no status message of the host arrived."""
     OWN_KEY_INVALID = "own_key_invalid"
-    """The host was not probed, because this computer's key cannot be used."""
+    """The connection was not attempted further, because the key of this computer cannot be used."""
 
 
 HANDSHAKES: dict[int, Reachability] = {
@@ -76,10 +85,10 @@ HANDSHAKES: dict[int, Reachability] = {
 
 @dataclass(slots=True)
 class HostProbe:
-    """The messages that one host published, and the problems of their reception.
+    """The messages that were received from one host, and the problems during their reception.
 
-    refused: reasons why messages were not accepted. failed_handshakes: connections that were
-    rejected after an earlier connection with a valid key.
+    refused: reasons why messages were rejected.
+    failed_handshakes: texts about connections that failed after an earlier successful connection.
     """
 
     host: str
@@ -96,10 +105,12 @@ class HostProbe:
 async def probe_all(
     plan: ResolvedGraph, *, here: str, keys: KeyRing | None, run: Run | None, timeout_s: float
 ) -> dict[str, HostProbe]:
-    """Probe all hosts concurrently and return the results by host.
+    """Read the state of all hosts of a graph concurrently, and return the results by host name.
 
-    here: name of this host. keys: key ring of this host; None if no key can be used. run: run of
-    the graph on this host; None if no graph runs here.
+    here: name of this host.
+    keys: key ring of this host; None if no key can be used.
+    run: running graph on this host; None if no graph runs here.
+    timeout_s: maximum time for which messages of a host are read.
     """
     probes = await asyncio.gather(
         *(
@@ -146,7 +157,10 @@ async def _probe_remote(
 
 
 async def probe_port(address: str, port: int) -> Reachability:
-    """Return the step at which a TCP connection to a port fails; RESPONDING if it succeeds."""
+    """Try to connect to a TCP port, and return why the connection failed.
+
+    Return RESPONDING if the connection succeeded.
+    """
     number = await _connect(address, port)
     if number == 0:
         return Reachability.RESPONDING
@@ -160,7 +174,7 @@ async def probe_port(address: str, port: int) -> Reachability:
 
 
 async def _connect(address: str, port: int) -> int:
-    """Return the error number of an attempt to connect by TCP; 0 means success."""
+    """Try to connect to a TCP port. Return the error number, or 0 after success."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
@@ -202,9 +216,12 @@ async def _listen(
     find_source: Callable[[Writer], Source],
     timeout_s: float,
 ) -> None:
-    """Read the messages of a host until all expected messages have arrived or `timeout_s` is over.
+    """Read messages of a host until all expected messages have arrived or the time is over.
 
-    The reachability of the probe becomes NO_RESPONSE if no host status arrives.
+    If no status message of the host arrives, the reachability of the probe becomes NO_RESPONSE.
+
+    find_source: function that returns the endpoint of a publisher.
+    timeout_s: maximum time for which messages are read.
     """
 
     def on_host(status: HostStatus, header: Header) -> None:

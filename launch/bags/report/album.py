@@ -1,4 +1,7 @@
-"""Select images of a session for the report: some at regular intervals, and those at bookmarks."""
+"""Select images of a recorded session for the report.
+
+Images are selected at regular intervals and at bookmarks.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ import numpy as np
 from flexsheet.nodes.arrays import Image
 
 MAX_BOOKMARK_SHOTS = 40
-"""The maximum number of stored shots (image sets) at bookmarks. Further shots are only counted."""
+"""The maximum number of stored image sets at bookmarks. Further image sets are only counted."""
 
 MAX_WIDTH_PX = 420
 QUALITY = 82
@@ -19,9 +22,11 @@ QUALITY = 82
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """A set of JPEG images taken at one time. Each image has a title.
+    """A set of JPEG images that were taken at one time.
 
-    marked: label of a bookmark; empty if there is none.
+    seconds: time since the start of the bag.
+    pictures: (title, JPEG data) of each image.
+    marked: label of a bookmark at this time; empty if there is none.
     """
 
     seconds: float
@@ -32,10 +37,12 @@ class Shot:
 
 @dataclass(slots=True)
 class Album:
-    """The shots at regular intervals (at most `limit`), and the first shot after each bookmark.
+    """A selection of image sets: some at regular intervals, and the first one after each bookmark.
 
-    bookmarks: (seconds, label), in the order of time. count: number of all shots in the session.
-        left_out: number of shots at bookmarks that are not stored.
+    limit: maximum number of image sets at regular intervals.
+    bookmarks: (time in s, label) of each bookmark, in the order of time.
+    count: number of all image sets in the session.
+    left_out: number of image sets at bookmarks that are not stored.
     """
 
     limit: int
@@ -47,7 +54,11 @@ class Album:
     _at_bookmarks: list[Shot] = field(default_factory=list)
 
     def add(self, seconds: float, title: str, pictures: Sequence[tuple[str, Image]]) -> None:
-        """Add a shot. Its images are encoded and stored only if it is selected."""
+        """Add a set of images. The images are encoded and stored only if the set is selected.
+
+        seconds: time since the start of the bag.
+        pictures: (title, image) of each image.
+        """
         passed = [label for at_s, label in self.bookmarks if at_s <= seconds]
         self.bookmarks = self.bookmarks[len(passed) :]
         if passed and len(self._at_bookmarks) >= MAX_BOOKMARK_SHOTS:
@@ -62,7 +73,7 @@ class Album:
         self.count += 1
 
     def shots(self) -> list[Shot]:
-        """Return the selected shots in the order of their times."""
+        """Return the selected image sets in the order of time."""
         return sorted((*self._regular, *self._at_bookmarks), key=lambda shot: shot.seconds)
 
 
@@ -73,7 +84,10 @@ def _shot(
 
 
 def jpeg(image: Image) -> bytes:
-    """Encode a grey (h, w) or RGB (h, w, 3) image as JPEG, at most `MAX_WIDTH_PX` wide."""
+    """Encode a grey (h, w) or RGB (h, w, 3) image as JPEG.
+
+    An image that is wider than `MAX_WIDTH_PX` is reduced to this width.
+    """
     height, width = image.shape[:2]
     if width > MAX_WIDTH_PX:
         size = (MAX_WIDTH_PX, max(round(height * MAX_WIDTH_PX / width), 1))

@@ -1,4 +1,4 @@
-"""Draw the charts of the bag report as SVG for light and dark pages, with descriptions."""
+"""Draw the charts of the bag report as SVG, with descriptions, for light and dark pages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STATE_COLOURS = {
 }  # fmt: skip
 HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop": "xx",
            "engaged": "xx", "lost": "xx", "disconnected": "..", "stopping": ".."}  # fmt: skip
-"""The hatches that distinguish states for readers who cannot see the colours."""
+"""The hatch pattern of each state, for readers who cannot distinguish the colours."""
 
 MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
@@ -46,7 +46,12 @@ EVENTS = (
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """A chart. svg: image. text: description of the image. caption: explanation for readers."""
+    """A chart of the report.
+
+    svg: image of the chart.
+    text: description of the image for readers who cannot see it.
+    caption: explanation below the chart.
+    """
 
     svg: str
     text: str
@@ -54,7 +59,7 @@ class Chart:
 
 
 def draw_charts(session: Session) -> dict[str, Chart]:
-    """Draw all charts for which the bag has data, and return them by name."""
+    """Draw all charts for which the bag contains data, and return them by name."""
     makers: dict[str, Callable[[Session], Chart | None]] = {
         "timeline": timeline,
         "latency": latencies,
@@ -80,14 +85,17 @@ def _figure(rows: int, columns: int, height_in: float) -> tuple[Figure, NDArray[
 
 
 def _over_time(axes: Axes, session: Session) -> None:
-    """Limit the x axis to the duration of the bag. The lines must be drawn before."""
+    """Limit the time axis to the duration of the bag, and add a grid.
+
+    The lines of the chart must be drawn before this call.
+    """
     mark_isolated(axes)
     axes.set_xlim(0.0, session.info.duration_s)
     axes.grid(visible=True, alpha=0.2)
 
 
 def mark_isolated(axes: Axes) -> None:
-    """Add markers to values between NaNs, which a line would not show."""
+    """Add a marker to each value between two NaNs, because a line does not show such a value."""
     for line in axes.lines:
         known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
         has_neighbour = np.zeros_like(known)
@@ -100,7 +108,10 @@ def mark_isolated(axes: Axes) -> None:
 
 
 def timeline(session: Session) -> Chart | None:
-    """Draw the states of sheet, arms and tracker as strips along time, with events below them."""
+    """Draw the states of sheet, arms and finger tracker over time as coloured bars, with events.
+
+    Return None if the bag contains no states and no events.
+    """
     strips = [
         (name, states)
         for name, states in (
@@ -163,7 +174,10 @@ def timeline(session: Session) -> Chart | None:
 
 
 def sort_by_duration(states: States) -> list[tuple[str, float]]:
-    """Return the states and their total durations (s) in the order of decreasing duration."""
+    """Return (state, total duration in s) for each state, with the longest duration first.
+
+    States of less than 0.05 s are omitted.
+    """
     lasted = [(state, seconds) for state, seconds in states.seconds.items() if seconds > 0.05]
     return sorted(lasted, key=lambda one: -one[1])
 
@@ -171,9 +185,9 @@ def sort_by_duration(states: States) -> list[tuple[str, float]]:
 def find_intervals(
     states: States, grid: Grid, *, lasting: bool = False
 ) -> Iterator[tuple[str, float, float]]:
-    """Yield the intervals of constant state: (state, start in s, end in s).
+    """Yield each interval of constant state as (state, start in s, end in s).
 
-    lasting: whether a state continues until the next state, also through gaps without messages.
+    lasting: whether a state continues until the next state, even if no messages arrive.
     """
     width_s = grid.duration_s / grid.count
     # Bridge short gaps, which occur if messages are rarer than intervals of the grid.
@@ -195,7 +209,10 @@ def find_intervals(
 
 
 def latencies(session: Session) -> Chart | None:
-    """Draw the median and 99 % quantile of the latency from exposure to each event against time."""
+    """Draw the latency from exposure to each event against time, as median and 99 % quantile.
+
+    Return None if the bag contains no latencies.
+    """
     events = [event for event in EVENTS if event in session.latencies]
     if not events:
         return None
@@ -234,7 +251,10 @@ def latencies(session: Session) -> Chart | None:
 
 
 def paths(session: Session) -> Chart | None:
-    """Draw the paths of the finger and of the sheet's centre, from the front and from the side."""
+    """Draw the paths of the finger and of the sheet's centre, from the front and from the side.
+
+    Return None if the bag contains no positions.
+    """
     finger, true = 1e3 * session.finger_path.points, 1e3 * session.true_path.points
     sheet = 1e3 * session.sheet_path.points
     known = [points for points in (finger, true, sheet) if np.isfinite(points).any()]
@@ -273,7 +293,10 @@ def paths(session: Session) -> Chart | None:
 
 
 def sheet_errors(session: Session) -> Chart | None:
-    """Draw the maximum position and angle errors of the sheet in contact, against time."""
+    """Draw the maximum position and angle errors of the sheet during contact, against time.
+
+    Return None if the bag contains no errors.
+    """
     errors = session.errors
     shown = [
         (name, label)
@@ -317,7 +340,10 @@ def sheet_errors(session: Session) -> Chart | None:
 
 
 def draw_joint_speeds(session: Session) -> Chart | None:
-    """Draw the maximum speed of each joint in percent of its limit, against time."""
+    """Draw the maximum speed of each joint against time, in percent of the speed limit.
+
+    Return None if the bag contains no joint speeds.
+    """
     arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
     if not arms:
         return None
@@ -353,7 +379,10 @@ def draw_joint_speeds(session: Session) -> Chart | None:
 
 
 def forces(session: Session) -> Chart | None:
-    """Draw the forces at the sheet's edges, the object's force and the push depth against time."""
+    """Draw the sheet's edge forces, the object's force and the push depth against time.
+
+    Return None if the bag contains no edge forces.
+    """
     arms = {side: arm for side, arm in session.arms.items() if arm.edge_force.overall()}
     if not arms:
         return None

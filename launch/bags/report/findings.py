@@ -11,24 +11,24 @@ from flexsheet.launch.experiments.stroke import ARM_EVENTS
 Gravity = Literal["bad", "doubtful"]
 
 SLOW_RATIO = 0.5
-"""The fraction of a topic's minimum rate below which the topic counts as slow."""
+"""The fraction of a topic's minimum rate below which the rate is reported as a problem."""
 
 MAX_UNSEEN_RATIO = 0.05
-"""The maximum fraction of images without a valid fingertip."""
+"""The maximum fraction of images without a valid fingertip that is not reported as a problem."""
 
 MAX_LIMIT_RATIO = 1.0
-"""The ratio of a value to its limit above which the value is reported as a problem."""
+"""The maximum ratio of a value to its limit that is not reported as a problem."""
 
 ROUNDING = 1.02
-"""The factor by which measured speeds and forces may exceed their limits, due to rounding."""
+"""The factor by which measured values may exceed their limits because of rounding."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionFinding:
-    """A problem that was found in a session.
+    """A problem that was found in a recorded session.
 
-    gravity: "bad" for a failure, "doubtful" for something to check. section: id of the page section
-        with details.
+    gravity: "bad" for a failure, "doubtful" for a possible problem that the user should check.
+    section: id of the section of the page with details.
     """
 
     gravity: Gravity
@@ -37,7 +37,10 @@ class SessionFinding:
 
 
 BRIEFLY_BUSY_FRACTION = 0.05
-"""The maximum fraction of time in which an overloaded computer is not reported as a failure."""
+"""The maximum fraction of time for which an overload counts as a possible problem only.
+
+A longer overload, or one in which an arm stopped, is reported as a failure.
+"""
 
 CHECKED = (
     "overload of the computers; "
@@ -50,9 +53,12 @@ CHECKED = (
 
 
 def find_problems(numbers: dict[str, Any]) -> list[SessionFinding]:
-    """Return all problems in the numbers of a session.
+    """Return all problems in a recorded session.
 
-    Overload is first, because it causes most other problems. Failures follow.
+    An overload of a computer is first, because it causes most other problems. Failures are next,
+    and possible problems are last.
+
+    numbers: result of `compute_numbers`.
     """
     found = [
         *_check_bag(numbers),
@@ -71,7 +77,10 @@ def _times(count: int) -> str:
 
 
 def _check_load(numbers: dict[str, Any], others: list[SessionFinding]) -> Iterator[SessionFinding]:
-    """Report overloaded computers. others: other problems, which overload may have caused."""
+    """Yield a problem for each computer that was overloaded.
+
+    others: other problems of the session, which the overload may have caused.
+    """
     stopped = numbers["events"]["counts"].get("arm", 0)
     for host in numbers["hosts"].values():
         if not host["busy_fraction"]:

@@ -1,4 +1,4 @@
-"""Measure how well the sheet followed the simulated finger along one path."""
+"""Measure how accurately the sheet followed the simulated finger along one path."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from flexsheet.launch.bags.report.series import Grid, RunningMoments, Spread
 from flexsheet.nodes.arrays import Floats
 
 MAX_CONTACT_HEIGHT_M = 0.001
-"""The maximum height of the true finger above the undeformed object that counts as contact.
+"""The maximum height (m) of the finger above the undeformed object that counts as contact.
 
-The pad of a fingertip deforms by about this much.
+The pad of a fingertip deforms by about this height.
 """
 
 
 class Sizes:
-    """The mean, 95 % quantile (accurate to 2.3 %) and maximum of positive values.
+    """An accumulator of the mean, the 95 % quantile and the maximum of positive values.
 
-    The values are not stored.
+    The quantile is accurate to 2.3 %, because the values themselves are not stored.
     """
 
     def __init__(self) -> None:
@@ -31,9 +31,9 @@ class Sizes:
             self._spread.add(0, value)
 
     def summary(self, scale: float) -> dict[str, float] | None:
-        """Return mean, 95 % quantile and maximum, multiplied by `scale`.
+        """Return the mean, the 95 % quantile and the maximum, each multiplied by `scale`.
 
-        Return None if there are no values.
+        Return None if no values were added.
         """
         found, p95 = self._moments.summary(scale), self._spread.quantile_s(0.95)
         if found is None or p95 is None:
@@ -44,7 +44,8 @@ class Sizes:
 class FollowedFinger:
     """An accumulator of the errors of the true sheet relative to the true finger.
 
-    A drop-out is an interval in which the arms do not follow, and which includes contact.
+    It also counts drop-outs. A drop-out is an interval in which the arms do not follow the finger,
+    at least partly during contact.
     """
 
     def __init__(self) -> None:
@@ -56,10 +57,12 @@ class FollowedFinger:
     def add(
         self, delta_d_m: Floats, delta_theta_rad: Floats, heights_m: Floats, following: Any
     ) -> None:
-        """Add the errors (n,) at consecutive exposures.
+        """Add the errors of the sheet at n consecutive exposures.
 
-        heights_m (n,): height of the true finger above the undeformed object, negative below it.
-        following (n,): whether both arms follow a sheet target that follows the finger.
+        delta_d_m: position errors (n,).
+        delta_theta_rad: angle errors (n,).
+        heights_m: heights (n,) of the true finger above the undeformed object, negative below it.
+        following: whether both arms follow the finger (n,).
         """
         contact = heights_m <= MAX_CONTACT_HEIGHT_M
         self.exposures += len(contact)
@@ -75,10 +78,12 @@ class FollowedFinger:
                 self.drop_outs += 1
 
     def figures(self) -> dict[str, Any]:
-        """Return a summary of the errors. Values that require contact are None without contact.
+        """Return a summary of the errors and drop-outs.
 
-        contact_ratio: fraction of the exposures that are in contact. following_ratio: fraction of
-            the exposures in contact at which the arms follow.
+        contact_ratio: fraction of the exposures that are in contact.
+        following_ratio: fraction of the exposures in contact at which the arms follow the finger.
+
+        Values that require contact are None if there was no contact.
         """
         return {
             "contact_ratio": self._in_contact / self.exposures if self.exposures else None,

@@ -1,4 +1,4 @@
-"""Compute all numbers of the bag report, for `bag report --json` and the HTML page."""
+"""Compute all numbers of the bag report, for the HTML page and for `bag report --json`."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ from flexsheet.messages.topics import TOPICS
 DEGREES = float(np.degrees(1.0))
 
 METHODS = ("method", *Methods.model_fields)
-"""The names of node parameters that select a method."""
+"""The names of the node parameters that select a method."""
 
 
 def compute_numbers(session: Session) -> dict[str, Any]:
-    """Compute all numbers of the report. A number is None if the bag lacks the data."""
+    """Compute all numbers of the bag report.
+
+    A number is None if the bag does not contain the data for it.
+    """
     info, scene = session.info, session.scene
     return {
         "bag": {
@@ -205,9 +208,10 @@ def _node(session: Session, name: str, summary: NodeSummary) -> dict[str, Any]:
 
 
 def describe_methods(parameters: Mapping[str, Any], scene: Scene | None) -> str | None:
-    """Describe the methods that a node uses, or return None if it has no such parameter.
+    """Return a text with the methods that a node uses.
 
-    The value "auto" means the method that the scene selects.
+    Return None if the node has no parameter that selects a method. The parameter value "auto"
+    selects the method in the scene.
     """
     by_scene = scene.methods.model_dump() if scene is not None else {}
     by_scene["method"] = (by_scene.get("soft_body") or {}).get("method")

@@ -1,4 +1,4 @@
-"""Render the bag report as one self-contained HTML file for screen and print."""
+"""Create the bag report as one self-contained HTML file for screen and print."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ from flexsheet.launch.bags.report.numbers import compute_numbers
 from flexsheet.launch.bags.report.session import Session
 
 MARK = "<!-- made by: flexsheet bag report -->"
-"""The comment that marks a file as a report, which a later report may overwrite."""
+"""The comment by which a report is recognized.
+
+A file without this comment is not overwritten by a report.
+"""
 
 COLOURS = {
     "light": {"ground": "#ffffff", "text": "#1f2328", "quiet": "#57606a", "line": "#d0d7de",
@@ -40,7 +43,7 @@ SECTIONS = {
 
 EVENTS_SHOWN = 60
 BRIEF_S = 0.02
-"""The minimum duration of states in the table of the page. Chart and --json contain all states."""
+"""The minimum duration (s) of a state that the page lists. Chart and --json contain all states."""
 
 _CSS = """
 * { box-sizing: border-box; }
@@ -88,7 +91,7 @@ pre { background: var(--panel); padding: .75rem; overflow-x: auto; }
 
 
 def render_page(session: Session) -> str:
-    """Render the report of a recorded session as HTML text."""
+    """Return the report of a recorded session as HTML text."""
     numbers, charts = compute_numbers(session), draw_charts(session)
     name = Path(numbers["bag"]["path"]).name
     body = [
@@ -451,7 +454,10 @@ def _image(title: str, shot: Shot, name: str, jpeg: bytes) -> str:
 
 
 def figure(chart: Chart | None, missing: str) -> str:
-    """Render a chart with its caption. If there is no chart, render the text `missing`."""
+    """Return the HTML of a chart with its caption.
+
+    If there is no chart, return the HTML of the text `missing`.
+    """
     if chart is None:
         return _missing(missing)
     data = b64encode(chart.svg.encode()).decode()
@@ -463,7 +469,10 @@ def figure(chart: Chart | None, missing: str) -> str:
 
 
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Render a table. The first column contains row headers, and numbers have three digits."""
+    """Return the HTML of a table.
+
+    The first column contains the row headers. Numbers are rounded to three digits.
+    """
     body = []
     for first, *rest in rows:
         cells = "".join(_cell(value) for value in rest)
@@ -519,7 +528,7 @@ def _missing(text: str) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Format a duration (s) for display, such as "3.2 s", "4 min 10 s" or "2 h 5 min"."""
+    """Return a duration as text, such as "3.2 s", "4 min 10 s" or "2 h 5 min"."""
     if seconds < 60.0:
         return f"{seconds:.3g} s"
     minutes, rest = divmod(round(seconds), 60)

@@ -1,4 +1,4 @@
-"""Summarize measured quantities in equal intervals of a bag's duration.
+"""Summarize measured quantities in equal time intervals of a bag.
 
 The required memory does not depend on the duration of the bag.
 """
@@ -15,34 +15,40 @@ from numpy.typing import NDArray
 from flexsheet.nodes.arrays import Floats
 
 MIN_DURATION_S, MAX_DURATION_S, CELLS_PER_DECADE = 1e-5, 1e2, 100
-"""The range and resolution of the histogram in `Spread`. A bin is 2.3 % wide."""
+"""The minimum and maximum duration (s) in the histogram of `Spread`, and its bins per decade.
+
+Each bin is 2.3 % wide.
+"""
 
 CELLS = 7 * CELLS_PER_DECADE
 MAX_STATE_AGE_S = 0.5
-"""The maximum time for which a state is assumed to last without another message."""
+"""The maximum time (s) for which a state is assumed to last without a new message."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A division of a bag's duration into `count` equal intervals."""
+    """A division of the duration of a bag into `count` equal intervals."""
 
     start_ns: int
     duration_s: float
     count: int
 
     def index(self, at_ns: int) -> int:
-        """Return the index of the interval that contains a time, or of the nearest interval."""
+        """Return the index of the interval that contains a time.
+
+        If the time is outside the bag, return the index of the nearest interval.
+        """
         fraction = (at_ns - self.start_ns) * 1e-9 / max(self.duration_s, 1e-9)
         return min(max(int(fraction * self.count), 0), self.count - 1)
 
     def seconds(self) -> Floats:
-        """Return the centre times (count,) of the intervals, s since the start of the bag."""
+        """Return the centres (count,) of the intervals, in s since the start of the bag."""
         middles = np.arange(self.count, dtype=np.float64) + 0.5
         return np.asarray(middles * (self.duration_s / self.count))
 
 
 class Range:
-    """The minimum and maximum of a quantity in each interval; NaN if the interval has no values."""
+    """The minimum and maximum of a quantity in each interval, or NaN without values."""
 
     def __init__(self, grid: Grid) -> None:
         self.minimum = np.full(grid.count, np.nan)
@@ -56,21 +62,27 @@ class Range:
             self.maximum[index] = value
 
     def overall(self) -> tuple[float, float] | None:
-        """Return the minimum and maximum over all intervals, or None if there are no values."""
+        """Return the minimum and maximum over all intervals, or None without values."""
         if np.isnan(self.maximum).all():
             return None
         return float(np.nanmin(self.minimum)), float(np.nanmax(self.maximum))
 
 
 class Spread:
-    """The distribution of durations (such as latencies) in each interval, as histograms."""
+    """The distribution of durations, such as latencies, in each interval.
+
+    Each distribution is stored as a histogram.
+    """
 
     def __init__(self, grid: Grid) -> None:
         self.counts: NDArray[np.int32] = np.zeros((grid.count, CELLS), np.int32)
         self.longest_s = 0.0
 
     def add(self, index: int, duration_s: float) -> None:
-        """Add a duration (s) to the interval `index`. It counts as at least `MIN_DURATION_S`."""
+        """Add a duration (s) to the histogram of the interval `index`.
+
+        A duration below `MIN_DURATION_S` is counted in the first bin.
+        """
         self.longest_s = max(self.longest_s, duration_s)
         cell = CELLS_PER_DECADE * log10(max(duration_s, MIN_DURATION_S) / MIN_DURATION_S)
         self.counts[index, min(int(cell), CELLS - 1)] += 1
@@ -80,20 +92,31 @@ class Spread:
         return int(self.counts.sum())
 
     def quantile_s(self, fraction: float) -> float | None:
-        """Return a quantile of all durations, accurate to 2.3 %; None without durations."""
+        """Return a quantile (s) of all durations, accurate to 2.3 %.
+
+        Return None if no durations were added.
+
+        fraction: fraction of the durations that are below the quantile.
+        """
         found = _quantiles(self.counts.sum(axis=0, keepdims=True), fraction)[0]
         return None if np.isnan(found) else float(min(found, self.longest_s))
 
     def quantiles_s(self, fraction: float) -> Floats:
         """Return a quantile (count,), in s, of the durations in each interval.
 
-        The quantile is NaN for intervals that have no durations.
+        The quantile is NaN for an interval without durations.
+
+        fraction: fraction of the durations that are below the quantile.
         """
         return _quantiles(self.counts, fraction)
 
 
 def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
-    """Return quantiles (n,), s, of n histograms, given as rows (n, CELLS) of counts."""
+    """Return a quantile (n,), in s, of each of n histograms.
+
+    counts: number of durations in each bin, as rows (n, CELLS).
+    fraction: fraction of the durations that are below the quantile.
+    """
     sums = np.cumsum(counts, axis=1)
     rank = fraction * sums[:, -1:]
     cell = np.argmax(sums >= np.maximum(rank, 1), axis=1)
@@ -105,7 +128,7 @@ def _quantiles(counts: NDArray[np.int32], fraction: float) -> Floats:
 
 
 class PointSeries:
-    """The last position (count, 3) of a moving point in each interval; NaN if there is none."""
+    """The last known position (count, 3), in m, of a point in each interval; NaN if unknown."""
 
     def __init__(self, grid: Grid) -> None:
         self.points = np.full((grid.count, 3), np.nan)
@@ -115,7 +138,7 @@ class PointSeries:
 
 
 class States:
-    """The most severe state of a device in each interval, and the total time in each state.
+    """The most severe state of a device in each interval, and the total duration of each state.
 
     order: expected states, from the least to the most severe.
     """
@@ -130,7 +153,11 @@ class States:
         self._since_ns = 0
 
     def add(self, index: int, at_ns: int, state: str) -> bool:
-        """Add the state reported at `at_ns`. Return whether it differs from the previous state."""
+        """Add a reported state, and return whether it differs from the previous state.
+
+        index: index of the interval.
+        at_ns: time of the report, ns.
+        """
         if state not in self.seconds:
             self.names.append(state)
             self.seconds[state] = 0.0
@@ -145,7 +172,10 @@ class States:
 
 @dataclass(slots=True)
 class RunningMoments:
-    """The mean, standard deviation and maximum of values that are not stored."""
+    """An accumulator of the mean, the standard deviation and the maximum of values.
+
+    The values themselves are not stored.
+    """
 
     count: int = 0
     total: float = 0.0
@@ -160,9 +190,9 @@ class RunningMoments:
             self.maximum = max(self.maximum, float(values.max()))
 
     def summary(self, scale: float) -> dict[str, float] | None:
-        """Return mean, standard deviation and maximum, multiplied by `scale`.
+        """Return the mean, the standard deviation and the maximum, each multiplied by `scale`.
 
-        Return None if there are no values.
+        Return None if no values were added.
         """
         if not self.count:
             return None
@@ -173,7 +203,7 @@ class RunningMoments:
 
 @dataclass(slots=True)
 class Events:
-    """The first `limit` events of each kind in the order of time, and the number of all events."""
+    """A list of the first `limit` events of each kind, and the number of all events per kind."""
 
     limit: int = 100
     stored: list[tuple[float, str, str]] = field(default_factory=list)

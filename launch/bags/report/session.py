@@ -1,4 +1,4 @@
-"""Read a bag once, from start to end, and summarize it for `flexsheet bag report`."""
+"""Read a bag once, from start to end, and compute a summary for `flexsheet bag report`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ STEREO_SHOTS, EYE_SHOTS, FRAME_SHOTS = 6, 12, 6
 MIN_EARLIER_UPTIME_S = 10.0
 SILENT_PERIODS, MIN_SILENCE_S = 10.0, 0.5
 SPEED_OVER_NS = 25_000_000
-"""The interval over which speeds are averaged, because timestamps are irregular."""
+"""The minimum interval (ns) over which speeds are averaged, because timestamps are irregular."""
 
 PHASES = ("wait", "approach", "contact", "hold")
 MODES = (
@@ -67,24 +67,28 @@ MODES = (
 FINGER_STATES = ("tracking", "acquiring", "coasting", "lost")
 FAULTY = ("fault", "estop", "disconnected", "stopping")
 FAULTY_AT_END = ("disconnected", "stopping")
-"""The faulty modes that an arm also enters at the end of a session."""
+"""The arm modes that indicate a fault, except at the end of a session.
+
+At the end of a session, an arm enters these modes because it is shut down.
+"""
 
 MOVING = ("follow", "hold", "relax")
 MAX_END_S = 2.0
-"""The maximum time (s) between the shutdown of an arm's controller and of its bridge.
+"""The maximum time (s) from the loss of an arm to the shutdown of its node at a session's end.
 
-If an arm is lost at most this time before the shutdown, and does not move again, the loss is
-reported as the end of the session.
+An arm that is lost within this time and does not move again has not failed. Its loss is reported as
+the end of the session.
 """
 
 
 @dataclass(slots=True)
 class Flow:
-    """The regularity of a topic's messages, and the number of missing messages.
+    """The regularity of the messages of a topic, and the number of missing messages.
 
-    age: distribution of the time from the source timestamp to the recording. lost: number of
-        missing sequence numbers. silences: number of intervals without messages that are too long.
-        longest_silence_s: duration of the longest interval.
+    age: distribution of the time from the source timestamp to the recording.
+    lost: number of missing sequence numbers.
+    silences: number of intervals without messages that are longer than permitted.
+    longest_silence_s: duration of the longest interval without messages.
     """
 
     age: Spread
@@ -98,10 +102,10 @@ class Flow:
 
 @dataclass(slots=True)
 class PortTotals:
-    """The numbers of messages that the readers of a topic skipped, lost and refused.
+    """The numbers of messages that the subscribers of a topic skipped, lost and refused.
 
-    Counters of all starts of a node are summed. Counts from before the start of the bag are
-    subtracted.
+    If a node starts several times, its counts are summed. Messages from before the start of the bag
+    are not counted.
     """
 
     age: Spread
@@ -111,10 +115,11 @@ class PortTotals:
     refused: int = 0
 
     def add(self, node: str, epoch: int, port: PortStatus, *, started_earlier: bool) -> None:
-        """Add the counters that a reader reports.
+        """Add the message counters that a subscriber reports.
 
-        epoch: start of the reader, ns. started_earlier: whether the reader was running long before
-            the start of the bag.
+        node: name of the subscribing node.
+        epoch: start time of the node, ns.
+        started_earlier: whether the node was running long before the start of the bag.
         """
         before = self.newest.get(node)
         if before is not None and before[0] != epoch:
@@ -131,7 +136,7 @@ class PortTotals:
         self.refused += sign * port.rejected
 
     def totals(self) -> tuple[int, int, int]:
-        """Return the numbers of skipped, lost and refused messages of all readers."""
+        """Return the numbers of messages that all subscribers skipped, lost and refused."""
         now = [port for _, port in self.newest.values()]
         return (
             self.skipped + sum(port.dropped for port in now),
@@ -142,7 +147,12 @@ class PortTotals:
 
 @dataclass(slots=True)
 class HostLoad:
-    """The number of a host's status reports, of those in which it is busy, and the worst report."""
+    """A summary of the processor load of a host.
+
+    reports: number of status messages of the host.
+    busy: number of status messages in which the host is overloaded.
+    worst: status message with the highest load.
+    """
 
     reports: int = 0
     busy: int = 0
@@ -162,7 +172,7 @@ def _pressure(host: HostStatus) -> float:
 
 @dataclass(slots=True)
 class NodeSummary:
-    """A summary of a node's status messages: processor use, memory, starts and errors."""
+    """A summary of the status messages of a node: processor use, memory, starts and errors."""
 
     cpu: RunningMoments = field(default_factory=RunningMoments)
     resident_bytes: int = 0
@@ -174,9 +184,9 @@ class NodeSummary:
     note: str = ""
 
     def add(self, status: Status, epoch: int) -> bool:
-        """Add a status message of the node, and return whether it contains a new error.
+        """Add a status message, and return whether it contains a new error.
 
-        epoch: start of the node, ns.
+        epoch: start time of the node, ns.
         """
         self.cpu.add(np.array([status.cpu_ratio]))
         self.resident_bytes = max(self.resident_bytes, status.resident_bytes)
@@ -204,7 +214,11 @@ class Arm:
         self._recent: deque[tuple[int, Floats, Floats]] = deque()
 
     def add(self, arm: ArmState, source_ns: int, index: int) -> None:
-        """Add an arm state, measured at `source_ns`, to the interval `index`."""
+        """Add an arm state to the summary.
+
+        source_ns: time of the joint measurement.
+        index: index of the interval to which the state belongs.
+        """
         self.cycle.add(0, arm.cycle_s)
         if arm.edge_force_n is not None:
             self.edge_force.add(index, arm.edge_force_n)
@@ -227,7 +241,10 @@ class Arm:
 
 
 class Session:
-    """A summary of a bag. `scene` is the last recorded scene."""
+    """A summary of a recorded session.
+
+    scene: last recorded scene; None if the bag contains no scene.
+    """
 
     def __init__(
         self, reader: BagReader, info: BagInfo, bookmarks: list[tuple[float, str]]
@@ -272,15 +289,18 @@ class Session:
         self._late_before: int | None = None
 
     def joint_speeds_rad_per_s(self, side: str) -> tuple[float, ...]:
-        """Return the maximum joint speeds (6,), in rad/s, of an arm.
+        """Return the maximum joint speeds (6,), in rad/s, of an arm in the scene.
 
-        If no scene was recorded, return the speeds of an RV-1A.
+        If no scene was recorded, return the speeds of an RV-1A arm.
         """
         model = RV_1A if self.scene is None else getattr(self.scene.arms, side).model
         return tuple(model.speed_rad_per_s)
 
     def add(self, topic: str, message: Message, header: Header, log_ns: int) -> None:
-        """Add one message of the bag to the summary. log_ns: time at which it was recorded."""
+        """Add one message of the bag to the summary.
+
+        log_ns: time when the message was recorded, ns.
+        """
         self._add_flow(topic, header, log_ns)
         if isinstance(message, Clocks) and header.clock_id == self.clock_id:
             self._table.update(message)
@@ -316,7 +336,7 @@ class Session:
                 self._add_rare(message, header, log_ns)
 
     def seconds(self, at_ns: int) -> float:
-        """Return the time (s) since the start of the bag."""
+        """Convert a recorded time (ns) to the time (s) since the start of the bag."""
         return (at_ns - self.info.start_ns) * 1e-9
 
     def _add_flow(self, topic: str, header: Header, log_ns: int) -> None:
@@ -340,7 +360,7 @@ class Session:
         flow.last_ns = log_ns
 
     def finish(self) -> None:
-        """Complete the summary after the last message."""
+        """Complete the summary after all messages have been added."""
         self.errors.finish()
         for arm in self.arms.values():
             ends_s = [
@@ -353,7 +373,10 @@ class Session:
                 self.events.add(seconds, "end" if at_end else kind, text)
 
     def _list_simulators(self, bridge: str) -> list[str]:
-        """Return the nodes that simulate the arm of a bridge; empty for a real arm."""
+        """Return the names of the nodes that simulate an arm; empty for a real arm.
+
+        bridge: name of the node that controls the arm.
+        """
         nodes = {} if self.plan is None else self.plan.nodes
         if bridge not in nodes or nodes[bridge].device_address is None:
             return []
@@ -478,12 +501,15 @@ class Session:
 
 
 def add_correction(label: str, correction: str) -> str:
-    """Append the name of the image correction to an image's label, unless the label contains it."""
+    """Append the name of the image correction to the label of an image.
+
+    Return the label unchanged if it already contains the name.
+    """
     return label if correction in label else ", ".join(filter(None, (label, correction)))
 
 
 def _list_silence_limits() -> dict[str, float]:
-    """Return the interval (s) without messages from which a topic counts as silent, by topic.
+    """Return the maximum permitted interval (s) without messages, by topic.
 
     Only topics with an expected rate and a single writer have a limit.
     """
@@ -498,7 +524,10 @@ SILENCE_LIMITS_S = _list_silence_limits()
 
 
 def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -> Session:
-    """Read and summarize a complete or incomplete bag. Raises BagError if nothing can be read."""
+    """Read a complete or incomplete bag, and return a summary.
+
+    Raises BagError if no message can be read.
+    """
     reader = BagReader(bag)
     info = reader.info()
     readable = {one.name for one in info.topics if one.readable}

@@ -1,9 +1,10 @@
-"""Compute the sheet errors of Furukawa et al. 2007 (Fig. 9) at every exposure in contact.
+"""Compute the sheet errors of Furukawa et al. 2007 (Fig. 9) at every exposure during contact.
 
-The errors are defined in `launch.experiments.stroke`. They are computed in blocks, so the memory
-does not depend on the duration of the bag. If the planner lowers the sheet to render compliance,
-errors are relative to the object's surface lowered by the commanded `normal_offset_m`. For strokes
-of the experiment, errors are relative to the surface itself, as in the paper.
+The errors are defined in `launch.experiments.stroke`. They are computed in blocks, so the required
+memory does not depend on the duration of the bag. If the planner lowers the sheet to render
+compliance, the errors are relative to the object's surface lowered by the commanded
+`normal_offset_m`. For the strokes of an experiment, the errors are relative to the surface itself,
+as in the paper.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 BLOCK = 2000
-"""The number of finger samples that are processed together."""
+"""The number of finger samples for which errors are computed together."""
 
 TOPICS_READ = (
     "scene",
@@ -47,25 +48,29 @@ TOPICS_READ = (
     "arm_right",
     "twin/arms",
 )
-"""The topics needed for errors relative to the true finger.
+"""The topics from which errors relative to the true finger are computed.
 
-In a simulator's bag, their timestamps are on one clock.
+In a bag of the simulator, the timestamps of these topics are on one clock.
 """
 
 SAME_RUN_NS = 1_000_000_000
 
 SILENT_NS = 100_000_000
-"""The maximum age of an arm's last state. With an older state, the arm counts as not following."""
+"""The maximum age (ns) of the last state of an arm that follows the finger.
+
+If the last state is older, the arm does not count as following the finger.
+"""
 
 
 @dataclass(slots=True)
 class FingerRun:
     """A motion of the simulated finger along a path.
 
-    zero_ns: start of the path. done_ns: last exposure on the path. end_ns: last exposure that names
-        the path.
-    stroke_s: duration of the stroke; None if the path is no stroke of an experiment.
-    sums: errors of this stroke relative to the measured and the true finger.
+    zero_ns: start time of the path.
+    done_ns: time of the last exposure on the path.
+    end_ns: time of the last exposure at which the finger reports the path.
+    stroke_s: duration of the stroke; None if the path is not a stroke of an experiment.
+    sums: errors during the stroke relative to the measured and to the true finger.
     """
 
     label: str
@@ -78,7 +83,10 @@ class FingerRun:
 
     @property
     def stroke_window_ns(self) -> tuple[int, int]:
-        """Return start and end time (ns) of the stroke. They are equal if the path is no stroke."""
+        """Return the start and the end time (ns) of the stroke.
+
+        If the path is not a stroke of an experiment, both times are equal.
+        """
         if self.stroke_s is None:
             return self.zero_ns, self.zero_ns
         begin_s, finish_s = stroke_window_s(self.stroke_s)
@@ -86,13 +94,16 @@ class FingerRun:
         return self.zero_ns + round(begin_s * 1e9), min(finish_ns, self.end_ns)
 
     def figures(self) -> dict[str, Any]:
-        """Return numbers for how well the sheet followed the finger on this path."""
+        """Return a summary of how accurately the sheet followed the finger on this path."""
         seconds = (self.done_ns - self.zero_ns) * 1e-9
         return {"path": self.label, "seconds": seconds, **self.followed.figures()}
 
 
 class MotionBuffer:
-    """A buffer for samples of a finger and of both sheet edges, until errors can be computed."""
+    """A buffer for positions of a finger and poses of both sheet edges.
+
+    The positions remain in the buffer until the edges are known at the same times.
+    """
 
     def __init__(self) -> None:
         self.finger: list[tuple[int, Floats]] = []
@@ -101,10 +112,11 @@ class MotionBuffer:
     def pop_complete(
         self,
     ) -> tuple[SampledMotion, tuple[SampledMotion, SampledMotion], Ints] | None:
-        """Return the motions of the finger and of both edges, and the finger's times that both
-        edges cover.
+        """Remove and return the samples that are complete.
 
-        Later samples remain in the buffer. Returns None if there are too few samples.
+        Return the motion of the finger, the motions of both edges, and the times (ns) of the finger
+        samples at which both edges are known. Later samples remain in the buffer. Return None if
+        there are too few samples.
         """
         if len(self.finger) < 2 or min(map(len, self.edges)) < 2:
             return None
@@ -120,7 +132,10 @@ class MotionBuffer:
 
 
 class SheetErrors:
-    """An accumulator of sheet errors. Messages are added in order, and then `finish` is called."""
+    """An accumulator of sheet errors.
+
+    Messages must be added in order. The method `finish` must be called after the last message.
+    """
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
@@ -141,7 +156,7 @@ class SheetErrors:
         self.runs: list[FingerRun] = []
 
     def add(self, message: Any, source_ns: int) -> None:
-        """Add a message. All source timestamps must be on one clock."""
+        """Add a message of the bag. The source timestamps of all messages must be on one clock."""
         match message:
             case Scene():
                 self.finish()
@@ -213,7 +228,7 @@ class SheetErrors:
             last.done_ns = source_ns
 
     def finish(self) -> None:
-        """Compute the errors of all buffered finger samples for which both edges are known."""
+        """Compute the errors at all buffered finger samples at which both sheet edges are known."""
         scene, shape = self._scene, self._shape
         if scene is None or shape is None:
             self.measured, self.true = MotionBuffer(), MotionBuffer()
@@ -278,7 +293,10 @@ class SheetErrors:
                 run.followed.add(d[inside], theta[inside], heights[inside], following[inside])
 
     def _read_contact(self, times_ns: Ints) -> tuple[Bools, Floats]:
-        """Return whether the sheet target was in contact (n,), and its normal offset (n,), m."""
+        """Return whether the sheet target was in contact (n,), and its normal offset (n,), in m.
+
+        times_ns: times (n,) for which the result is computed.
+        """
         if len(self._contact) < 2:
             return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))
         contact = make_motion(self._contact, "sheet_target")
@@ -288,7 +306,10 @@ class SheetErrors:
 
 
 def read_followed(bag: Path) -> list[dict[str, Any]]:
-    """Return a summary for each finger path in a bag of how well the sheet followed the finger."""
+    """Return a summary of how accurately the sheet followed the finger, for each finger path.
+
+    The simulated finger paths are read from a bag.
+    """
     errors = SheetErrors(Grid(0, 1.0, 1))
     for _, message, header, _ in BagReader(bag, topics=TOPICS_READ):
         errors.add(message, header.source_ns)

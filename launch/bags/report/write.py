@@ -1,4 +1,4 @@
-"""Write the report of a bag as an HTML page, and return its numbers."""
+"""Write the report of a bag as an HTML page, and return the numbers in the report."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from flexsheet.messages.files import DISK_ERRORS, make_write_error
 
 
 def default_output(bag: Path) -> Path:
-    """Return the default path of the page: the path of the bag with the suffix .html."""
+    """Return the default path of the report: the path of the bag with the suffix .html."""
     return bag.with_suffix(".html")
 
 
 def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]:
-    """Read a bag, write its report page to `output` unless it is None, and return the numbers.
+    """Read a bag, write its report as an HTML page, and return the numbers in the report.
 
-    Raises BagError if the bag cannot be read, if the page cannot be written, or if `output` exists
-    and is not a report.
+    output: path of the page; None: no page is written.
+
+    Raises BagError if the bag cannot be read or the page cannot be written. Raises BagError also if
+    `output` exists and is not a report.
     """
     if output is not None:
         _check(output)
@@ -42,7 +44,7 @@ def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]
 
 
 def make_result(session: Session) -> dict[str, Any]:
-    """Return the numbers and the problems of a session for `bag report --json`."""
+    """Return the numbers and the problems of a recorded session, for `bag report --json`."""
     numbers = compute_numbers(session)
     return {"findings": [asdict(one) for one in find_problems(numbers)], **numbers}
 
@@ -54,7 +56,10 @@ def _draft_path(output: Path) -> Path:
 
 
 def _check(output: Path) -> None:
-    """Raise BagError if the page cannot be written, before the bag is read."""
+    """Raise BagError if the page cannot be written.
+
+    The check is made before the bag is read, because reading may take long.
+    """
     draft = _draft_path(output)
     try:
         draft.touch()
