@@ -1,4 +1,4 @@
-"""Define the parameters of `arm_bridge`, the node that commands one arm."""
+"""Define the parameters of the node `arm_bridge`, which commands one arm."""
 
 from __future__ import annotations
 

@@ -9,17 +9,17 @@ from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.models.servo_lag import LagEstimate
 
 LAG_THRESHOLD_S = 0.01
-"""The maximum deviation of the measured lag from the configured lag: five standard deviations of a
-calibrated lag (2 ms)."""
+"""The maximum deviation of the measured servo lag from the configured lag. It equals five standard
+deviations of a calibrated lag (2 ms)."""
 
 TRACKING_THRESHOLD_RAD = 0.005
-"""The maximum excess of the tracking error over the error of an ideal servo with the measured lag.
-It corresponds to 2 mm at 0.4 m: four times the effect of the largest tabulated backlash (0.6 mrad
-per joint)."""
+"""The maximum difference between the tracking error and that of an ideal servo with the measured
+lag. It corresponds to 2 mm at 0.4 m. The largest tabulated backlash (0.6 mrad per joint) has a
+fourth of this effect."""
 
 
 class ServoCheck:
-    """The self-checks of one arm that use estimates of the arm's lag.
+    """The self-checks of one arm's servo lag and tracking error.
 
     configured_lag_s: lag of the arm in the parameters. command_period_s: period of its commands.
 
