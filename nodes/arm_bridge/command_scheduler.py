@@ -41,8 +41,8 @@ class CommandScheduler:
         """Return whether a periodic command must be sent now.
 
         target_ns: arrival time of the newest target.
-        No periodic command is sent shortly before the next target is due, because the arm would
-        still be busy with it when the target arrives.
+        No periodic command is sent shortly before the next target is due. Otherwise the arm would
+        still be busy with the periodic command when the target arrives.
         """
         due_s = self.target_period_s - (now_ns - target_ns) * 1e-9
         return self.wait_s(now_ns, sent_ns) == 0.0 and abs(due_s) > 0.5 * self.period_s

@@ -509,7 +509,7 @@ class ArmControl:
     def _wait_for_arming(self, geometry: ArmGeometry, other: OtherArm, step_s: float) -> Command:
         """Return the command that stops the arm and then slackens the sheet.
 
-        Used until both arms are armed.
+        This command is returned until both arms are armed.
         """
         self._waited_s += step_s
         if self.ready:

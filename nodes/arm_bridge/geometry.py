@@ -136,10 +136,10 @@ class ArmGeometry:
         return self.solve_joints(flange_pose(edge, self.flange_from_edge), present_rad)
 
     def edge_offset_m(self, stretch_ratio: float) -> float:
-        """Return the distance (m) to command from the sheet's centre to the edge.
+        """Return the edge's commanded coordinate (m) on the sheet's x axis.
 
-        The result is a coordinate on the sheet's x axis, and negative for the left edge. It
-        compensates for the tension of the sheet, which pulls the edge towards the other edge.
+        The result is negative for the left edge. It compensates for the tension of the sheet, which
+        pulls the edge towards the other edge.
         """
         length_m = stretch_ratio * self.sheet_limits.width_m
         moved_m = self._compliance_m_per_n * self.sheet_limits.force_n(length_m)
@@ -148,8 +148,9 @@ class ArmGeometry:
     def solve_joints(self, world_from_flange: Floats, near_rad: Floats) -> Floats:
         """Return the encoder angles (6,) rad that place the flange at a world pose (4, 4).
 
-        near_rad: joint angles (6,) near the result. The compliance of the arm is not compensated.
-        Raises UnreachableError if the arm cannot reach the pose.
+        near_rad: joint angles (6,) near the result.
+        The compliance of the arm is not compensated. Raises UnreachableError if the arm cannot
+        reach the pose.
         """
         offsets_rad = self._joint_offsets_rad
         base_from_flange = self.base_from_world @ world_from_flange

@@ -35,11 +35,11 @@ FOLLOW_BOUNDS = SheetBounds(
 )
 
 SLOW_FROM_RAD = 0.05
-"""The distance (rad) by which one edge may be ahead of the other edge before its arm slows down."""
+"""The lead (rad) of one edge over the other edge above which the leading arm slows down."""
 
 WAIT_FROM_RAD = 0.12
-"""The distance (rad) by which one edge is ahead of the other edge when its arm waits. At 0.2 rad,
-the limiter stops both arms."""
+"""The lead (rad) of one edge over the other edge at which the leading arm waits. At 0.2 rad, the
+limiter stops both arms."""
 
 MAX_PREDICTION_S = 0.15
 """The maximum time by which a target's timestamp may lie in the future. It consists of the
@@ -190,7 +190,7 @@ def _sheet_centre(edge: Floats, along_m: float) -> Floats:
 
 
 def _difference(pose: Floats, other: Floats) -> Floats:
-    """Return the difference (6,) of two poses (4, 4) as one vector without units.
+    """Return the difference of two poses (4, 4) as one vector (6,).
 
     The vector consists of the rotation (rad) and the offset divided by SKEW_LENGTH_M.
     """

@@ -45,7 +45,7 @@ SINGULAR_LENGTH_M = 0.25
 same unit."""
 
 MIN_SINGULAR_VALUE, NEAR_SINGULAR_VALUE = 0.01, 0.05
-"""The minimum of the smallest singular value of the Jacobian, for single poses and for paths. At
+"""The minimum values of the Jacobian's smallest singular value, for single poses and for paths. At
 the second value, a flange speed of 0.25 m/s requires at most 20 rad/s of each joint."""
 
 SEEDS = 256

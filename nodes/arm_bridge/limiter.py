@@ -353,10 +353,11 @@ def _twist(edge: Floats, other_edge: Floats) -> float:
 
 
 def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits) -> str | None:
-    """Return a text about the limit that the sheet between two edges violates, or None.
+    """Return a description of the limit that the sheet violates, or None.
 
     edge, other_edge: world poses (4, 4) of this arm's edge and of the other edge.
-    left: whether this arm holds the left edge. Values that are not finite violate every limit.
+    left: whether this arm holds the left edge.
+    Values that are not finite violate every limit.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     distance = limits.sheet_length_m(math.sqrt(float(across @ across)))
@@ -385,7 +386,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Return a text if a flange violates the workspace or the flange distance, otherwise None.
+    """Return a description if a flange violates the workspace or the flange distance, or None.
 
     flange_world, other_flange: world poses (4, 4). slack_m: tolerance on both limits.
     Values that are not finite violate both limits.
@@ -408,7 +409,10 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Return a text if commanded and measured angles (6,) rad differ too much, otherwise None."""
+    """Return a description of the tracking error if it exceeds the maximum, otherwise None.
+
+    joints_rad, measured_rad: commanded and measured joint angles (6,).
+    """
     lag = float(np.abs(joints_rad - measured_rad).max())
     if not lag <= max_error_rad:
         return f"the arm trails its command by {np.degrees(lag):.1f} degrees"

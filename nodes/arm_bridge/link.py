@@ -89,15 +89,18 @@ class Freshness(StrEnum):
     """A classification of measured joint angles by the counters in the controller's answers."""
 
     FIRST = "first"
-    """The answer is the first answer since the start of the link or of the controller."""
+    """The first measurement since the start of the link or of the controller."""
     FRESH = "fresh"
-    """The counters have advanced, so the joint angles are a new measurement."""
+    """A new measurement, because the counters have advanced."""
     REPEATED = "repeated"
-    """The counters equal the previous counters, within the permitted time (`max_unchanged_s`)."""
+    """A repeated measurement, whose counters are unchanged for a permitted time
+    (`max_unchanged_s`)."""
     STALLED = "stalled"
-    """The counters have not advanced for longer than the permitted time (`max_unchanged_s`)."""
+    """A repeated measurement, whose counters are unchanged for too long a time
+    (`max_unchanged_s`)."""
     REVERSED = "reversed"
-    """A counter has decreased, so the joint angles are older than the previous joint angles."""
+    """A measurement that is older than the previous measurement, because a counter has
+    decreased."""
 
     @property
     def is_usable(self) -> bool:

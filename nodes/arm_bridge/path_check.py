@@ -198,8 +198,8 @@ def _check_alignment(
 ) -> None:
     """Check a straight joint motion of both arms; raise PathError if it violates a limit.
 
-    begin, there: joint angles of both arms at the start and at the end. Limits that are already
-        violated at the start are widened.
+    begin, there: joint angles of both arms at the start and at the end.
+    Limits that are already violated at the start are widened.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)
@@ -257,8 +257,8 @@ class PathChecker:
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
         """Return a finished request with its result, or None if no check has finished.
 
-        request: check to start unless another check is running; None if no check is necessary. This
-            method must be called in every cycle.
+        request: check to start unless another check is running; None if no check is necessary.
+        This method must be called in every cycle.
         """
         if self._running is None:
             if request is not None:

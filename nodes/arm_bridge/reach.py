@@ -124,7 +124,7 @@ class ArmReach:
 
     @property
     def binding(self) -> NDArray[np.intp]:
-        """Return the index in `LIMITS` of the first limit that each pose violates, (n,).
+        """Return the first violated limit of each pose as an index (n,) in `LIMITS`.
 
         The index is -1 for a pose that violates no limit.
         """
@@ -135,13 +135,13 @@ class ArmReach:
 
     @property
     def reachable(self) -> Bools:
-        """Return for each pose whether the arm can reach the pose at rest, (n,)."""
+        """Return whether the arm can reach each pose at rest, as booleans (n,)."""
         binding = self.binding
         return np.asarray((binding < 0) | (binding >= len(POSE_LIMITS)))
 
     @property
     def trackable(self) -> Bools:
-        """Return for each pose whether the arm can reach the pose and follow its twists, (n,)."""
+        """Return whether the arm can reach each pose and follow its twists, as booleans (n,)."""
         return np.asarray(self.binding < 0)
 
 

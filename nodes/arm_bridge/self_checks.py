@@ -13,9 +13,9 @@ LAG_THRESHOLD_S = 0.01
 deviations of a calibrated lag (2 ms)."""
 
 TRACKING_THRESHOLD_RAD = 0.005
-"""The maximum difference between the tracking error and that of an ideal servo with the measured
-lag. It corresponds to 2 mm at 0.4 m. The largest tabulated backlash (0.6 mrad per joint) has a
-fourth of this effect."""
+"""The maximum difference between the tracking error and the tracking error of an ideal servo with
+the measured lag. It corresponds to 2 mm at 0.4 m. The largest tabulated backlash (0.6 mrad per
+joint) causes a fourth of this displacement."""
 
 
 class ServoCheck:

@@ -14,8 +14,8 @@ STANDSTILL_COUNT = 5
 rest."""
 
 SETTLED_COUNT = 100
-"""The number of consecutive unchanged measurements after which an arm away from its last command is
-at rest. It is sufficient for measurements that lag by 0.7 s."""
+"""The number of consecutive unchanged measurements after which an arm that is not at its last
+command is at rest. It is sufficient for measurements that lag by 0.7 s."""
 
 STANDSTILL_RAD = 1e-3
 """The maximum difference between measurements that count as unchanged: 200 times the encoder
@@ -38,7 +38,8 @@ OVERSPEED = 1.5
 """The maximum ratio of an arm's speed to its commanded speed while the arm catches up."""
 
 MEMORY_S = 0.1
-"""The time constant with which the monitor discounts earlier commanded speeds and joint angles."""
+"""The time constant with which the influence of earlier commanded speeds and joint angles
+decays."""
 
 ON_PATH_RAD = 0.005
 """The distance from recently commanded joint angles within which any measurement is plausible."""

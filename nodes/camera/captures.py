@@ -107,9 +107,9 @@ class CapturedDevice(ABC):
         return 0.0
 
     def retrieve(self) -> tuple[bool, Image | None]:
-        """Return the grey image (height, width) that was grabbed last.
+        """Return the grey image (height, width) that was grabbed last, as (True, image).
 
-        The first result is whether an image was grabbed; if not, the image is None.
+        Returns (False, None) if no image was grabbed.
         """
         return self.image is not None, self.image
 

@@ -21,10 +21,11 @@ jitter would drop frames of cameras that expose half a period apart."""
 
 
 class StampCheck:
-    """A check whether a driver's timestamps are times of this computer's monotonic clock.
+    """A plausibility check of a camera driver's timestamps.
 
-    A timestamp is plausible if it is later than the previous timestamp, and at most MAX_AGE_NS
-    before the frame's arrival. Timestamps of another clock differ by hours or years.
+    The timestamps must be times of this computer's monotonic clock. A timestamp is plausible if it
+    is later than the previous timestamp, and at most MAX_AGE_NS before the frame's arrival.
+    Timestamps of another clock differ by hours or years.
     trusted: whether the timestamps may be used. It is False after MAX_IMPLAUSIBLE consecutive
         implausible timestamps.
     """
@@ -48,7 +49,7 @@ class StampCheck:
 
 
 class Pairing:
-    """A pairing of the frames of two cameras with equal frame rates by their exposure times.
+    """A matcher that pairs the frames of two cameras with equal frame rates by exposure time.
 
     The cameras have no common trigger. Two frames are a pair if the time between their exposures is
     at most half a period, plus a tolerance. Otherwise the older frame is dropped.

@@ -69,8 +69,9 @@ def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -
 def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float) -> tuple[int, int]:
     """Return the lower and the upper bound of the clock offset (ns) at time `at_ns`.
 
-    max_drift_ratio: maximum relative drift of the clocks. Every sample limits the offset. If the
-        samples are inconsistent, the lower bound is above the upper bound.
+    max_drift_ratio: maximum relative drift of the clocks.
+    Every sample limits the offset. If the samples are inconsistent, the lower bound is above the
+    upper bound.
     """
     errors = [one.half_ns + int(max_drift_ratio * abs(at_ns - one.at_ns)) + 1 for one in samples]
     low = max(one.offset_ns - error for one, error in zip(samples, errors, strict=True))

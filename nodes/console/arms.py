@@ -64,8 +64,8 @@ def compute_link_poses(
 ) -> Floats:
     """Compute the world poses (7, 4, 4) of the base and the six links of an arm.
 
-    world_from_base: pose (4, 4) of the base. joints_rad: joint angles (6,). The last pose is the
-        pose of the flange.
+    world_from_base: pose (4, 4) of the base. joints_rad: joint angles (6,).
+    The last pose is the pose of the flange.
     """
     chain = model.chain() if isinstance(model, ClosedFormArm) else model
     poses = [world_from_base]
@@ -97,7 +97,8 @@ def rounded_box(
 ) -> tuple[Floats, NDArray[np.int32]]:
     """Return vertices (24, 3), m, and triangles (44, 3) of a box with bevelled edges.
 
-    bevel: ratio of the bevel to half of the shortest side. The triangles are counter-clockwise.
+    bevel: ratio of the bevel to half of the shortest side.
+    The triangles are counter-clockwise.
     """
     half = 0.5 * np.array(size_m)
     cut = bevel * half.min()

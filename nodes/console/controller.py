@@ -40,7 +40,7 @@ MAX_DRAWING_S = 5.0
 """The maximum time to wait for a frame from the renderer."""
 
 CAPTURE_S = 1.0
-"""The time after a frame in which the simulated eye receives all its inputs."""
+"""The time after a frame within which the simulated eye receives all its inputs."""
 
 MAX_TRACING_S = 120.0
 """The maximum time to wait for the ray-traced image of the eye view."""
@@ -138,8 +138,8 @@ class SceneController:
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
         """Prepare the selection of points on the object in a background thread.
 
-        By selecting points, viewers move the finger. failed: function that receives the cause if
-        the object permits no selection.
+        failed: function that receives the cause if the object permits no selection.
+        By selecting points, viewers move the finger.
         """
         if self._picker_task is not None:
             self._picker_task.cancel()
@@ -171,11 +171,11 @@ class EyeViewState(Enum):
 class EyeViewRequester:
     """A requester of eye views, which are images from the position of the user's eye.
 
-    For each view, it requests one frame with pixels from the renderer, which the simulated eye then
-    traces. Only one image is requested at a time, because tracing takes a second of processor time.
-    When the simulated eye has all its inputs, the previous display settings are restored. If no
-    other node has sent display settings, the image correction of the scene or of the console is
-    restored.
+    For each view, the requester orders one frame with pixels from the renderer, which the simulated
+    eye then traces. Only one image is requested at a time, because tracing takes a second of
+    processor time. When the simulated eye has all its inputs, the previous display settings are
+    restored. If no other node has sent display settings, the image correction of the scene or of
+    the console is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
@@ -410,7 +410,10 @@ class ConsoleController:
         self.save_state()
 
     def add_bookmark(self, label: str) -> str:
-        """Publish a bookmark, and return the label that it has received."""
+        """Publish a bookmark, and return its label.
+
+        An empty label is replaced by a default label.
+        """
         label = label.strip() or DEFAULT_BOOKMARK
         self._publish(Bookmark(label=label))
         return label
@@ -421,7 +424,7 @@ class ConsoleController:
         self.save_state()
 
     def save_state(self) -> None:
-        """Save the scene, the sliders, the recording and the finger for the next process."""
+        """Save the scene, sliders, recording and finger for a restart of the console."""
         scenes = self.scenes
         state = ConsoleState(
             base=scenes.base,
@@ -433,9 +436,10 @@ class ConsoleController:
 
 
 def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> ConsoleState:
-    """Load the saved state of the previous console, or else the first scene of the plan.
+    """Load the saved state of the previous console process.
 
     warn: function that receives the cause if the saved state is invalid.
+    Without a valid state, the result contains the first scene of the plan.
     """
     try:
         state = load_state(files.state)

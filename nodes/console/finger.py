@@ -14,7 +14,7 @@ from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
 
 LABEL = "console"
 FRONT_M = 1.5
-"""The distance (m) from the projection plane at which rays from the front start."""
+"""The z coordinate (m, world frame) of the origins of rays from the front."""
 
 
 @dataclass(frozen=True, slots=True)

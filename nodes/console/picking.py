@@ -56,7 +56,8 @@ class SurfacePicker:
     def offset_point(self, near: Floats, depth_m: float) -> Floats:
         """Return the point (3,), in m, at a depth below the surface point nearest to `near`.
 
-        near: point (3,), m. A negative depth results in a point above the surface.
+        near: point (3,), m.
+        A negative depth results in a point above the surface.
         """
         found = self._shape.closest(apply(self._object_from_world, near))
         inside = found.point - depth_m * found.normal
@@ -65,9 +66,10 @@ class SurfacePicker:
     def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
         """Return the next point (3,), in m, on the path of the finger to the target.
 
-        finger, target: present and requested position (3,), m. The step is at most `max_step_m`
-            long. It enters the object at most to `depth_m`, or to the present depth of the finger
-            if that is larger. If a step around the object makes no progress, the step is straight.
+        finger, target: present and requested position (3,), m.
+        The step is at most `max_step_m` long. It enters the object at most to `depth_m`, or to the
+        present depth of the finger if that is larger. If a step around the object makes no
+        progress, the step is straight.
         """
         across = target - finger
         distance = float(np.linalg.norm(across))

@@ -52,9 +52,9 @@ def edit_scene(
 ) -> Scene:
     """Change the object's stiffness, the sheet's minimum stretch and the object's size.
 
-    size_ratio: size relative to the size in `scene`. The front of the object stays in place, and
-        the object grows away from the user. A rigid object stays rigid.
-    Raise SceneChoiceError for invalid values.
+    size_ratio: size relative to the size in `scene`.
+    The front of the object stays in place, and the object grows away from the user. A rigid object
+    stays rigid. Raise SceneChoiceError for invalid values.
     """
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
@@ -120,7 +120,7 @@ def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
     """Return the extent (m) of an object's touchable surface from its origin towards the user.
 
-    world_from_object: rotation matrix (3, 3) of the object. The user is in the direction of the
-        world's z axis. The ends of a cylinder are not touchable.
+    world_from_object: rotation matrix (3, 3) of the object.
+    The user is in the direction of the world's z axis. The ends of a cylinder are not touchable.
     """
     return GEOMETRIES[geometry.shape].extent_m(geometry, world_from_object[2])

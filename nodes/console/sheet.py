@@ -37,10 +37,10 @@ def compute_sheet_points(
 ) -> Floats | None:
     """Compute the world positions (ROWS * COLUMNS, 3), in m, of the drawn sheet's vertices.
 
-    world_from_left_edge, world_from_right_edge: poses (4, 4) of the sheet's edges. fingertip:
-        position (3,) in the world frame, m, or None. Rows are ordered upwards, and columns to the
-        right.
-    Return None if the distance between the edges is less than `MIN_EDGE_DISTANCE_M`.
+    world_from_left_edge, world_from_right_edge: poses (4, 4) of the sheet's edges.
+    fingertip: position (3,) in the world frame, m, or None.
+    Rows are ordered upwards, and columns to the right. Return None if the distance between the
+    edges is less than `MIN_EDGE_DISTANCE_M`.
     """
     left, right = world_from_left_edge, world_from_right_edge
     width_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
@@ -88,8 +88,8 @@ def film(
 def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
     """Compute Green's function (n,) of Laplace's equation in the strip |x| < pi / 2.
 
-    x, y: coordinates (n,) of the points. The source is at (source_x, 0).
-    The result is not normalized.
+    x, y: coordinates (n,) of the points.
+    The source is at (source_x, 0). The result is not normalized.
     """
     high = np.cosh(np.minimum(np.abs(y), 30.0))
     near = np.maximum(high - np.cos(x - source_x), 1e-12)

@@ -114,8 +114,8 @@ def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
 
     sheet: points of the drawn sheet.
     Returns segments (m, 2, 3) from the eye to the sheet, and segments (m, 2, 3) from the sheet to
-    the projector. A point whose ray misses the sheet has no segments.
-    The result is empty for a scene without projector.
+    the projector. A point whose ray misses the sheet has no segments. The result is empty for a
+    scene without projector.
     """
     if scene.projector is None:
         return np.empty((0, 2, 3)), np.empty((0, 2, 3))

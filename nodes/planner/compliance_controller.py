@@ -29,8 +29,7 @@ FIRST_DELAY_S = 0.06
 """The initial value of the delay between the measurement of a depth and the motion of the sheet."""
 
 DELAY_HYSTERESIS_S = 0.03
-"""The decrease of the measured delay up to which the bounds on the offset's slope are not
-updated."""
+"""The minimum decrease of the measured delay that leads to new bounds on the offset's slope."""
 
 COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
 """The depths at which force curves are compared, as fractions of the maximum depth."""
@@ -157,11 +156,12 @@ class ComplianceController:
         return f"the sheet force model {self._model.name} is not valid here: {reason}"
 
     def normal_offset(self, depth_m: float, position_m: SheetPosition) -> tuple[float, float]:
-        """Return the sheet's offset (m) behind the tangent plane, and its derivative by the depth.
+        """Return the sheet's normal offset (m), and its derivative with respect to the depth.
 
         depth_m: depth of the finger in the object.
         position_m: (x, y) of the contact on the sheet.
-        If the rubber has hysteresis, the result depends on the depths of earlier calls.
+        A positive offset is behind the object's tangent plane. If the rubber has hysteresis, the
+        result depends on the depths of earlier calls.
         """
         force_ratio = 1.0 if self._hysteresis is None else self._hysteresis.update(depth_m)
         if self._compliance is None or depth_m <= 0.0:

@@ -49,7 +49,7 @@ MAX_TILT_RAD = 1.4
 Two normals within this tilt are never opposite, so the shortest rotation between them is unique."""
 
 MIN_LIFT_M = 2e-4
-"""The height of the object's rim around the contact above which the contact is reported as
+"""The height of the surrounding surface above the contact from which the contact is reported as
 concave."""
 
 
@@ -77,7 +77,7 @@ class ContactLimits:
 
 @dataclass(frozen=True, slots=True)
 class ContactCommand:
-    """A command with the contact that the sheet must render, and the motion of the sheet.
+    """The commanded contact of the sheet with the object, and the motion of the sheet.
 
     twist: velocity (6,) of the sheet's centre in the object's frame, m/s and rad/s.
     """
@@ -273,5 +273,8 @@ def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
 
 
 def _norm(vector: Floats) -> float:
-    """Return the length of a vector (3,); not finite if an element is not finite."""
+    """Return the length of a vector (3,).
+
+    The result is not finite if an element of the vector is not finite.
+    """
     return hypot(*vector.tolist())

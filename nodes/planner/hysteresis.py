@@ -9,12 +9,12 @@ the finger's travel.
 from __future__ import annotations
 
 REVERSAL_RATIO = 0.2
-"""The travel after a reversal over which the force factor changes completely, as a fraction of the
-depth."""
+"""The travel of the finger after a reversal until the hysteresis is fully reversed, as a fraction
+of the depth."""
 
 MIN_REVERSAL_M = 4e-4
-"""The minimum travel after a reversal over which the force factor changes completely. At small
-depths, tremor would otherwise change the factor."""
+"""The minimum travel of the finger after a reversal until the hysteresis is fully reversed. At
+small depths, tremor would otherwise reverse the hysteresis."""
 
 
 class HysteresisCorrection:

@@ -25,7 +25,8 @@ from flexsheet.nodes.models.motion import (
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform, vector_from_rotation
 
 TAPER_FRACTION = 0.5
-"""The fraction of the maximum jerk that reduces the acceleration to 0 near the desired velocity."""
+"""The fraction of the maximum jerk with which the acceleration decreases to 0 near the desired
+velocity."""
 
 LINEAR, ANGULAR, STRETCH = slice(0, 3), slice(3, 6), slice(6, 7)
 
@@ -68,8 +69,8 @@ def limit_jerk(
 ) -> tuple[Floats, Floats]:
     """Return the mean velocity and the acceleration (n,) of the next step.
 
-    goal_velocity: velocity (n,) to reach. The acceleration stays within its limit, and changes by
-        at most max_jerk * step_s.
+    goal_velocity: velocity (n,) to reach.
+    The acceleration stays within its limit, and changes by at most max_jerk * step_s.
     """
     change = goal_velocity - mean_velocity
     size = measure_length(change)

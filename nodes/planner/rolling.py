@@ -24,8 +24,9 @@ MIN_STEP_RATIO = 1.0 / 512.0
 the search distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
-"""The finer resolution of the search at tilts that are more than NEAR_LIMIT_RAD below the limit.
-Deep inside the object, a small step can change the normal by many degrees."""
+"""The finer resolution of the search, and the minimum distance from the maximum tilt at which it is
+used. It is necessary deep inside the object, where a small step can change the normal by many
+degrees."""
 
 RIM_RADIUS_M = 0.03
 """The radius around the contact in which the object is tested for points above the tangent

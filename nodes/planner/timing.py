@@ -5,8 +5,8 @@ from __future__ import annotations
 from flexsheet.messages.types import Side
 
 RESTART_COUNT = 3
-"""The number of consecutive late fingertips with ascending timestamps after which the clock must
-have been set back."""
+"""The number of consecutive late fingertips with ascending timestamps that indicate a clock that
+was set back."""
 
 MIN_STEP_NS = 1_000_000
 """The minimum plausible interval between two exposures. No camera is faster."""
@@ -21,11 +21,11 @@ corresponds to a time constant of 1.8 s."""
 
 
 class MonotonicTimestampFilter:
-    """A filter that drops a fingertip if a fingertip with a later exposure has already passed.
+    """A filter that drops every fingertip that was exposed before the last accepted fingertip.
 
-    The sheet is already planned for a later time than that of the dropped fingertip. After
-    `RESTART_COUNT` consecutive late fingertips, the clock must have been set back. The filter then
-    restarts.
+    The sheet is already planned for a later time than that of the dropped fingertip.
+    `RESTART_COUNT` consecutive late fingertips indicate that the clock was set back. The filter
+    then restarts.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class MonotonicTimestampFilter:
         self._late_ns: list[int] = []
 
     def update(self, source_ns: int, first_step_s: float) -> float | None:
-        """Return the time (s) since the last passed fingertip, or None if the fingertip is dropped.
+        """Return the time (s) since the last accepted fingertip, or None for a dropped fingertip.
 
         source_ns: time of the exposure.
         first_step_s: result for the first fingertip and after a restart.

@@ -274,9 +274,9 @@ def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajecto
 
 
 def offset_along_normal(sheet: SheetMotion, offset_m: float, rate_m_per_s: float) -> SheetMotion:
-    """Move the sheet backwards along its normal.
+    """Move the sheet backwards along its normal by an offset, and correct its velocity.
 
-    offset_m, rate_m_per_s: distance, and rate at which the distance changes.
+    rate_m_per_s: rate at which the offset changes.
     """
     normal = sheet.world_from_sheet[:3, 2]
     pose, twist = sheet.world_from_sheet.copy(), sheet.twist_world.copy()

@@ -51,10 +51,10 @@ rounded up to whole frames, and the first horizon is one frame. Weights for othe
 interpolated."""
 
 MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
-"""The maximum age of stored earlier filter states."""
+"""The maximum age of the earlier filter states that are stored to measure prediction errors."""
 
 STAMP_JITTER_NS = 2_000_000
-"""The tolerance for jitter of the camera's timestamps. A state may be younger by this time than the
+"""The tolerance for jitter of the camera's timestamps, by which a state may be younger than the
 horizon for which its error is measured."""
 
 MEMORY_S, MEMORY_POINTS = 1.0, 60
@@ -75,9 +75,9 @@ OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
 outdated."""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
-"""The number of points that have the same weight as the initial value, and the initial variance of
-every filter's prediction errors. The unit is m instead of m^2, because errors are divided by the
-square root of their magnitude."""
+"""The weight (in points) and the value of the initial variance of every filter's prediction errors.
+The unit of the variance is m instead of m^2, because errors are divided by the square root of their
+magnitude."""
 
 MIN_ERROR_M = 1e-9
 """A constant that is added to the magnitude of errors to avoid a division by zero."""

@@ -35,8 +35,8 @@ POSITION_SIGMA_M = 0.0005
 velocity."""
 
 ACCELERATION_SIGMA_M_PER_S2 = 1.0
-"""The acceleration that causes the variable part of a marker's deviation from motion at constant
-velocity."""
+"""The acceleration that determines how a marker's deviation from motion at constant velocity
+increases with time."""
 
 STUDENT_T_DOF = 2.0
 """The degrees of freedom of Student's t distribution, by which a marker's deviation from motion at
@@ -112,7 +112,8 @@ SOLE_CANDIDATE_TIME_S = 1.0
 ambiguous."""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""The time after the last detection of the finger from which moving clutter may be the finger."""
+"""The time for which the finger must be lost before moving clutter may be selected as the
+finger."""
 
 
 @dataclass(slots=True)
@@ -443,10 +444,9 @@ def assign_columns(costs: Floats) -> list[int]:
     """Assign a different column to each row so that the sum of the costs is minimal.
 
     costs: cost matrix (n, m) with n <= m.
-    Returns the column of each row.
-    The method is that of shortest augmenting paths (Jonker and Volgenant, 1987). The equivalent
-    function of SciPy is not used, because its import would delay the start of the node by a third
-    of a second.
+    Returns the column of each row. The method is that of shortest augmenting paths (Jonker and
+    Volgenant, 1987). The equivalent function of SciPy is not used, because its import would delay
+    the start of the node by a third of a second.
     """
     nearest: list[int] = costs.argmin(axis=1).tolist()
     if len(set(nearest)) == len(nearest):

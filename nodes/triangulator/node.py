@@ -66,8 +66,8 @@ class Triangulator(Node):
     """A node that detects and tracks the fingertip in stereo image pairs.
 
     The cameras track a marker on the finger. The fingertip is the point of the finger's pad that
-    touches the sheet. The offset between marker and fingertip is constant, because the cameras
-    cannot measure the finger's rotation.
+    touches the sheet. The offset between marker and fingertip is assumed to be constant, because
+    the cameras cannot measure the finger's rotation.
     """
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame"})

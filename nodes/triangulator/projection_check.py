@@ -45,8 +45,8 @@ MATCH_RADIUS_M = 0.012
 are matched."""
 
 MAX_SPREAD_M = 0.004
-"""The maximum deviation of a mark's offset from the median offset of all marks. A point with a
-larger deviation is not a mark."""
+"""The maximum difference between the offset of a mark from its expected position and the median
+offset of all marks. A point with a larger difference is not a mark."""
 
 MAX_AGE_NS = 300_000_000
 """The maximum age of the newest frame at the exposure: with an older one, frames are missing."""

@@ -64,7 +64,8 @@ class PositionMeasurement:
     def can_reach(self, later: PositionMeasurement, max_speed: float) -> bool:
         """Return whether a finger can move from this point to a later point.
 
-        max_speed: maximum speed of the finger, m/s. The noise of both points is taken into account.
+        max_speed: maximum speed of the finger, m/s.
+        The noise of both points is taken into account.
         """
         distance = float(np.linalg.norm(later.measured - self.measured))
         noise = float(np.sqrt(np.trace(self.covariance) + np.trace(later.covariance)))
