@@ -276,7 +276,7 @@ class ClosedFormKinematics:
         The result is exact except near two singularities. Near J5 = 0, a small motion of the flange
         would require a fast rotation of J4. J4 may therefore lag there, and J5 reduces the
         remaining error. The orientation error of the flange is at most MAX_FIXED_ERROR_RATIO *
-        WRIST_FIXED_RAD. J1 may lag in the same way if the wrist centre is near the J1 axis.
+        WRIST_FIXED_RAD. J1 may lag too if the wrist centre is near the J1 axis.
 
         If the solution exceeds the joint ranges, another branch is selected. Raises
         UnreachableError if no branch is within the joint ranges.

@@ -421,7 +421,7 @@ class ArmControl:
         if clock_problem:
             self._inhibit(clock_problem)
         if silent or stopped or clock_problem:
-            # From now on the arm must not slacken the sheet (see the states TAUT and SLACK).
+            # From now on the arm must not slacken the sheet (see the state TAUT).
             self.handle(Event.ISOLATED)
         self._settle()
 
@@ -807,8 +807,8 @@ class ArmControl:
         if starts or self._sheet is None or self._relax_from is None:
             self._restart_at(measured, geometry)
             self._sheet, self._relax_from = between, between.stretch_ratio
-        # Half of a change of stretch falls to each arm.  The other arm rests, so this arm commands
-        # twice the change: from a stretch ratio s to 2 - s instead of to 1.
+        # Each arm executes half of a commanded change of stretch.  The other arm rests, so this arm
+        # commands twice the change: from a stretch ratio s to 2 - s instead of to 1.
         target = replace(
             self._sheet,
             twist_world=np.zeros(6),

@@ -23,8 +23,8 @@ from flexsheet.nodes.models.rigid import transform, vector_from_rotation
 
 Floats = NDArray[np.float64]
 
-# Accelerations that the joints can follow (J6 22 rad/s^2, J2 9.4 rad/s^2).  With larger ones the
-# joints would overshoot a target that reverses, and each arm by a different amount.
+# The joints can follow these accelerations (J6 22 rad/s^2, J2 9.4 rad/s^2).  With larger
+# accelerations, each arm would overshoot a target that reverses by a different distance.
 FOLLOW_BOUNDS = SheetBounds(
     speed_m_per_s=0.22,
     acceleration_m_per_s2=2.6,
@@ -123,9 +123,10 @@ def make_goal(
 ) -> Goal:
     """Convert a target to the goal of a command that is sent now.
 
+    received_ns, now_ns: arrival time of the target, and present time.
     trajectory: result of `find_trajectory` if the other arm follows the trajectory too. The target
-        is then overdue after the end of the trajectory. If None, the target is extrapolated with
-        its velocity.
+        is then overdue as soon as the trajectory has ended. If None, the target is extrapolated
+        with its velocity.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s

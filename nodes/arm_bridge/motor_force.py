@@ -97,7 +97,7 @@ class MotorForceEstimator:
     ) -> Force | None:
         """Return the estimated force at `at_ns`; None if the last estimate is too recent.
 
-        The other arguments are those of `estimate_pull_n`.
+        For the other arguments, see `estimate_pull_n`.
         """
         before_ns, before_rad = self._last_ns, self._last_rad
         if before_ns is not None and at_ns - before_ns < PERIOD_NS:

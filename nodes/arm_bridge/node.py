@@ -197,7 +197,7 @@ class ArmBridge(Node):
         command = control.step(geometry, goal, other, step_s, clock_problem)
         if result := self._path_checker.poll(control.pending_check):
             control.on_path_result(*result)
-        # Store the target now: a newer one that arrives during the exchange is not used here.
+        # Store the target now, because a newer target may arrive during the exchange.
         last.target, last.received_ns = self.sheet_target.header, self.sheet_target.received_ns
         last.trajectory_ends_ns = 0
         if target is not None and trajectory is not None:

@@ -76,7 +76,7 @@ BACKENDS = {
         autos=(("auto white balance", cv2.CAP_PROP_XI_AUTO_WB),),
         offsets=(cv2.CAP_PROP_XI_OFFSET_X, cv2.CAP_PROP_XI_OFFSET_Y),
     ),
-    # The module `captures` opens the next three, OpenCV the others.
+    # The module `captures` opens the next three backends.  OpenCV opens the other backends.
     "aravis": Backend(
         api=cv2.CAP_ANY,
         exposure_unit_s=1e-6,

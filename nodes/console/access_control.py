@@ -1,10 +1,10 @@
 """Control access to the console page.
 
-By default, only users of this computer have access, and users of other computers need a token.
-Listening on the loopback address is insufficient, because a web page of another site, opened in a
-browser on this computer, could connect to the console. The Host and Origin headers of every request
-are therefore checked. No other page may show the console in a frame, because a frame can hide the
-element that the user clicks.
+By default, only users of this computer have access, and users of other computers need a token. A
+web page of another site that is open in a browser on this computer could connect to the console.
+Listening on the loopback address is therefore insufficient, and the Host and Origin headers of
+every request are checked. No other page may show the console in a frame, because a frame can hide
+the element that the user clicks.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ def _message(entry: tuple[Fingertip, Header] | None) -> Fingertip | None:
 def _skin(source: MessageSource) -> Floats | None:
     """Return the vertices (n, 3), m, of the object's surface mesh.
 
-    Before the first result of the solver, the vertices are those of the undeformed object.
+    Before the first result of the solver, these are the vertices of the undeformed object.
     """
     skin, body = source.latest("skin", Skin), source.latest("soft_body", SoftBody)
     if skin is None:

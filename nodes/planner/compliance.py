@@ -54,15 +54,15 @@ because each arm receives the state of the other arm one or two cycles late."""
 
 FORCE_JND_FLOOR_N = 0.05
 """The minimum divisor for the relative error of a force. Smaller forces have relative errors of at
-least a tenth, for example in the first 2 mm of an object with a modulus of 4 kPa."""
+least a tenth, as in the first 2 mm of an object of 4 kPa."""
 
 DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
-"""The contact forces between which the sheet's advance increases from zero to its full value. The
-contact force is the maximum of the object's force and the sheet's force."""
+"""The contact forces between which the sheet's advance towards the finger increases from zero to
+its full value. The contact force is the maximum of the object's force and the sheet's force."""
 
 DEADBAND_START_M, DEADBAND_END_M = 0.3e-3, 1.2e-3
-"""The depths between which the sheet's advance increases from zero to its full value. A fingertip
-at a smaller depth may only rest on the object."""
+"""The depths between which the sheet's advance towards the finger increases from zero to its full
+value. A fingertip at a smaller depth may only rest on the object."""
 
 TARGET_ERROR_RATIO = 0.10
 """The relative error of the rendered force above which the planner reports the error."""
@@ -73,8 +73,9 @@ feel the deformation of the skin (Bergmann Tiest & Kappers 2009). The second val
 neither work nor terminal force is a cue (Tan et al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
-"""The maximum advance of the sheet per depth of the push. With a value of 0.5, the sheet feels 1.5
-times as stiff. The bounds for a stable control loop of sheet and hand are usually lower."""
+"""The maximum advance of the sheet towards the finger per depth of the push. With a value of 0.5,
+the sheet feels 1.5 times as stiff. The bounds for a stable control loop of sheet and hand are
+usually lower."""
 
 SLOPE_TOLERANCE = 0.03
 """The amount by which a slope may exceed its bound. The bounds contain larger safety margins."""
@@ -157,7 +158,10 @@ class StretchLimits:
     bounds: OffsetBounds | None = None
 
     def max_advance(self, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum advance per depth (n,) for sheets with stiffnesses (n,) N/m."""
+        """Return the maximum advance (n,) of the sheet towards the finger per depth of the push.
+
+        stiffnesses_n_per_m: stiffnesses (n,) of the sheet.
+        """
         result = np.full(len(stiffnesses_n_per_m), self.max_advance_per_depth)
         if self.bounds is None:
             return result
@@ -306,10 +310,11 @@ def _indentation_for_edge_force(
 
 
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
-    """Reduce the advance smoothly to zero where depths or forces are too small to be felt.
+    """Reduce the sheet's advance towards the finger to zero if it is too small to be felt.
 
     depths, indentation: depths and indentations (n,), m. forces_n: contact forces (n,).
-    Returns the changed indentations (n,), m.
+    Returns the changed indentations (n,), m. The advance decreases smoothly with the depth and the
+    contact force.
     """
     force_weight = _fade(forces_n, DEADBAND_START_N, DEADBAND_END_N)
     depth_weight = _fade(depths, DEADBAND_START_M, DEADBAND_END_M)
@@ -379,7 +384,7 @@ class Compliance:
         return result
 
     def offset_per_depth(self, depth_m: float, position_m: SheetPosition = CENTRE) -> float:
-        """Return the derivative of the offset with respect to the depth, which is at most 1."""
+        """Return the derivative of the normal offset with respect to the depth, at most 1."""
         if depth_m <= 0.0:
             return 0.0
         if depth_m >= self.max_depth_m:

@@ -78,8 +78,8 @@ def transport_axes(axes: Floats, normal: Floats) -> Floats:
     is undefined for opposite normals. It is orthogonal, because rounding errors do not accumulate.
     """
     both = axes[:, 2] + normal
-    # The rotation is the product of two Householder reflections.  The first one negates the third
-    # axis and leaves the others unchanged; the second one maps the negated axis to the normal.
+    # The rotation is the product of two Householder reflections.  The first reflection
+    # negates the third axis.  The second reflection maps the negated axis to the normal.
     result = axes - np.outer(both, both @ axes) * (2.0 / (both @ both))
     result[:, 2] = normal
     return result

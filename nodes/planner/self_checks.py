@@ -23,8 +23,8 @@ def check_stiffness(
 ) -> tuple[SelfCheck, ...]:
     """Compare Young's modulus times thickness in the scene with the calibrated product.
 
-    Returns () without a calibration. A difference is an error, because rendered forces depend on
-    the calibration, whereas the sag and the limits of the edge force depend on the scene.
+    Returns () without a calibration. A difference is an error: rendered forces depend on the
+    calibration, but the sag and the limits of the edge force depend on the scene.
     """
     if calibration is None:
         return ()

@@ -68,7 +68,7 @@ OUTDATED_RATIO = 1.5
 """The error ratio above which the error covariance is outdated.
 
 The covariance was then estimated during another kind of motion. The ratio is the mean square error
-of the weighted sum divided by that of the best model."""
+of the weighted sum divided by the mean square error of the best model."""
 
 OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
 """The time constant and the minimum number of points for averaging the error covariance while it is

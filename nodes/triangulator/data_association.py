@@ -444,7 +444,7 @@ def assign_columns(costs: Floats) -> list[int]:
     """Assign a different column to each row so that the sum of the costs is minimal.
 
     costs: cost matrix (n, m) with n <= m.
-    Returns the column of each row. The method is that of shortest augmenting paths (Jonker and
+    Returns the column of each row. The algorithm finds shortest augmenting paths (Jonker and
     Volgenant, 1987). The equivalent function of SciPy is not used, because its import would delay
     the start of the node by a third of a second.
     """

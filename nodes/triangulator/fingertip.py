@@ -572,9 +572,9 @@ def _triangulate(
 def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
     """Estimate the variance (px^2) of a marker's centre that partial occlusion causes.
 
-    An obstacle that covers a strip of a disc shifts the disc's centre by half the strip's width,
-    and reduces the radius by the same amount. The variance is therefore the squared difference of
-    the radii in both views, minus the variance of the estimated radii.
+    An obstacle that covers a strip of a disc shifts the disc's centre by half the strip's width. It
+    reduces the radius by the same amount. The variance is therefore the squared difference of the
+    radii in both views, minus the variance of the estimated radii.
     """
     one, other = markers
     noise_px = one.radius * math.hypot(one.radius_deviation, other.radius_deviation)
