@@ -525,7 +525,7 @@ class ArmControl:
     def _wait_for_other(self, geometry: ArmGeometry, step_s: float) -> Command:
         """Return the command that stops the arm because the other arm is not armed.
 
-        If this arm has already moved or has waited too long, it is disarmed too.
+        With manual arming, this arm is disarmed too if it has already moved or has waited too long.
         """
         reason = "the other arm is not ready"
         has_started = self._sheet is not None or not self.at_rest

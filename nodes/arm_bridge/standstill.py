@@ -27,11 +27,11 @@ measured position. Joint servos with a lag of at least 15 ms then move there at 
 m/s."""
 
 JUMP_MARGIN_RAD = 0.002
-"""The maximum change between two measurements without a command. It allows for measurement
-noise."""
+"""The step by which measured joint angles may change in addition to a motion at a plausible
+speed."""
 
 JUMP_SPEED_RAD_PER_S = 0.5
-"""The maximum joint speed without a command. The operator may move the arm with its teach
+"""The joint speed that is plausible without a command. The operator may move the arm with its teach
 pendant."""
 
 OVERSPEED = 1.5
@@ -62,7 +62,7 @@ class StandstillMonitor:
     def is_standing(self, *, at_command: bool) -> bool:
         """Return whether the arm is at rest.
 
-        at_command: whether the measured joint angles equal the last command.
+        at_command: whether the measured joint angles are near the last command.
         """
         return self._count >= (STANDSTILL_COUNT if at_command else SETTLED_COUNT)
 

@@ -382,7 +382,8 @@ def _make_marker(
     """Make a marker from the result of a fit.
 
     motion: motion (x, y) during the exposure, px, which increases the systematic error.
-    is_blurred, is_merged: whether the marker is out of focus, or merged with another spot.
+    is_blurred, is_merged: whether to reject the marker as out of focus, or as merged with another
+        spot.
     """
     rejection_reason: MarkerRejection | None = "blurred" if is_blurred else None
     return Marker(
