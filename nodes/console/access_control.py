@@ -242,8 +242,9 @@ class PageConnection(ServerConnection):
 def start_server(address: str, port: int, access: AccessControl, label: str) -> viser.ViserServer:
     """Start a viser server with access control at the requested address and port.
 
-    label: heading of the control panel. Raise ConsoleError if the port is in use, or if the
-    installed version of viser does not support the access control.
+    label: heading of the control panel.
+    Raise ConsoleError if the port is in use, or if the installed version of viser does not support
+    the access control.
     """
     # viser uses the next free port if the requested port is in use, so test the port first.
     _check_port_is_free(address, port)

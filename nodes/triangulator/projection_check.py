@@ -49,19 +49,20 @@ MAX_SPREAD_M = 0.004
 offset of all marks. A point with a larger difference is not a mark."""
 
 MAX_AGE_NS = 300_000_000
-"""The maximum age of the newest frame at the exposure: with an older one, frames are missing."""
+"""The maximum age of the newest frame at the exposure. If the newest frame is older, frames are
+missing."""
 
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
 """The speed of the marks below which their positions are checked, and the speed above which the
 latency is checked."""
 
 MAX_DRIFT_M = 3e-4
-"""The maximum motion of a mark along the sheet's normal between the frame and the exposure.  With a
-larger motion, heights above the expected surface are not checked."""
+"""The maximum motion of a mark along the sheet's normal between the frame and the exposure. With a
+larger motion, the heights of the marks above the expected surface are not checked."""
 
 MAX_GAIN = 4.0
-"""The maximum standard deviation of the finger's estimated depth as a multiple of that of a mark's
-height.  With a larger gain, which marks far from the finger cause, the depth is not estimated."""
+"""The maximum ratio of the standard deviation of the finger's estimated depth to that of a mark's
+height. Marks that are far from the finger cause a larger ratio. The depth is then not estimated."""
 
 
 class ProjectionCheck:
@@ -145,9 +146,10 @@ class ProjectionCheck:
             self._latency.add(np.array([late]), at_ns)
 
     def _velocities(self, number: int) -> Floats | None:
-        """Return the velocities (n, 3) of the marks in a frame, m/s; NaN for marks off the sheet.
+        """Return the velocities (n, 3), m/s, of the marks in a frame; NaN for marks off the sheet.
 
-        number: index of the frame in `_frames`.  Returns None if no velocity is known.
+        number: index of the frame in `_frames`.
+        Returns None if no velocity is known.
         """
         if number == 0:
             return None
