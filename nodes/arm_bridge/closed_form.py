@@ -21,26 +21,27 @@ from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
 Floats = NDArray[np.float64]
 
 WRIST_SINGULAR = 1e-7
-"""The value of |sin J5| below which the axes of J4 and J6 are considered as coincident.  J4 then
-stays constant."""
+"""The value of |sin J5| below which the axes of J4 and J6 are treated as parallel. J4 then stays
+constant."""
 
 SHOULDER_SINGULAR_M = 1e-7
 """The distance of the wrist centre from the axis of J1 below which J1 stays constant."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
-"""The value of |J5| up to which J4 may stay constant, and the value from which J4 is exact."""
+"""The values of |J5| that delimit the wrist singularity. Up to the first value, J4 may stay
+constant. From the second value on, the exact J4 is used."""
 
 SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
-"""The distance of the wrist centre from J1's axis up to which J1 may stay constant, and the
-distance from which J1 is exact."""
+"""The distances between wrist centre and J1 axis that delimit the shoulder singularity. Up to the
+first distance, J1 may stay constant. From the second distance on, the exact J1 is used."""
 
 MAX_FIXED_ERROR_RATIO = 1.4
-"""The maximum pose error near a singularity, as a multiple of WRIST_FIXED_RAD or SHOULDER_FIXED_M:
-1.05 degrees or 1 mm."""
+"""The maximum pose error near a singularity, divided by WRIST_FIXED_RAD or SHOULDER_FIXED_M. The
+maximum errors are 1.05 degrees and 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
-"""The maximum rotation of J4 or J1 in one step to reduce the error near a singularity.  At 140
-steps per second, this is half the maximum speed of these joints."""
+"""The maximum rotation of J4 or J1 in one step to reduce the pose error near a singularity. At 140
+steps per second, it corresponds to half the maximum speed of these joints."""
 
 Shoulder = Literal["front", "back"]
 Elbow = Literal["up", "down"]
@@ -66,24 +67,28 @@ BRANCHES = tuple(
     for elbow in get_args(Elbow)
     for wrist in get_args(Wrist)
 )
-"""All branches, in the order of the results of `ClosedFormKinematics.branches`."""
+"""All eight branches, in the order in which `ClosedFormKinematics.branches` returns the
+solutions."""
 
 
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
-    """Return the rotation matrix (3, 3) of the forearm: J1 about z times J2 + J3 about y."""
+    """Return the rotation matrix (3, 3) of the forearm.
+
+    joint_1: angle of J1 about z, rad. joints_23: sum of the angles J2 and J3 about y, rad.
+    """
     c1, s1, c23, s23 = cos(joint_1), sin(joint_1), cos(joints_23), sin(joints_23)
     return np.array([[c1 * c23, -s1, c1 * s23], [s1 * c23, c1, s1 * s23], [-s23, 0.0, c23]])
 
 
 def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
-    """Return the angle (rad) by which to rotate an axis towards a vector or its opposite.
+    """Return the angle (rad) by which an axis rotates until it is parallel to a vector.
 
-    The nearer one of these two directions is used.  Near a singularity the vector is short, and the
-    rotation is limited.
-    along, across: components of the vector parallel to the axis, and perpendicular to the axis.
-    fixed, near: lengths of the vector.  Up to `fixed`, the axis may deviate by 90 degrees from the
-        vector.  Between `fixed` and `near`, the permitted deviation decreases to zero.  It is
-        reduced by at most MAX_FREE_ROTATION_RAD per step.
+    The axis rotates towards the vector or towards its opposite, whichever is nearer. Near a
+    singularity, the vector is short and the rotation is limited.
+    along, across: components of the vector parallel and perpendicular to the axis.
+    fixed, near: two lengths of the vector. Up to `fixed`, the axis may deviate from the vector by
+        90 degrees. From `fixed` to `near`, the permitted deviation decreases to zero. A permitted
+        deviation is reduced by at most MAX_FREE_ROTATION_RAD per step.
     """
     length = hypot(along, across)
     if length == 0.0:
@@ -98,7 +103,10 @@ def _limited_rotation(along: float, across: float, *, fixed: float, near: float)
 
 
 def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
-    """Return the J6 (rad) for which the rotation by J4, J5 and J6 is nearest to `wrist` (3, 3)."""
+    """Return the angle of J6 (rad) for which J4, J5 and J6 best approximate a rotation.
+
+    wrist: rotation matrix (3, 3) from the forearm to the flange. q4, q5: angles of J4 and J5, rad.
+    """
     s4, c4, s5, c5 = sin(q4), cos(q4), sin(q5), cos(q5)
     first = (c4 * c5, s4 * c5, -s5)
     second = (-s4, c4, 0.0)
@@ -108,14 +116,15 @@ def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
 
 
 def _wrap(angle: float) -> float:
-    """Return the equivalent angle from -pi to pi."""
+    """Return the equivalent angle in the range from -pi to pi (rad)."""
     return atan2(sin(angle), cos(angle))
 
 
 def _nearest_revolution(angle: float, near: float, low: float, high: float) -> float:
-    """Return the equivalent angle (rad) in [low, high] that is nearest to `near`.
+    """Return the angle (rad) in [low, high] that is nearest to `near` and equivalent to `angle`.
 
-    The result is infinite if no equivalent angle is in this range.
+    Two angles are equivalent if they differ by one revolution. The result is infinite if no
+    equivalent angle is in the range.
     """
     best = inf
     for rotated in (angle, angle - 2.0 * pi, angle + 2.0 * pi):
@@ -125,7 +134,7 @@ def _nearest_revolution(angle: float, near: float, low: float, high: float) -> f
 
 
 class ClosedFormKinematics:
-    """The kinematics of one arm in closed form."""
+    """The closed-form kinematics of a 6-axis arm with a spherical wrist."""
 
     def __init__(self, model: ClosedFormArm) -> None:
         self.model = model
@@ -144,11 +153,14 @@ class ClosedFormKinematics:
         """The maximum distance (m) of the wrist centre from the shoulder within the range of J3."""
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the Jacobian (n, 6, 6): linear, then angular flange velocity per joint speed."""
+        """Return the Jacobian (n, 6, 6) at joint angles (n, 6) rad.
+
+        The Jacobian maps joint speeds to the linear and then the angular velocity of the flange.
+        """
         return self._chain.jacobian(joints_rad)
 
     def forward(self, joints_rad: ArrayLike) -> Floats:
-        """Return the flange's pose base_from_flange (4, 4) at joint angles (6,) rad."""
+        """Return the flange pose base_from_flange (4, 4) at joint angles (6,) rad."""
         q1, q2, q3, q4, q5, q6 = np.asarray(joints_rad, dtype=np.float64).tolist()
         s2, c2, s23, c23 = sin(q2), cos(q2), sin(q2 + q3), cos(q2 + q3)
         out = self._upper_m * s2 - self._shift_m * c23 + self._forearm_m * s23
@@ -176,28 +188,32 @@ class ClosedFormKinematics:
         return np.array(rows).T
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return the joint angles (6,) rad of a pose on all branches, also beyond their ranges."""
+        """Return the joint angles (6,) rad of all solutions for a flange pose (4, 4).
+
+        The angles may exceed the joint ranges.
+        """
         return [np.array(one) for one in self.branches(base_from_flange, self.model.start_rad)]
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[Branch]:
-        """Return all eight branches."""
+        """Return all eight branches, for any flange pose."""
         return BRANCHES
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return the distances (n,), in m, of poses (n, 4, 4) from the limit of the arm's reach.
+        """Return the distances (n,), m, of flange poses (n, 4, 4) from the arm's maximum reach.
 
-        A distance is positive if the wrist centre is within the reach.
+        A distance is positive if the wrist centre is within reach.
         """
         wrist = base_from_flange[:, :3, 3] - self._flange_m * base_from_flange[:, :3, 2]
         away = np.linalg.norm(wrist - [0.0, 0.0, self._shoulder_m], axis=1)
         return np.asarray(self.max_wrist_m - away)
 
     def branches(self, base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
-        """Return all joint angles (rad) that reach a flange pose, in the order of `BRANCHES`.
+        """Return all solutions (rad) of the inverse kinematics for a flange pose (4, 4).
 
-        present_rad: present joint angles (6,), which replace angles that are undefined at a
-            singularity.
-        Angles may exceed the joint ranges.  The list is empty if the wrist centre is out of reach.
+        present_rad: present joint angles (6,). At a singularity, they replace the angles that are
+            undefined.
+        The solutions are in the order of `BRANCHES`. Their angles may exceed the joint ranges. The
+        list is empty if the wrist centre is out of reach.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         rotation = base_from_flange[:3, :3]
@@ -231,10 +247,10 @@ class ClosedFormKinematics:
         return found
 
     def inverse_kinematics(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Return the joint angles (6,) rad for a flange pose nearest to the present angles.
+        """Return the joint angles (6,) rad for a flange pose, nearest to the present angles (6,).
 
-        The nearest solution has the smallest maximum joint change.  Joint ranges may exceed 360
-        degrees, so angles that differ by one revolution are also tried.  Raises UnreachableError if
+        The nearest solution has the smallest maximum joint change. Joint ranges may exceed 360
+        degrees, so angles that differ by one revolution are also tried. Raises UnreachableError if
         no solution is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
@@ -255,16 +271,14 @@ class ClosedFormKinematics:
         return np.array(nearest)
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-        """Return the joint angles (6,) rad for the next step of a motion.
+        """Return the joint angles (6,) rad for the next step of a motion to a flange pose (4, 4).
 
-        The result is exact except near two singularities.  Near J5 = 0, the exact J4 is the
-        direction of a vector of length sin(J5).  This direction changes arbitrarily fast if the
-        vector is short, so J4 may lag there.  J5 then follows the component of the vector along J4,
-        and the other component is ignored.  The orientation error of the flange is at most
-        MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD.  J1 is treated in the same way when the wrist
-        centre is near its axis.
+        The result is exact except near two singularities. Near J5 = 0, a small motion of the flange
+        would require a fast rotation of J4. J4 may therefore lag there, and J5 reduces the
+        remaining error. The orientation error of the flange is at most MAX_FIXED_ERROR_RATIO *
+        WRIST_FIXED_RAD. J1 may lag too if the wrist centre is near the J1 axis.
 
-        If the solution is not within the joint ranges, another branch is selected.  Raises
+        If the solution exceeds the joint ranges, another branch is selected. Raises
         UnreachableError if no branch is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
@@ -305,10 +319,11 @@ class ClosedFormKinematics:
         return self.inverse_kinematics(base_from_flange, present)
 
     def _bend(self, out: float, height: float) -> float | None:
-        """Return the angle (0 to pi) between upper arm and elbow-wrist line; None if out of reach.
+        """Return the angle (0 to pi rad) between the upper arm and the line from elbow to wrist.
 
         out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder, in
-        the plane of the arm.
+            the plane of the arm.
+        Returns None if the wrist centre is out of reach.
         """
         cosine = (out * out + height * height - self._upper_m**2 - self._elbow_to_wrist_m**2) / (
             2.0 * self._upper_m * self._elbow_to_wrist_m
@@ -318,7 +333,11 @@ class ClosedFormKinematics:
         return acos(min(1.0, max(-1.0, cosine)))
 
     def _solve_shoulder(self, out: float, height: float, q3: float) -> float:
-        """Return J2 (rad) for the position of the wrist centre (see `_bend`) and J3 (rad)."""
+        """Return the angle of J2 (rad) that places the wrist centre.
+
+        out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder, in
+            the plane of the arm. q3: angle of J3, rad.
+        """
         along = self._forearm_m * sin(q3) - self._shift_m * cos(q3)
         up = self._upper_m + self._shift_m * sin(q3) + self._forearm_m * cos(q3)
         return _wrap(atan2(out, height) - atan2(along, up))
@@ -346,7 +365,10 @@ class ClosedFormKinematics:
         )
 
     def _beyond(self, solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
-        """Return the excess beyond the range (rad), the index and the angle (rad) of each joint."""
+        """Return the range violation (rad), the index and the angle (rad) of each joint.
+
+        A range violation is negative if the angle is within the joint range.
+        """
         found = []
         for joint, (angle, low, high) in enumerate(
             zip(solution, self._lowest, self._highest, strict=True)
@@ -357,7 +379,10 @@ class ClosedFormKinematics:
         return found
 
     def find_branch(self, joints_rad: ArrayLike) -> Branch:
-        """Return the branch of joint angles (6,) rad; at a singularity, the first that matches."""
+        """Return the branch to which joint angles (6,) rad belong.
+
+        At a singularity, where several branches match, the first branch is returned.
+        """
         joints = np.asarray(joints_rad, dtype=np.float64)
         return Branch(
             "front" if self._out(joints) >= 0.0 else "back",
@@ -370,9 +395,9 @@ class ClosedFormKinematics:
     ) -> Floats:
         """Return joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
 
-        Angles may exceed the joint ranges. They are NaN for poses out of reach. Among the
-        equivalent angles of a joint, an angle within its range and near `near_rad` (6,) is
-        selected.
+        near_rad: joint angles (6,). Of equivalent angles within the joint range, an angle near
+            `near_rad` is selected.
+        Angles may exceed the joint ranges. They are NaN for poses that are out of reach.
         """
         poses = np.asarray(base_from_flange, dtype=np.float64)
         wrist = poses[:, :3, 3] - self._flange_m * poses[:, :3, 2]
@@ -413,9 +438,10 @@ class ClosedFormKinematics:
         return joints
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return the margins (n,) of joint angles (n, 6) to each singularity's minimum distance.
+        """Return the margins (n,) of joint angles (n, 6) rad with respect to each singularity.
 
-        A margin is negative if the angles are nearer to the singularity than permitted.
+        A margin is the distance from the singularity minus the minimum distance. It is negative if
+        the arm is too near to the singularity.
         """
         joints = np.asarray(joints_rad, dtype=np.float64)
         elbow = np.remainder(joints[..., 2] - self.elbow_rad + 0.5 * pi, pi) - 0.5 * pi
@@ -427,9 +453,10 @@ class ClosedFormKinematics:
         }
 
     def _out(self, joints: Floats) -> Floats:
-        """Return the distance (m) of the wrist centre from the axis of J1 in the arm's plane.
+        """Return the horizontal distance (m) of the wrist centre from the axis of J1.
 
-        The distance is negative if the wrist centre is behind the axis.
+        joints: joint angles (..., 6) rad. The distance is negative if the wrist centre is behind
+            the axis.
         """
         q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
         return np.asarray(

@@ -1,4 +1,7 @@
-"""Schedule an arm's commands: a command when a target arrives, and periodic commands in between."""
+"""Determine when to send commands to an arm.
+
+A command is sent when a target arrives, and periodically between targets.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class CommandScheduler:
-    """A schedule of an arm's commands.
+    """A scheduler for the commands to one arm.
 
-    period_s: period of periodic commands.  target_period_s: period of targets.
-    idle_period_s: period of commands to an idle arm, short enough for the arm's watchdog.
-    In all methods, sent_ns is the time of the last command, or 0 before the first command.
+    period_s: time between periodic commands. target_period_s: time between targets.
+    idle_period_s: time between commands to an idle arm, which is short enough for the arm's
+        watchdog.
+    The argument `sent_ns` of all methods is the time of the last command, or 0 before the first
+    command.
     """
 
     period_s: float
@@ -19,28 +24,29 @@ class CommandScheduler:
     idle_period_s: float
 
     def wait_s(self, now_ns: int, sent_ns: int) -> float:
-        """Return the time (s) until half a period has passed since the last command.
+        """Return the time (s) until the next command may be sent.
 
-        This is the minimum time between commands, because a step in a shorter time is too fast.
+        The minimum time between two commands is half a period. With a shorter time, the computed
+        speed of the arm would be too high.
         """
         since_s = (now_ns - sent_ns) * 1e-9
         return max(0.0, 0.5 * self.period_s - since_s) if sent_ns else 0.0
 
     def step_s(self, now_ns: int, sent_ns: int) -> float:
-        """Return the duration (s) of the motion that a command covers: 0.5 to 2 periods."""
+        """Return the duration (s) of the motion for the next command: 0.5 to 2 periods."""
         since_s = (now_ns - sent_ns) * 1e-9
         return min(max(since_s, 0.5 * self.period_s), 2.0 * self.period_s)
 
     def is_due(self, now_ns: int, sent_ns: int, target_ns: int) -> bool:
-        """Return whether to send a periodic command now.
+        """Return whether a periodic command must be sent now.
 
-        target_ns: time of arrival of the newest target.
-        No command is sent shortly before the next target is due, because the command for this
-        target would have to wait for the answer.
+        target_ns: arrival time of the newest target.
+        No periodic command is sent shortly before the next target is due. Otherwise the arm would
+        still be busy with the periodic command when the target arrives.
         """
         due_s = self.target_period_s - (now_ns - target_ns) * 1e-9
         return self.wait_s(now_ns, sent_ns) == 0.0 and abs(due_s) > 0.5 * self.period_s
 
     def is_due_when_idle(self, now_ns: int, sent_ns: int) -> bool:
-        """Return whether to send a command to an idle arm now."""
+        """Return whether a command to an idle arm must be sent now."""
         return not sent_ns or (now_ns - sent_ns) * 1e-9 >= self.idle_period_s

@@ -1,10 +1,10 @@
-"""Compute the command of one arm in each cycle: follow the sheet's target, pause, stop or relax.
+"""Compute the command of one arm in each cycle: follow the target, stop or slacken the sheet.
 
-Two arms hold an elastic sheet between them.  Each arm is controlled by its own node, the bridge.
-To relax means to slacken the sheet.  This module uses no sockets and no clock: the node provides
-the inputs and the duration of the cycle, and sends the returned command.  `state_machine` defines
-the states and their transitions.  Both bridges apply the same speed bounds to the sheet, which
-synchronizes the two arms on long paths.
+Two arms hold an elastic sheet between them. Each arm is controlled by its own node, the bridge.
+This module uses no sockets and no clock. The node provides the inputs and the duration of the
+cycle, and sends the returned command. `state_machine` defines the states and their transitions.
+Both bridges apply the same speed bounds to the sheet, which synchronizes the two arms on long
+paths.
 """
 
 from __future__ import annotations
@@ -72,32 +72,34 @@ from flexsheet.nodes.models.rigid import is_rigid
 Floats = NDArray[np.float64]
 
 MAX_REST_RAD_PER_S = 1e-6
-"""The maximum joint speed of an arm at rest."""
+"""The joint speed up to which an arm is considered to be at rest."""
 
 # At this stretch rate the sheet becomes slack in about a second.
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
-"""The distances (position, rotation, stretch) from the target below which the sheet moves with
-FOLLOW_BOUNDS instead of START_BOUNDS."""
+"""The position (m), rotation (rad) and stretch deviations from the target that end the slow start.
+With smaller deviations, the sheet moves with the faster FOLLOW_BOUNDS instead of START_BOUNDS."""
 
 MEASURED_SLACK_M = 0.002
-"""The distance by which a measured flange may exceed a limit of commands, because servos ripple."""
+"""The distance by which a measured flange position may exceed a limit, because servos ripple."""
 
 SLACK_STRETCH = 1.0005
-"""The maximum stretch ratio of a slack sheet.  The tension at this ratio is 0.1 N."""
+"""The stretch ratio (length / rest length) up to which the sheet is considered slack. At this
+ratio, the tension is 0.1 N."""
 
 NO_MOTION = np.zeros(6)
 
 IMPLAUSIBLE_LENGTH_RATIO = 1.1
-"""The ratio of a measured sheet length to its limit above which the measurement is wrong."""
+"""The ratio of a measured sheet length to the maximum length above which the measurement is
+wrong."""
 
 MAX_JOINT_JUMP_RAD = 0.35
-"""The maximum change of the joint goal in one cycle.  A larger change would lead to another branch
-of joint solutions."""
+"""The maximum change of the joint goal in one cycle. A larger change would switch to another branch
+of the inverse kinematics."""
 
 RELAX_DELAY_S = 0.5
-"""The time without a target or permission to move after which an arm slackens the sheet."""
+"""The time without a target or a permission to move after which the arms slacken the sheet."""
 
 STALE_REASONS = {
     Freshness.STALLED: "the counters of its status stand still, so its joint angles are not used",
@@ -109,23 +111,28 @@ MAX_WAIT_FOR_OTHER_S = 1.0
 """The time after which an armed arm is disarmed if the other arm is not armed."""
 
 MAX_ARMING_AGE_S = 1.0
-"""The maximum age of an arming command.  An older command may not be the operator's intention."""
+"""The maximum age of an arming command. An older command is refused, because the operator may no
+longer intend it."""
 
 ALIGNED_RAD = 1e-4
-"""The maximum distance of the joint angles from the goal of an alignment (see `path_check`) at
-which the alignment is complete."""
+"""The maximum difference between the joint angles and the goal of an alignment (see `path_check`)
+at which the alignment is complete."""
 
 MAX_BEYOND_RANGE_RAD = 0.02
-"""The maximum distance of measured joint angles outside their ranges. A larger distance is a
-measurement error."""
+"""The maximum angle by which measured joint angles may be out of range. A larger angle is treated
+as a measurement error."""
 
 RECHECK_PERIOD_S = 0.5
-"""The time after which a blocked path is checked again, since the target may have moved."""
+"""The time after which a blocked path is checked again, because the target may have moved."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """The delays (s) of an input after which the arm decelerates and after which it is disarmed."""
+    """The maximum delays (s) of an input from the planner or the other arm.
+
+    hold_after_s: delay after which the arm decelerates. stop_after_s: delay after which the arm is
+        disarmed.
+    """
 
     hold_after_s: float
     stop_after_s: float
@@ -143,10 +150,10 @@ class ArmControl:
     """A controller of one arm, which computes one command per cycle.
 
     faults: texts of the faults, which are latched until `reset`.
-    reason: why the arm does not follow the target; shown to the operator.
-    auto_arming: whether the arm is armed whenever no interlock forbids motion.  Otherwise the
-        operator arms the arm.  Every interlock disarms the arm until it is armed again.
-    pending_check: path that must be checked; `on_path_result` receives the result.
+    reason: text for the operator that explains why the arm does not follow the target.
+    auto_arming: whether the arm is armed automatically whenever no interlock forbids motion.
+        Otherwise the operator must arm the arm, also after every interlock.
+    pending_check: path that must be checked; the method `on_path_result` receives the result.
     """
 
     def __init__(
@@ -192,7 +199,7 @@ class ArmControl:
 
     @property
     def mode(self) -> ArmMode:
-        """Return the mode that the bridge publishes for the state."""
+        """Return the mode that the bridge publishes for the present state."""
         return "fault" if self._state is State.TAUT and self.faults else MODES[self._state]
 
     @property
@@ -202,7 +209,10 @@ class ArmControl:
 
     @property
     def all_faults(self) -> tuple[str, ...]:
-        """Return the faults, the e-stop and the lost connection as texts for the other arm."""
+        """Return the texts of the faults, of the e-stop and of a lost connection.
+
+        The bridge sends them to the other arm.
+        """
         estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
         lost = (self.reason,) if self._state is State.DISCONNECTED else ()
         return (*self.faults, *estop, *lost)
@@ -219,11 +229,14 @@ class ArmControl:
 
     @property
     def is_idle(self) -> bool:
-        """Return whether the arm rests until an operator's command and may be polled less often."""
+        """Return whether the arm rests and waits for an operator's command.
+
+        An idle arm needs less frequent commands.
+        """
         return self._state is State.IDLE and self.at_rest
 
     def handle(self, event: Event) -> None:
-        """Change the state by the transition table `TRANSITIONS`."""
+        """Change the state according to the transition table `TRANSITIONS`."""
         target = TRANSITIONS[self._state, event]
         if target is None:
             return
@@ -233,11 +246,11 @@ class ArmControl:
         self._state = target
 
     def on_answer_missed(self, text: str) -> bool:
-        """Tolerate one exchange without an answer; return False for a second consecutive one.
+        """Handle a command without an answer; return False if it is the second in succession.
 
-        The next command continues from the command that was not answered. The arm's own watchdog
-        stops the arm if it receives no command for too long.
-        text: reason for the operator.
+        After the first missing answer, the motion continues from the unanswered command. The arm's
+        own watchdog stops the arm if no commands arrive.
+        text: reason that is shown to the operator.
         """
         if self._missed or self.measured_rad is None:
             return False
@@ -250,9 +263,9 @@ class ArmControl:
         return True
 
     def on_exchange_failed(self, text: str, *, silent: bool) -> bool:
-        """Handle a failed exchange; return True if the arm has just been lost.
+        """Handle a failed exchange; return True if the connection to the arm has just been lost.
 
-        text: reason for the operator.  silent: whether no answer arrived.
+        text: reason that is shown to the operator. silent: whether the arm has not answered.
         """
         if silent and self.last_measured_rad is None:
             # The arm has never answered, so it may still be starting, which is no fault.
@@ -278,9 +291,9 @@ class ArmControl:
         arm_faults: tuple[ArmFault, ...],
         freshness: Freshness = Freshness.FRESH,
     ) -> None:
-        """Store the faults and the measured joint angles (6,) rad of an arm's answer.
+        """Store the faults and the measured joint angles (6,) rad that the arm has reported.
 
-        Angles that are not fresh are ignored.
+        The joint angles are ignored if their freshness does not permit their use.
         """
         self._missed = False
         self._standstill.on_measurement(joints_rad, freshness)
@@ -305,7 +318,10 @@ class ArmControl:
         self._must_idle = True
 
     def on_scene_changed(self) -> None:
-        """Stop the arm, and check the path again before the next motion."""
+        """Stop the arm after a change of the scene.
+
+        The path is checked again before the next motion.
+        """
         self.pending_check = self._clear_path = self._blocked = None
         self.handle(Event.SCENE_CHANGED)
 
@@ -316,12 +332,12 @@ class ArmControl:
     def on_estop(
         self, estop: EStop, stamp_ns: int, now_ns: int, clock_problem: str = ""
     ) -> str | None:
-        """Engage or reset the e-stop; return why a reset is refused, or None.
+        """Engage or reset the e-stop; return the reason if a reset is refused, otherwise None.
 
         stamp_ns: timestamp of the message.
-        clock_problem: why the timestamp is uncertain; empty if it is certain.
-        Several nodes publish e-stops, which may arrive in any order.  A reset is therefore refused
-        if it is older than the last stop, or if its timestamp is in the future.
+        clock_problem: reason why the timestamp is uncertain; empty if the timestamp is certain.
+        Several nodes publish e-stops, and their messages may arrive in any order. A reset is
+        therefore refused if it is older than the last stop, or if its timestamp is in the future.
         """
         if estop.engaged:
             # With a timestamp in the future, the stop would block every reset until that time.
@@ -339,7 +355,7 @@ class ArmControl:
         return None
 
     def reset(self) -> bool:
-        """Clear the e-stop and all faults; return False if this is refused while the arm moves."""
+        """Clear the e-stop and all faults; return False if the arm moves, which forbids a reset."""
         if not self.at_rest:
             return False
         self.estop_reason, self.faults = None, ()
@@ -350,9 +366,10 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm the arm by an operator's command; return why it is refused, or None.
+        """Arm or disarm the arm on an operator's command.
 
         age_s: age of the command.
+        Returns the reason if the command is refused, otherwise None.
         """
         if not arming.ready:
             self._disarm_reason = f"disabled: {arming.reason}" if arming.reason else "disabled"
@@ -372,7 +389,7 @@ class ArmControl:
         self.handle(Event.ARM)
 
     def _inhibit(self, reason: str, event: Event = Event.INTERLOCK) -> None:
-        """Disarm the arm by an event, and prevent arming for the given reason."""
+        """Disarm the arm by the given event, and forbid arming for the given reason."""
         self._interlock_reason = reason
         self._disarm(reason, event)
 
@@ -385,7 +402,10 @@ class ArmControl:
     def _check_interlocks(
         self, goal: Goal | None, other: OtherArm | None, clock_problem: str
     ) -> None:
-        """Disarm the arm if an interlock forbids motion; otherwise arm it if `auto_arming`."""
+        """Disarm the arm if an interlock forbids motion.
+
+        If no interlock forbids motion and `auto_arming` is set, arm the arm.
+        """
         silent = other is None or not other.age_s <= self._timeouts.stop_after_s
         stopped = self.estop_reason is not None or (other is not None and other.estopped)
         reason = self._find_interlock(goal, None if silent else other)
@@ -401,14 +421,14 @@ class ArmControl:
         if clock_problem:
             self._inhibit(clock_problem)
         if silent or stopped or clock_problem:
-            # From now on the arm must not slacken the sheet (see the states TAUT and SLACK).
+            # From now on the arm must not slacken the sheet (see the state TAUT).
             self.handle(Event.ISOLATED)
         self._settle()
 
     def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
         """Return the text of the interlock that forbids motion, or None.
 
-        other: state of the other arm; None if its messages are too late.
+        other: state of the other arm; None if its messages are late.
         """
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
@@ -428,7 +448,7 @@ class ArmControl:
         return None
 
     def _settle(self) -> None:
-        """Change the state if a stop or a fault is latched, or if the arm has come to rest."""
+        """Update the state for a latched e-stop, for a latched fault, and for an arm at rest."""
         for _ in range(2):
             if self.estop_reason is not None:
                 self.handle(Event.ESTOP)
@@ -445,10 +465,12 @@ class ArmControl:
         step_s: float,
         clock_problem: str = "",
     ) -> Command:
-        """Compute this cycle's command, which covers `step_s` seconds.
+        """Compute the command of this cycle, which covers `step_s` seconds.
 
-        goal, other: target of the sheet and state of the other arm; None until received.
-        clock_problem: why the ages of `goal` and `other` are unknown; empty if they are known.
+        goal: target of the sheet; None before the first target.
+        other: state of the other arm; None before its first message.
+        clock_problem: reason why the ages of `goal` and `other` are unknown; empty if they are
+            known.
         """
         measured = self.measured_rad
         if measured is None or self._must_idle:
@@ -477,7 +499,7 @@ class ArmControl:
         return self._move_to_target(geometry, goal, other, measured, step_s)
 
     def _find_stop(self, other: OtherArm | None, clock_problem: str) -> str | None:
-        """Return why the arm must stop and must not slacken the sheet, or None."""
+        """Return the reason if the arm must stop without slackening the sheet, otherwise None."""
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
         if other is not None and other.estopped:
@@ -485,7 +507,10 @@ class ArmControl:
         return clock_problem if clock_problem and not self.faults else None
 
     def _wait_for_arming(self, geometry: ArmGeometry, other: OtherArm, step_s: float) -> Command:
-        """Command a stop and then a slack sheet, until both arms are armed."""
+        """Return the command that stops the arm and then slackens the sheet.
+
+        This command is returned until both arms are armed.
+        """
         self._waited_s += step_s
         if self.ready:
             return self._wait_for_other(geometry, step_s)
@@ -498,9 +523,9 @@ class ArmControl:
         return self._decelerate(reason, geometry, step_s)
 
     def _wait_for_other(self, geometry: ArmGeometry, step_s: float) -> Command:
-        """Command a stop because the other arm is not armed.
+        """Return the command that stops the arm because the other arm is not armed.
 
-        Unless it is about to start, this arm is disarmed too.
+        With manual arming, this arm is disarmed too if it has already moved or has waited too long.
         """
         reason = "the other arm is not ready"
         has_started = self._sheet is not None or not self.at_rest
@@ -518,7 +543,7 @@ class ArmControl:
         measured: Floats,
         step_s: float,
     ) -> Command:
-        """Return the command that follows the target, or checks the path if the arm is at rest."""
+        """Return the command that follows the target; check the path before a motion starts."""
         self._waited_s = 0.0
         if not _is_valid(goal.motion):
             return self._latch_fault("sheet target is not a rigid pose", geometry, step_s)
@@ -537,10 +562,10 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """Return the command that moves the sheet to its target.
+        """Return the command that moves the sheet towards its target.
 
-        The sheet decelerates if the target or the state of the other arm is late, or if the planner
-        or the bridge of the other arm has ended.
+        The sheet decelerates if the target or the state of the other arm is late. It also
+        decelerates if the planner or the bridge of the other arm has ended.
         """
         late_s = max(goal.overdue_s, other.age_s - self._timeouts.hold_after_s)
         is_late = goal.planner_ended or other.ended or late_s > self._timeouts.hold_after_s
@@ -597,9 +622,9 @@ class ArmControl:
         measured: Floats,
         step_s: float,
     ) -> Command:
-        """Start the motion if its path has been checked; otherwise request a check.
+        """Start the motion to the target if its path has been checked; otherwise request a check.
 
-        The other arm's bridge checks the same path.  No arm moves before both checks have passed.
+        The other arm's bridge checks the same path. No arm moves before both checks have passed.
         """
         if not self._stands_still(measured, geometry):
             return self._decelerate("waits for the arm to stand still", geometry, step_s)
@@ -625,10 +650,10 @@ class ArmControl:
         return self._decelerate(reason, geometry, step_s)
 
     def on_path_result(self, request: PathCheckRequest, result: Alignment | str | None) -> None:
-        """Store the result of a path check, unless the request is not the pending one.
+        """Store the result of a path check, and ignore the result of an outdated request.
 
-        result: alignment that first moves the joints to the start of the path; None if no alignment
-            is necessary; or the text why the path is blocked.
+        result: alignment of the joints to the start of the path, or None if no alignment is
+            necessary. If the path is blocked, a text states the reason.
         """
         if request is not self.pending_check:
             return
@@ -687,8 +712,9 @@ class ArmControl:
     ) -> SheetMotion:
         """Return the sheet's motion after one step towards its target.
 
-        The sheet moves slowly until it has reached the target for the first time after a start.
-        speed_factor: factor on the speed bounds, below 1 for the arm that leads the other arm.
+        After a start, the sheet moves slowly until it has first reached the target.
+        speed_factor: factor for the speed bounds; below 1 for the arm that is ahead of the other
+            arm.
         """
         if not self._settled:
             distance_m, angle_rad = measure_distance(sheet, target)
@@ -702,7 +728,7 @@ class ArmControl:
     def _command_sheet(
         self, sheet: SheetMotion, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Return the command for the joint angles that place this arm's edge for a sheet pose."""
+        """Return the command that places this arm's edge for a pose of the sheet."""
         try:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError as error:
@@ -720,7 +746,10 @@ class ArmControl:
     def _command_joints(
         self, goal_rad: Floats, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Return the command towards angles (6,) rad; latch a fault if it violates a limit."""
+        """Return the command that moves towards joint angles (6,) rad.
+
+        If a limit is violated, a fault is latched and the arm stops.
+        """
         velocity = self._limit_velocity(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
         limits = self._limits(geometry)
@@ -743,9 +772,10 @@ class ArmControl:
     def _slacken(
         self, reason: str, geometry: ArmGeometry, other: OtherArm | None, step_s: float
     ) -> Command:
-        """Command a stop; at rest, slacken the sheet by moving this edge towards the other edge.
+        """Return the command that stops the arm and then slackens the sheet.
 
-        reason: text for the operator.
+        The sheet becomes slack because this arm's edge moves towards the other edge.
+        reason: text that is shown to the operator.
         """
         self._settle()
         measured = self.measured_rad
@@ -777,8 +807,8 @@ class ArmControl:
         if starts or self._sheet is None or self._relax_from is None:
             self._restart_at(measured, geometry)
             self._sheet, self._relax_from = between, between.stretch_ratio
-        # Half of a change of stretch falls to each arm.  The other arm rests, so this arm commands
-        # twice the change: from a stretch ratio s to 2 - s instead of to 1.
+        # Each arm executes half of a commanded change of stretch.  The other arm rests, so this arm
+        # commands twice the change: from a stretch ratio s to 2 - s instead of to 1.
         target = replace(
             self._sheet,
             twist_world=np.zeros(6),
@@ -802,9 +832,10 @@ class ArmControl:
         return self._move(velocity, geometry, step_s)
 
     def _decelerate(self, reason: str, geometry: ArmGeometry, step_s: float) -> Command:
-        """Return the command that decelerates along the path, or that commands no motion at rest.
+        """Return the command that decelerates the arm along its path.
 
-        reason: text for the operator.
+        If the arm is at rest, the command keeps it at rest.
+        reason: text that is shown to the operator.
         """
         self.handle(Event.RELAX_BLOCKED)
         self._drop_path()
@@ -832,7 +863,10 @@ class ArmControl:
         return self._move(velocity, geometry, step_s)
 
     def _limit_velocity(self, goal_rad: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
-        """Return joint velocities (6,), rad/s, towards a goal that moves at its last velocity."""
+        """Return joint velocities (6,) rad/s towards the moving goal `goal_rad` (6,).
+
+        The goal is assumed to continue at its last velocity.
+        """
         before = self.commanded_rad if self._goal_rad is None else self._goal_rad
         return limit_velocity(
             self.commanded_rad,
@@ -850,10 +884,10 @@ class ArmControl:
         return self._send("move", self.commanded_rad + velocity * step_s, geometry, step_s)
 
     def _send(self, mode: str, joints_rad: Floats, geometry: ArmGeometry, step_s: float) -> Command:
-        """Return the command for joint angles (6,) rad after two final checks of every command.
+        """Return the command for joint angles (6,) rad after the final checks of every command.
 
-        A fault is latched if the state permits no motion, or if the step exceeds the joint speeds
-        or the tool speed.
+        A fault is latched if the state permits no motion, or if the step exceeds the maximum joint
+        speeds or tool speed.
         """
         before = self.commanded_rad
         if mode == "move" and self._state not in MOTION_STATES:
@@ -881,7 +915,10 @@ class ArmControl:
         return Command(mode, bounded)
 
     def _is_at_command(self, measured: Floats, geometry: ArmGeometry) -> bool:
-        """Return whether the measured angles are near enough to the last command to restart."""
+        """Return whether the measured joint angles (6,) rad are near the last commanded angles.
+
+        The measured and commanded positions of the edge may differ by MAX_RESTART_SHIFT_M.
+        """
         shift_m = geometry.bound_edge_shift_m(self.commanded_rad, measured)
         return shift_m <= MAX_RESTART_SHIFT_M
 
@@ -889,10 +926,10 @@ class ArmControl:
         return self._standstill.is_standing(at_command=self._is_at_command(measured, geometry))
 
     def _restart_refusal(self, measured: Floats, geometry: ArmGeometry) -> str | None:
-        """Return why a motion must not start from the measured joint angles (6,), or None.
+        """Return the reason why a motion must not start from the measured angles (6,) rad, or None.
 
-        The motion may start at the last commanded position.  At another position, the measurement
-        may be wrong, and the arm would then jump.
+        A motion may start near the last commanded position. At another position, it may start only
+        if the measurements are plausible. After a wrong measurement, the arm would jump.
         """
         lowest, highest = geometry.range_rad
         beyond = max(float((lowest - measured).max()), float((measured - highest).max()))
@@ -913,9 +950,9 @@ class ArmControl:
         )
 
     def _restart_at(self, measured: Floats, geometry: ArmGeometry) -> None:
-        """Replace the last commanded joint angles by the measured joint angles.
+        """Replace the last commanded joint angles by the measured joint angles (6,) rad.
 
-        If the arm does not stand still, latch a fault instead.
+        If the arm does not stand still, a fault is latched instead.
         """
         if (
             not self._stands_still(measured, geometry)

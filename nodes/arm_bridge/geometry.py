@@ -23,11 +23,11 @@ Floats = NDArray[np.float64]
 RANGE_MARGIN_RAD = np.radians(2.0)
 
 EDGE_SPEED_FRACTION = 0.95
-"""The fraction of the limiter's tool speed that the sheet's motion may use."""
+"""The fraction of the maximum tool speed that the motion of the sheet may use."""
 
 
 def make_kinematics(model: ClosedFormArm | JointChain) -> ArmKinematics:
-    """Make the kinematics of an arm from its model."""
+    """Make the kinematics object for an arm model."""
     return (
         ClosedFormKinematics(model)
         if isinstance(model, ClosedFormArm)
@@ -36,10 +36,10 @@ def make_kinematics(model: ClosedFormArm | JointChain) -> ArmKinematics:
 
 
 class ArmGeometry:
-    """The geometry of one arm: poses of its base and of the edge that it holds, and its limits.
+    """The geometry and the limits of one arm, and the edge of the sheet that it holds.
 
-    tool_points_flange: (4, 3) m in the flange frame: centre and ends of the clamped edge, and the
-        flange.
+    tool_points_flange: points (4, 3) m in the flange frame: the centre and both ends of the clamped
+        edge, and the flange.
     """
 
     def __init__(self, scene: Scene, side: Side) -> None:
@@ -97,19 +97,19 @@ class ArmGeometry:
         return self._cached_flange(tuple((joints_rad + self._joint_offsets_rad).tolist()))
 
     def _solve_flange(self, joints_rad: tuple[float, ...]) -> Floats:
-        """Return the read-only flange pose (4, 4) at true joint angles (6,) rad."""
+        """Return the read-only pose base_from_flange (4, 4) at true joint angles (6,) rad."""
         pose = self.kinematics.forward(np.array(joints_rad))
         pose.flags.writeable = False
         return pose
 
     def bound_edge_shift_m(self, joints_rad: Floats, other_rad: Floats) -> float:
-        """Return an upper bound of the edge's displacement (m) between two sets of angles (6,)."""
+        """Return an upper bound (m) of the edge's motion between two joint vectors (6,) rad."""
         return float(self._levers_m @ np.abs(joints_rad - other_rad))
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
-        """Return the world pose (4, 4) of the flange, without the compliance of the arm.
+        """Return the world pose (4, 4) of the flange of a rigid arm.
 
-        joints_rad: angles (6,) that the encoders report.
+        joints_rad: joint angles (6,) that the encoders report.
         """
         return self.world_from_base @ self._base_from_flange(joints_rad)
 
@@ -118,37 +118,39 @@ class ArmGeometry:
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
-        """Return points (4, 3) m in the base frame at joint angles (6,) rad.
+        """Return the tool points (4, 3) m in the base frame at joint angles (6,) rad.
 
-        The points are the centre and the ends of the clamped edge, and the flange.
+        The tool points are the centre and both ends of the clamped edge, and the flange.
         """
         return apply(self._base_from_flange(joints_rad), self.tool_points_flange)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
-        """Return joint angles (6,) rad that place this arm's edge for a pose of the sheet.
+        """Return the joint angles (6,) rad that place this arm's edge for a pose of the sheet.
 
-        present_rad: present joint angles (6,), which are near the result.
-        The displacement of the edge by the sheet's tension is compensated.  Raises UnreachableError
-        if the arm cannot reach the pose.
+        present_rad: present joint angles (6,), which must be near the result.
+        The result compensates for the displacement of the edge by the sheet's tension. Raises
+        UnreachableError if the arm cannot reach the pose.
         """
         edge = motion.world_from_sheet.copy()
         edge[:3, 3] += self.edge_offset_m(motion.stretch_ratio) * edge[:3, 0]
         return self.solve_joints(flange_pose(edge, self.flange_from_edge), present_rad)
 
     def edge_offset_m(self, stretch_ratio: float) -> float:
-        """Return the commanded distance (m) of the edge from the sheet's centre along its x axis.
+        """Return the edge's commanded coordinate (m) on the sheet's x axis.
 
-        The result is negative for the left edge.  The tension of the sheet moves the edge from the
-        commanded position towards the other edge.
+        The result is negative for the left edge. It compensates for the tension of the sheet, which
+        pulls the edge towards the other edge.
         """
         length_m = stretch_ratio * self.sheet_limits.width_m
         moved_m = self._compliance_m_per_n * self.sheet_limits.force_n(length_m)
         return (-1.0 if self.left else 1.0) * (0.5 * length_m + moved_m)
 
     def solve_joints(self, world_from_flange: Floats, near_rad: Floats) -> Floats:
-        """Return encoder angles (6,) rad near `near_rad` that place a rigid arm's flange at a pose.
+        """Return the encoder angles (6,) rad that place the flange at a world pose (4, 4).
 
-        Raises UnreachableError if the arm cannot reach the pose (4, 4).
+        near_rad: joint angles (6,) near the result.
+        The compliance of the arm is not compensated. Raises UnreachableError if the arm cannot
+        reach the pose.
         """
         offsets_rad = self._joint_offsets_rad
         base_from_flange = self.base_from_world @ world_from_flange
@@ -156,9 +158,9 @@ class ArmGeometry:
         return np.asarray(joints_rad - offsets_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
-        """Return the sheet at rest between this arm's edge and the other arm's edge.
+        """Return the pose and stretch of a sheet at rest between the edges of both arms.
 
-        own_edge, other_edge: world poses (4, 4) of the edges of rigid arms.
+        own_edge, other_edge: world poses (4, 4) of the edges, without the compliance of the arms.
         """
         limits = self.sheet_limits
         left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)
@@ -177,9 +179,10 @@ class ArmGeometry:
     def sheet_state(
         self, joints_rad: Floats, world_from_other_flange: Floats | None
     ) -> tuple[float | None, float | None]:
-        """Return the distance between the edges (m) and the force on them (N).
+        """Return the distance between the edges (m) and the force on each edge (N).
 
-        Both are None if the pose of the other flange is unknown.
+        joints_rad: joint angles (6,) of this arm. world_from_other_flange: pose (4, 4) of the other
+            flange; if it is None, both results are None.
         """
         if world_from_other_flange is None:
             return None, None

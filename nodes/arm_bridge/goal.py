@@ -23,8 +23,8 @@ from flexsheet.nodes.models.rigid import transform, vector_from_rotation
 
 Floats = NDArray[np.float64]
 
-# Accelerations that the joints can follow (J6 22 rad/s^2, J2 9.4 rad/s^2).  With larger ones the
-# joints would overshoot a target that reverses, and each arm by a different amount.
+# The joints can follow these accelerations (J6 22 rad/s^2, J2 9.4 rad/s^2).  With larger
+# accelerations, each arm would overshoot a target that reverses by a different distance.
 FOLLOW_BOUNDS = SheetBounds(
     speed_m_per_s=0.22,
     acceleration_m_per_s2=2.6,
@@ -35,27 +35,29 @@ FOLLOW_BOUNDS = SheetBounds(
 )
 
 SLOW_FROM_RAD = 0.05
-"""The lead of one edge over the other edge from which the leading arm slows down."""
+"""The lead (rad) of one edge over the other edge above which the leading arm slows down."""
 
 WAIT_FROM_RAD = 0.12
-"""The lead of one edge at which the leading arm waits.  The limiter stops both arms at 0.2 rad."""
+"""The lead (rad) of one edge over the other edge at which the leading arm waits. At 0.2 rad, the
+limiter stops both arms."""
 
 MAX_PREDICTION_S = 0.15
-"""The maximum time by which a target may lie in the future: the prediction horizon and a margin."""
+"""The maximum time by which a target's timestamp may lie in the future. It consists of the
+prediction horizon and a margin."""
 
 MAX_TRAJECTORY_S = 0.4
 """The maximum duration of a trajectory, during which an arm moves without a new message."""
 
 SKEW_LENGTH_M = 0.25
-"""The offset between two sheet poses that has the same weight as a rotation of 1 rad."""
+"""The offset between two sheet poses that counts as much as a rotation of 1 rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """The target of the sheet at the time at which a command takes effect.
+    """The target of the sheet, converted to the time at which a command takes effect.
 
-    overdue_s: time since the next target was due; negative if it is not yet due.
-    planner_ended: whether the planner or a node on which it depends has ended since the target.
+    overdue_s: time since the next target was due; negative before that time.
+    planner_ended: whether the planner, or a node on which it depends, has ended after the target.
     """
 
     motion: SheetMotion
@@ -66,10 +68,11 @@ class Goal:
 def extrapolate_goal(
     motion: SheetMotion, ahead_s: float, overdue_s: float, *, max_extrapolation_s: float
 ) -> Goal:
-    """Extrapolate the target by `ahead_s`, limited to `max_extrapolation_s` in both directions.
+    """Extrapolate the motion of a target by `ahead_s`.
 
-    overdue_s: time since the next target was due.  It is increased if the target needs a longer
-        extrapolation, or if the target is too far in the future.
+    The extrapolation is limited to `max_extrapolation_s` into the past and the future.
+    overdue_s: time since the next target was due. The goal contains a longer time if the limit of
+        the extrapolation is exceeded, or if the target is too far in the future.
     """
     carried_s = min(max(ahead_s, -max_extrapolation_s), max_extrapolation_s)
     late_s = max(overdue_s, ahead_s - max_extrapolation_s, -ahead_s - MAX_PREDICTION_S)
@@ -78,11 +81,11 @@ def extrapolate_goal(
 
 @dataclass(frozen=True, slots=True)
 class GoalTiming:
-    """The times (s) for the conversion of a target to a goal.
+    """The time constants for the conversion of a target to a goal.
 
-    servo_lag_s: time from sending a command until it takes effect.
-    target_period_s: time from a target's arrival until the next is due.
-    max_extrapolation_s: maximum extrapolation of a target.
+    servo_lag_s: time from the transmission of a command until it takes effect.
+    target_period_s: time from the arrival of a target until the next target is due.
+    max_extrapolation_s: maximum time by which a target is extrapolated.
     """
 
     servo_lag_s: float
@@ -91,9 +94,10 @@ class GoalTiming:
 
 
 def find_trajectory(target: SheetTarget) -> SheetTrajectory | None:
-    """Return the trajectory of a target, or None if the arm must not follow the trajectory.
+    """Return the trajectory of a target, or None if the arm must not follow it.
 
-    The speeds and decelerations must be within FOLLOW_BOUNDS, the duration within MAX_TRAJECTORY_S.
+    The arm follows a trajectory only if its speeds and decelerations are within FOLLOW_BOUNDS, and
+    if its duration is at most MAX_TRAJECTORY_S.
     """
     trajectory, bounds = target.trajectory, FOLLOW_BOUNDS
     if trajectory is None or not trajectory.brake_s > 0.0 <= trajectory.keep_s:
@@ -119,9 +123,10 @@ def make_goal(
 ) -> Goal:
     """Convert a target to the goal of a command that is sent now.
 
-    trajectory: result of `find_trajectory` if the other arm also follows the trajectory; the target
-        is then overdue after the end of the trajectory.  None: the target is extrapolated by its
-        twist.
+    received_ns, now_ns: arrival time of the target, and present time.
+    trajectory: result of `find_trajectory` if the other arm follows the trajectory too. The target
+        is then overdue as soon as the trajectory has ended. If None, the target is extrapolated
+        with its velocity.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s
@@ -142,15 +147,15 @@ def make_goal(
 def compute_sync_factor(
     own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool
 ) -> float:
-    """Return the factor (0..1) on an arm's speed that lets the other arm catch up.
+    """Return the factor (0..1) for this arm's speed that lets the other arm catch up.
 
     own_edge, other_edge: world poses (4, 4) of the commanded edges.
     target: target pose world_from_sheet (4, 4).
     left: whether this arm holds the left edge.
 
-    Each arm's node computes its commands in its own cycles, so a late cycle on one side twists the
-    sheet.  The arm that is ahead on the path to the target slows in proportion to its lead.  The
-    arms cannot wait for each other, because only one of them can be ahead.
+    The two bridges compute their commands at different times, so a late cycle of one bridge twists
+    the sheet. The arm that is ahead on the path to the target slows down in proportion to its lead.
+    Only one arm can be ahead, so the arms never wait for each other.
     """
     across = other_edge[:3, 3] - own_edge[:3, 3]
     half = (0.5 if left else -0.5) * sqrt(float(across @ across))
@@ -166,7 +171,7 @@ def compute_sync_factor(
 
 
 def scale_speeds(bounds: SheetBounds, factor: float) -> SheetBounds:
-    """Multiply the speeds of the bounds by a factor; the accelerations do not change."""
+    """Multiply the speed bounds by a factor, and leave the acceleration bounds unchanged."""
     if factor == 1.0:
         return bounds
     return replace(
@@ -178,7 +183,7 @@ def scale_speeds(bounds: SheetBounds, factor: float) -> SheetBounds:
 
 
 def _sheet_centre(edge: Floats, along_m: float) -> Floats:
-    """Return the sheet's pose (4, 4) from an edge's pose (4, 4).
+    """Return the pose (4, 4) of the sheet's centre from the pose (4, 4) of an edge.
 
     along_m: coordinate of the sheet's centre on the x axis of the edge.
     """
@@ -186,6 +191,9 @@ def _sheet_centre(edge: Floats, along_m: float) -> Floats:
 
 
 def _difference(pose: Floats, other: Floats) -> Floats:
-    """Return the difference (6,) of two poses: rotation (rad), then offset / SKEW_LENGTH_M."""
+    """Return the difference of two poses (4, 4) as one vector (6,).
+
+    The vector consists of the rotation (rad) and the offset divided by SKEW_LENGTH_M.
+    """
     rotation = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
     return np.concatenate([rotation, (other[:3, 3] - pose[:3, 3]) / SKEW_LENGTH_M])

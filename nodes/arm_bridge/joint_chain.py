@@ -25,35 +25,36 @@ MAX_STEPS = 12
 """The maximum number of Newton steps from known joint angles. A control cycle needs 2 or 3."""
 
 WAYPOINTS, STEPS_PER_WAYPOINT = 8, 5
-"""The number of intermediate poses to a distant pose, and the number of Newton steps for each of
-them."""
+"""The number of intermediate poses on the way to a distant pose, and the number of Newton steps for
+each intermediate pose."""
 
 MAX_STEP_RAD = 0.3
 """The maximum change of a joint in one Newton step."""
 
 TOLERANCE = 1e-8
-"""The error of a solved pose (m, rad) below which the iteration ends."""
+"""The pose error (m and rad) at which the Newton iteration ends."""
 
 MAX_ERROR = 1e-6
-"""The maximum error (m and rad) of an accepted solution."""
+"""The maximum pose error (m and rad) of an accepted solution."""
 
 DAMPING = 1e-9
 """The damping term of the normal equations, which limits the steps at a singularity."""
 
 SINGULAR_LENGTH_M = 0.25
-"""The length by which the velocities in the Jacobian are divided to obtain angular velocities."""
+"""The length by which linear velocities in the Jacobian are divided, so that all its rows have the
+same unit."""
 
 MIN_SINGULAR_VALUE, NEAR_SINGULAR_VALUE = 0.01, 0.05
-"""The minimum of the smallest singular value of the Jacobian for single poses and for paths.  At
-the second value, a speed of 0.25 m/s needs joint speeds of at most 20 rad/s."""
+"""The minimum values of the Jacobian's smallest singular value, for single poses and for paths. At
+the second value, a flange speed of 0.25 m/s requires at most 20 rad/s of each joint."""
 
 SEEDS = 256
-"""The number of random joint vectors from which `solve_all` starts."""
+"""The number of random joint vectors from which `solve_all` searches for solutions."""
 
 SEED_STEPS = 40
 
 MIN_DIFFERENCE = 0.02
-"""The minimum value of |sin(difference / 2)| of a joint in two distinct solutions."""
+"""The minimum of |sin(difference / 2)| for at least one joint of two distinct solutions."""
 
 
 class SerialChain:
@@ -78,7 +79,10 @@ class SerialChain:
         self.flange_m = float(np.linalg.norm(model.flange.position_m))
 
     def _frames(self, joints_rad: Floats) -> list[Floats]:
-        """Return the poses (..., 4, 4) of all joints and of the flange in the base frame."""
+        """Return the poses (..., 4, 4) of all joints and of the flange in the base frame.
+
+        joints_rad: joint angles (..., 6).
+        """
         angles = joints_rad[..., None, None]
         links = self._constant + np.sin(angles) * self._sine + np.cos(angles) * self._cosine
         frames = [links[..., 0, :, :]]
@@ -87,15 +91,21 @@ class SerialChain:
         return [*frames, frames[-1] @ self._flange]
 
     def forward(self, joints_rad: Floats) -> Floats:
-        """Return base_from_flange (..., 4, 4) at joint angles (..., 6) rad."""
+        """Return the flange poses base_from_flange (..., 4, 4) at joint angles (..., 6) rad."""
         return self._frames(joints_rad)[-1]
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the Jacobian (..., 6, 6): linear, then angular flange velocity per joint speed."""
+        """Return the Jacobian (..., 6, 6) at joint angles (..., 6) rad.
+
+        The Jacobian maps joint speeds to the linear and then the angular velocity of the flange.
+        """
         return self.pose_and_jacobian(joints_rad)[1]
 
     def pose_and_jacobian(self, joints_rad: Floats) -> tuple[Floats, Floats]:
-        """Return base_from_flange (..., 4, 4), and the Jacobian (..., 6, 6) in the base frame."""
+        """Return the flange poses (..., 4, 4) and the Jacobian (..., 6, 6) in the base frame.
+
+        joints_rad: joint angles (..., 6).
+        """
         *frames, flange = self._frames(joints_rad)
         placed = np.stack(frames, axis=-3)
         x, y, z = np.moveaxis((placed[..., :3, :3] @ self._axes[:, :, None])[..., 0], -1, 0)
@@ -104,16 +114,16 @@ class SerialChain:
         return flange, np.stack(rows, axis=-2)
 
     def levers_m(self, beyond_flange_m: float) -> Floats:
-        """Return upper bounds (6,), in m, of the distances of a point from the joint axes.
+        """Return upper bounds (6,), in m, of a tool point's distance from each joint axis.
 
-        beyond_flange_m: distance of the point from the flange.
+        beyond_flange_m: distance of the tool point from the flange.
         """
         after = np.append(self.offsets_m[1:], self.flange_m + beyond_flange_m)
         return np.asarray(np.cumsum(after[::-1])[::-1])
 
 
 class NumericKinematics:
-    """The kinematics of one arm by Newton's method."""
+    """The kinematics of one arm, which are solved numerically by Newton's method."""
 
     def __init__(self, model: JointChain) -> None:
         self.model = model
@@ -122,7 +132,7 @@ class NumericKinematics:
         self._start = np.array(model.start_rad)
 
     def forward(self, joints_rad: Floats) -> Floats:
-        """Return base_from_flange (4, 4) at joint angles (6,) rad."""
+        """Return the flange pose base_from_flange (4, 4) at joint angles (6,) rad."""
         return self._chain.forward(np.asarray(joints_rad, dtype=np.float64))
 
     def jacobian(self, joints_rad: Floats) -> Floats:
@@ -130,7 +140,10 @@ class NumericKinematics:
         return self._chain.jacobian(joints_rad)
 
     def _refine(self, poses: Floats, joints_rad: Floats, steps: int) -> tuple[Floats, Floats]:
-        """Return joint angles (n, 6) after Newton steps towards poses (n, 4, 4), and errors."""
+        """Improve joint angles (n, 6) rad for flange poses (n, 4, 4) by Newton steps.
+
+        Returns the joint angles (n, 6) and the remaining errors (n,).
+        """
         joints = joints_rad
         for left in reversed(range(steps + 1)):
             flanges, slopes = self._chain.pose_and_jacobian(joints)
@@ -146,7 +159,10 @@ class NumericKinematics:
         return joints, largest
 
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
-        """Return joint angles (n, 6) for poses, on the branch of `joints_rad`, and errors (n,)."""
+        """Return joint angles (n, 6) rad for flange poses (n, 4, 4), and the errors (n,).
+
+        The arm moves through intermediate poses, so the result is on the branch of `joints_rad`.
+        """
         start = self.forward(joints_rad)
         rotation = scipy.spatial.transform.Rotation
         turns = rotation.from_matrix(poses[:, :3, :3] @ start[:3, :3].T).as_rotvec()
@@ -160,7 +176,7 @@ class NumericKinematics:
         return self._refine(poses, joints, STEPS_PER_WAYPOINT)
 
     def solve_next_joints(self, base_from_flange: Floats, present_rad: Floats) -> Floats:
-        """Return joint angles (6,) rad for a flange pose (4, 4) near the present angles (6,).
+        """Return the joint angles (6,) rad for a flange pose (4, 4) near the present angles (6,).
 
         Raises UnreachableError if there is no solution, if a joint is out of its range, or if the
         pose is too near to a singularity.
@@ -207,10 +223,10 @@ class NumericKinematics:
         return np.asarray(found)
 
     def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return distinct joint angles (6,) rad that reach a pose within the joint ranges.
+        """Return all known joint solutions (6,) rad for a flange pose within the joint ranges.
 
-        They are sorted by their distance from the start angles. The search starts from random
-        angles with a fixed seed, so it may miss a solution.
+        The solutions are sorted by their distance from the start angles. The search starts from
+        random angles with a fixed seed, so it may miss a solution.
         """
         random = np.random.default_rng(1)
         low, high = np.maximum(self._lowest, -pi), np.minimum(self._highest, pi)
@@ -229,11 +245,11 @@ class NumericKinematics:
         return sorted(found, key=lambda one: float(np.abs(one - self._start).max()))
 
     def find_branch(self, joints_rad: Floats) -> SeedBranch:
-        """Return the branch that continues from joint angles (6,) rad."""
+        """Return the branch to which joint angles (6,) rad belong."""
         return SeedBranch(tuple(float(angle) for angle in joints_rad))
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:
-        """Return the branches on which the arm reaches the first reachable of poses (n, 4, 4)."""
+        """Return the branches on which the arm reaches the first reachable pose of (n, 4, 4)."""
         for pose in base_from_flange:
             if found := self.solve_all(pose):
                 return [self.find_branch(joints) for joints in found]
@@ -242,7 +258,10 @@ class NumericKinematics:
     def solve_joints_on_branch(
         self, base_from_flange: Floats, branch: SeedBranch, near_rad: Floats
     ) -> Floats:
-        """Return joint angles (n, 6) rad for poses (n, 4, 4) on one branch; NaN if out of reach."""
+        """Return the joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
+
+        The angles are NaN for poses that are out of reach.
+        """
         joints, errors = self._continue(base_from_flange, np.array(branch.seed_rad))
         return np.where(errors[:, None] <= MAX_ERROR, joints, np.nan)
 
@@ -251,12 +270,18 @@ class NumericKinematics:
         return float(self._chain.offsets_m.sum() + self._chain.flange_m)
 
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
-        """Return the sum (m) of all link lengths minus the distances (n,) of poses (n, 4, 4)."""
+        """Return the distances (n,), m, of flange poses (n, 4, 4) from the arm's maximum reach.
+
+        The maximum reach is the sum of all link lengths. A distance is positive within reach.
+        """
         away = np.linalg.norm(base_from_flange[:, :3, 3], axis=1)
         return np.asarray(self._max_distance_m - away)
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return the margin (n,) of the smallest singular value above NEAR_SINGULAR_VALUE."""
+        """Return the margins (n,) of the Jacobian's smallest singular value at angles (n, 6) rad.
+
+        A margin is the smallest singular value minus NEAR_SINGULAR_VALUE.
+        """
         return {"singularity": self._singular_values(joints_rad) - NEAR_SINGULAR_VALUE}
 
     def _singular_values(self, joints_rad: Floats) -> Floats:
@@ -268,9 +293,9 @@ class NumericKinematics:
 
 
 def _pose_errors(wanted: Floats, present: Floats) -> Floats:
-    """Return translations (m) and rotation vectors (rad), (n, 6), from present to wanted poses.
+    """Return the translations (m) and rotation vectors (rad) from present to wanted poses, (n, 6).
 
-    The lengths of the rotation vectors are exact for small angles only, their directions always.
+    The directions of the rotation vectors are exact. Their lengths are exact for small angles only.
     """
     turn = wanted[:, :3, :3] @ np.swapaxes(present[:, :3, :3], 1, 2)
     spin = 0.5 * np.stack(

@@ -1,9 +1,10 @@
 """Limit every command to an arm.
 
-Joint speed, acceleration and tool speed (the speed of the flange and of the edge that it holds) are
-clamped, which delays the arm.  Limits of the sheet, of the distance between the flanges and of the
-workspace cannot be enforced by clamping.  If one of them is violated, a check returns a text, and
-the caller stops the arm.  Joints are (6,) rad, poses 4x4 in metres.
+Joint speed, joint acceleration and tool speed are clamped, which delays the arm. The tool speed is
+the maximum speed of the flange and of the edge that it holds. Limits of the sheet, of the distance
+between the flanges and of the workspace cannot be enforced by clamping. If one of them is violated,
+a check returns a text, and the caller stops the arm. Joint angles are (6,) rad, poses 4x4 in
+metres.
 """
 
 from __future__ import annotations
@@ -23,37 +24,36 @@ from flexsheet.nodes.models.sheet import edge_force_n
 Floats = NDArray[np.float64]
 
 TOOL_SPEED_FRACTION = 0.82
-"""The fraction of the maximum tool speed that commands may use.  A margin is necessary because the
-speed of an arm ripples about its mean.  The ripple is largest if wrist joints rotate fast in
-opposite directions (benchmarks/limiter.py)."""
+"""The fraction of the maximum tool speed that commands may use. A margin is necessary because the
+actual speed of an arm ripples. The ripple is largest if wrist joints rotate fast in opposite
+directions (benchmarks/limiter.py)."""
 
 MAX_TRAVEL_STEP_S = 0.01
-"""The maximum duration for which one command may move the arm.  After a longer gap, the arm would
-exceed the tool speed to catch up."""
+"""The maximum duration of the motion that one command may contain. After a longer gap between
+commands, the arm would exceed the tool speed to catch up."""
 
 MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
-"""The minimum and the maximum duration of a command.  Over a shorter duration, the computed speeds
-would be dominated by rounding errors."""
+"""The minimum and the maximum duration of a command. With a shorter duration, rounding errors would
+dominate the computed speeds."""
 
 LENGTH_TOLERANCE_M = 1e-7
 MIN_BLEND = 0.02
-"""The minimum weight of the desired velocity that is tried in a blend with a decelerating velocity.
-"""
+"""The minimum weight of the desired velocity when it is blended with a decelerating velocity."""
 
 ROUNDING_FACTOR = 1.0 + 1e-6
-"""The factor by which rounding errors may exceed a limit."""
+"""The factor by which computed values may exceed a limit because of rounding errors."""
 
 RELAXED_M, RELAXED_RAD = 0.002, 0.01
-"""The margins on limits that are exceeded at the start of a motion.  They are necessary because
-servos ripple and measurements are noisy."""
+"""The margins (m and rad) by which a limit is widened if it is exceeded at the start of a motion.
+They are necessary because servos ripple and measurements are noisy."""
 
 RANGE_BRAKE_FRACTION = 2.0 / 3.0
-"""The fraction of a joint's acceleration that is reserved for stopping within its range."""
+"""The fraction of a joint's maximum acceleration that is reserved for stopping within its range."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointLimits:
-    """The limits of range, speed and acceleration of each joint, (6,)."""
+    """The range (rad), speed (rad/s) and acceleration (rad/s^2) limits of the joints, each (6,)."""
 
     min_rad: Floats
     max_rad: Floats
@@ -63,7 +63,7 @@ class JointLimits:
 
 @dataclass(frozen=True, slots=True)
 class SheetLimits:
-    """The limits of the sheet and of the two arms that hold it."""
+    """The limits of the sheet and of the two arms that hold the sheet."""
 
     width_m: float
     height_m: float
@@ -76,12 +76,12 @@ class SheetLimits:
     workspace_min_m: Floats
     workspace_max_m: Floats
     compliance_m_per_n: float = 0.0
-    """The sum of the compliances of both flanges under the tension of the sheet."""
+    """The sum of the compliances of both flanges in the direction of the sheet's tension."""
 
     def sheet_length_m(self, edge_distance_m: float) -> float:
-        """Return the length of the sheet (m) between two compliant arms.
+        """Return the length of the sheet (m) if the arms comply with its tension.
 
-        edge_distance_m: distance between the edges if the arms were rigid.
+        edge_distance_m: distance between the edges that rigid arms would have.
         """
         if self.compliance_m_per_n == 0.0 or not self.width_m < edge_distance_m < math.inf:
             return edge_distance_m
@@ -104,7 +104,7 @@ class SheetLimits:
             high_m, high_excess_m = length_m, excess_m
 
     def force_n(self, length_m: float) -> float:
-        """Return the force (N) on each edge of a sheet of this length."""
+        """Return the force (N) on each edge of a sheet of the given length."""
         return edge_force_n(length_m / self.width_m, self)
 
 
@@ -121,13 +121,13 @@ def limit_velocity(
 ) -> Floats:
     """Return joint velocities (6,) rad/s for the next step towards a moving goal.
 
-    velocity: result of the last call. goal_rad: joint angles at the end of the step; if they are
-    not finite, the arm decelerates. tool_points: function from joint angles to points (n, 3) m,
-    whose speed is at most `max_tool_speed`.
+    velocity: result of the previous call. goal_rad: joint angles (6,) of the goal at the end of the
+        step. If they are not finite, the arm decelerates. tool_points: function that converts joint
+        angles to points (n, 3) m, whose speed is limited to `max_tool_speed`.
 
-    For any goal, joints_rad + result * step_s is in range, and joint and tool speeds are within
-    their limits.  The acceleration exceeds its limit only if range or tool speed require it.
-    Raises ValueError if `step_s` is not from MIN_STEP_S to MAX_STEP_S.
+    For any goal, joints_rad + result * step_s is within the joint ranges, and joint and tool speeds
+    are within their limits. The acceleration exceeds its limit only if the joint range or the tool
+    speed requires it. Raises ValueError if `step_s` is not between MIN_STEP_S and MAX_STEP_S.
     """
     if not MIN_STEP_S <= step_s <= MAX_STEP_S:
         raise ValueError(
@@ -158,7 +158,10 @@ def find_desired_velocity(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return velocities (6,) rad/s that reach the goal in this step, or that can stop there."""
+    """Return joint velocities (6,) rad/s that lead to the goal without overshoot.
+
+    The velocities reach the goal in this step, or permit the joints to stop at the goal.
+    """
     max_speed = limits.speed_rad_per_s
     goal = _clamp(goal_rad, limits.min_rad, limits.max_rad)
     along = _clamp(goal_velocity, -max_speed, max_speed)
@@ -171,7 +174,11 @@ def find_desired_velocity(
 def clamp_to_range(
     joints_rad: Floats, velocity: Floats, desired: Floats, *, limits: JointLimits, step_s: float
 ) -> Floats:
-    """Clamp velocities (6,) rad/s to the maximum acceleration, and to stop within the range."""
+    """Limit velocities (6,) rad/s so that the joints can stop within their ranges.
+
+    velocity: result of the previous step, from which the result differs by at most the maximum
+        acceleration.
+    """
     max_acceleration = limits.acceleration_rad_per_s2
     up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
     down = _find_max_speed(joints_rad - limits.min_rad, max_acceleration, step_s)
@@ -184,17 +191,23 @@ def clamp_to_range(
 
 
 def _clamp(values: Floats, lowest: Floats, highest: Floats) -> Floats:
-    """Clip values; numpy.clip is five times as slow for six numbers."""
+    """Limit array elements to the range from `lowest` to `highest`.
+
+    For arrays of six numbers, numpy.clip takes five times as long.
+    """
     return np.minimum(np.maximum(values, lowest), highest)
 
 
 def _find_max_speed(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
-    """Return the highest speeds from which the joints can stop within given distances."""
+    """Return the highest speeds from which the joints can stop within the given distances."""
     return closing_speed(np.maximum(distance, 0.0), RANGE_BRAKE_FRACTION * acceleration, step_s)
 
 
 def decelerate(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
-    """Return velocities (6,) rad/s after one step of braking; all joints slow in proportion."""
+    """Return the joint velocities (6,) rad/s after one step of deceleration.
+
+    All velocities decrease by the same factor.
+    """
     stopping_s = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
     return velocity * max(0.0, 1.0 - step_s / stopping_s) if stopping_s > 0.0 else velocity
 
@@ -209,12 +222,12 @@ def limit_tool_speed(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return velocities (6,) rad/s near the desired ones that respect the maximum tool speed.
+    """Return joint velocities (6,) rad/s near the desired velocities within the maximum tool speed.
 
-    velocity: result of the last call.
-    The result is a blend of the desired and the decelerating velocities, which are within the
-    acceleration limit.  If even the decelerating velocities are too fast, they are scaled down and
-    exceed the acceleration limit.
+    velocity: result of the previous call.
+    The result is a blend of the desired velocities and of decelerating velocities, which respects
+    the acceleration limit. If even the decelerating velocities are too fast, they are scaled down
+    and exceed the acceleration limit.
     """
     here = tool_points(joints_rad)
     max_shift_m = max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
@@ -256,11 +269,11 @@ def bound_step(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Return the joint angles (6,) towards `desired_rad` that one step can reach.
+    """Return the joint angles (6,) rad that one step towards `desired_rad` can reach.
 
-    Joint speeds and tool speed limit the step.  If they permit it, the result is the object
-    `desired_rad`, otherwise a point on the straight line to it.  If `desired_rad` is not finite,
-    the result is `joints_rad`.
+    Joint speeds and tool speed limit the step. If the limits permit the whole step, the same object
+    `desired_rad` is returned. Otherwise the result is a point on the straight line to
+    `desired_rad`. If `desired_rad` is not finite, the result is `joints_rad`.
     """
     if desired_rad is joints_rad:
         return desired_rad
@@ -289,9 +302,10 @@ def _longest(shifts: Floats) -> float:
 
 
 def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
-    """Return the largest blend (0 to 1) of slow and fast shifts (n, 3) m within `max_shift_m`.
+    """Return the largest blend factor (0 to 1) with which all points move at most `max_shift_m`.
 
-    The blend solves |slow + blend (fast - slow)| = max_shift_m for the shift that limits it most.
+    slow, fast: displacements (n, 3) m of the points for the factors 0 and 1.
+    The result solves |slow + factor * (fast - slow)| = max_shift_m for the critical point.
     """
     change = fast - slow
     square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)
@@ -311,7 +325,7 @@ def relax_limits(
 ) -> SheetLimits:
     """Widen the limits that the arms exceed, or nearly exceed, at the start of a motion.
 
-    All poses are (4, 4) in the world.  left: whether this arm holds the left edge.
+    All poses are (4, 4) in the world. left: whether this arm holds the left edge.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     apart = other_flange[:3, 3] - flange[:3, 3]
@@ -339,10 +353,11 @@ def _twist(edge: Floats, other_edge: Floats) -> float:
 
 
 def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits) -> str | None:
-    """Return a text about the limit that the sheet between two edges violates, or None.
+    """Return a description of the limit that the sheet violates, or None.
 
     edge, other_edge: world poses (4, 4) of this arm's edge and of the other edge.
-    left: whether this arm holds the left edge.  Numbers that are not finite violate every limit.
+    left: whether this arm holds the left edge.
+    Values that are not finite violate every limit.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     distance = limits.sheet_length_m(math.sqrt(float(across @ across)))
@@ -371,10 +386,10 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Return a text if a flange violates the workspace or the flange distance, or None.
+    """Return a description if a flange violates the workspace or the flange distance, or None.
 
-    flange_world, other_flange: world poses (4, 4).  slack_m: tolerance on both limits.
-    Numbers that are not finite violate both limits.
+    flange_world, other_flange: world poses (4, 4). slack_m: tolerance on both limits.
+    Values that are not finite violate both limits.
     """
     position = flange_world[:3, 3]
     lowest, highest = limits.workspace_min_m - slack_m, limits.workspace_max_m + slack_m
@@ -394,7 +409,10 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Return a text if commanded and measured angles (6,) rad differ too much, or None."""
+    """Return a description of the tracking error if it exceeds the maximum, otherwise None.
+
+    joints_rad, measured_rad: commanded and measured joint angles (6,).
+    """
     lag = float(np.abs(joints_rad - measured_rad).max())
     if not lag <= max_error_rad:
         return f"the arm trails its command by {np.degrees(lag):.1f} degrees"

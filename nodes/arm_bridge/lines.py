@@ -1,14 +1,15 @@
 """Control an arm by lines of text over TCP, as an example of a driver.
 
-Most controllers can run a program that reads and writes lines on a socket.  A command is one line,
-and its answer is one line.  Spaces separate the fields:
+Most controllers can run a program that reads and writes lines on a socket. A command is one line,
+and its answer is one line. Spaces separate the fields:
 
     SEQUENCE MODE Q1 Q2 Q3 Q4 Q5 Q6
     SEQUENCE COUNT FAULTS Q1 Q2 Q3 Q4 Q5 Q6
 
-SEQUENCE counts commands, and the answer repeats it.  MODE is `idle`, `move`, `hold` or `stop`.
-COUNT is the number of joint measurements of the controller, modulo 2**32.  FAULTS is `-`, or names
-of `ArmFault` in lower case, separated by commas.  Q1 to Q6 are the joint angles in radians.
+SEQUENCE is the number of the command, which its answer repeats. MODE is `idle`, `move`, `hold` or
+`stop`. COUNT is the number of joint measurements of the controller, modulo 2**32. FAULTS is `-`, or
+a list of `ArmFault` names in lower case, separated by commas. Q1 to Q6 are the joint angles in
+radians.
 """
 
 from __future__ import annotations
@@ -35,15 +36,16 @@ MAX_LINE_BYTES = 512
 
 
 def encode_line(sequence: int, mode: str, joints_rad: Floats) -> bytes:
-    """Encode a command; raise ValueError unless there are six finite angles."""
+    """Encode a command as a line; raise ValueError unless there are six finite joint angles."""
     angles = " ".join(f"{angle:.9g}" for angle in validate_joints(joints_rad))
     return f"{sequence} {mode} {angles}\n".encode("ascii")
 
 
 def decode_line(line: bytes, sequence: int) -> tuple[ArmStatus, tuple[int, ...]]:
-    """Decode the answer to a command into the status and its counter.
+    """Decode the answer to a command; return the arm's status and its measurement counter.
 
-    sequence: number of the command.  Raises ArmAnswerError if the answer is invalid.
+    sequence: number of the command.
+    Raises ArmAnswerError if the answer is invalid.
     """
     try:
         answered, count, faults, *angles = line.decode("ascii").split()
@@ -62,7 +64,7 @@ def decode_line(line: bytes, sequence: int) -> tuple[ArmStatus, tuple[int, ...]]
 
 
 class LineLink(ConnectedLink):
-    """A driver for one arm whose controller program exchanges lines of text."""
+    """A driver for one arm whose controller program exchanges lines of text over TCP."""
 
     period_s = 0.008
 

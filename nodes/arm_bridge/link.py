@@ -20,7 +20,7 @@ JOINTS = 6
 
 MAX_UNCHANGED_S = 0.05
 """The maximum time for which a controller's counters may stay unchanged: seven cycles of 7.1 ms.
-Two exchanges within one cycle may return the same counters."""
+Two exchanges within one cycle of the controller may return the same counters."""
 
 MIN_PAUSE_S, MAX_PAUSE_S = 0.05, 0.2
 """The minimum and the maximum pause before a driver opens a failed connection again."""
@@ -36,7 +36,7 @@ class ArmLinkError(FlexsheetError):
 
 
 class ArmSilentError(ArmLinkError):
-    """An error for an arm that cannot be connected or does not answer in time."""
+    """An error for an arm that does not accept a connection or does not answer in time."""
 
     code = "arm-silent"
     remedy = (
@@ -57,7 +57,7 @@ class ArmRefusedError(ArmLinkError):
 
 
 class ArmAnswerError(ArmLinkError):
-    """An error for an answer that is damaged, of another protocol or to another command."""
+    """An error for an answer that is damaged, of another protocol, or for another command."""
 
     code = "arm-answer"
     remedy = (
@@ -86,18 +86,21 @@ FAULT_TEXTS = {
 
 
 class Freshness(StrEnum):
-    """A classification of measured joint angles by the counters in the controller's answer."""
+    """A classification of measured joint angles by the counters in the controller's answers."""
 
     FIRST = "first"
-    """This is the first answer since the start of the link or of the controller."""
+    """The first measurement since the start of the link or of the controller."""
     FRESH = "fresh"
-    """The counters have advanced, so the joint angles are measured again."""
+    """A new measurement, because the counters have advanced."""
     REPEATED = "repeated"
-    """The counters equal those of the previous answer, but not yet for too long."""
+    """A repeated measurement, whose counters are unchanged for a permitted time
+    (`max_unchanged_s`)."""
     STALLED = "stalled"
-    """The counters have not advanced for too long (`max_unchanged_s`)."""
+    """A repeated measurement, whose counters are unchanged for too long a time
+    (`max_unchanged_s`)."""
     REVERSED = "reversed"
-    """A counter runs backwards, so the joint angles are older than the previous ones."""
+    """A measurement that is older than the previous measurement, because a counter has
+    decreased."""
 
     @property
     def is_usable(self) -> bool:
@@ -106,7 +109,7 @@ class Freshness(StrEnum):
 
 
 class CounterMonitor:
-    """A monitor of a controller's 32-bit counters, which detects measurements that are not new.
+    """A monitor of a controller's 32-bit counters, which detects old or repeated measurements.
 
     max_unchanged_s: maximum time for which the counters may stay unchanged.
     """
@@ -119,12 +122,12 @@ class CounterMonitor:
     def classify(
         self, counters: tuple[int, ...], *, sent_ns: int, received_ns: int, may_restart: bool
     ) -> Freshness:
-        """Return the freshness of an answer with the given counters.
+        """Classify the freshness of an answer by its counters.
 
-        counters: counters of the controller, which must all advance; the first one is the number or
-            the time of its measurements.
-        sent_ns, received_ns: times of the command and of its answer, on this computer's clock.
-        may_restart: whether a counter that runs backwards means a restarted controller.
+        counters: counters of the controller, all of which must advance. The first counter is the
+            number or the time of the controller's measurements.
+        sent_ns, received_ns: times of the command and of its answer on this computer's clock.
+        may_restart: whether a decreased counter means that the controller has restarted.
         """
         steps = [
             (new - old) % _COUNTER_PERIOD for new, old in zip(counters, self._last, strict=False)
@@ -147,9 +150,10 @@ class CounterMonitor:
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """An answer of an arm: measured joint angles (6,) rad, faults, and whether the angles are new.
+    """An arm's answer: measured joint angles (6,) rad, faults, and the freshness of the angles.
 
-    currents_percent: motor currents (6,), percent of the rated currents; None if not reported.
+    currents_percent: motor currents (6,) as a percentage of the rated currents; None if not
+        reported.
     """
 
     joints_rad: Floats
@@ -160,7 +164,7 @@ class ArmStatus:
 
 @dataclass(frozen=True, slots=True)
 class BlockField:
-    """A field of a register block or packet.
+    """A field of a block of registers or of a packet.
 
     kind: code of Python's `struct`: H (u16), I (u32), i (i32), f (float32) or x (padding).
     """
@@ -174,16 +178,20 @@ class BlockField:
 class ArmLink(Protocol):
     """The interface for the exchange of commands and answers with one arm.
 
-    Modes: `idle` (no motion; restarts after a fault or a lost connection), `move` (to the given
-    joint angles), `hold` and `stop` (no motion).
+    The mode `move` commands a motion to the given joint angles. The modes `hold`, `stop` and `idle`
+    command no motion. The mode `idle` also restarts the exchange after a fault or a lost
+    connection.
     """
 
     def due(self, now_ns: int) -> bool:
-        """Return whether an exchange may be tried now."""
+        """Return whether an exchange may be attempted now."""
         ...
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:
-        """Send a command and return the arm's answer; raise ArmLinkError if this fails."""
+        """Send a command with joint angles (6,) rad, and return the arm's answer.
+
+        Raises ArmLinkError if the exchange fails.
+        """
         ...
 
     def close(self) -> None:
@@ -192,17 +200,18 @@ class ArmLink(Protocol):
 
 
 class ConnectedLink(ABC):
-    """The base class of drivers that use one connection, on which each command gets one answer.
+    """A base class of drivers that use one connection, on which each command gets one answer.
 
-    A driver implements `connected`, `_connect`, `_request` and `_disconnect`.  The base class opens
-    the connection when it is needed, and closes it after a failure.  After the first failure it
-    reconnects at once, then after pauses that double from MIN_PAUSE_S to MAX_PAUSE_S.
+    A driver implements `connected`, `_connect`, `_request` and `_disconnect`. The base class opens
+    the connection when it is needed, and closes it after a failure. After the first failure it
+    reconnects immediately. Before further attempts it waits for MIN_PAUSE_S to MAX_PAUSE_S,
+    doubling the pause each time.
     connections: number of connections that were opened.
     """
 
     period_s: ClassVar[float] = 0.0071
     """The period with which the controller measures the joint angles. Answers may repeat a
-    measurement for seven periods, or for MAX_UNCHANGED_S if that is longer."""
+    measurement for seven periods, or for MAX_UNCHANGED_S if that time is longer."""
 
     def __init__(self, host: str, port: int, *, timeout_s: float) -> None:
         self.host, self.port = host, port
@@ -225,26 +234,29 @@ class ConnectedLink(ABC):
     async def _request(
         self, mode: str, joints_rad: Floats, now_ns: int
     ) -> tuple[ArmStatus, tuple[int, ...]]:
-        """Send one command, wait for its answer, and return the status and its counters.
+        """Send one command, wait for its answer, and return the arm's status and counters.
 
-        mode, joints_rad: see `ArmLink`.  now_ns: time of the command.  The counters have 32 bits;
-        the first one counts the joint measurements of the controller.  Raises ArmSilentError,
-        ArmRefusedError or ArmAnswerError.
+        mode, joints_rad: see `ArmLink`. now_ns: time of the command. The counters have 32 bits, and
+            the first counter is the number of the controller's joint measurements.
+        Raises ArmSilentError, ArmRefusedError or ArmAnswerError.
         """
 
     @abstractmethod
     def _disconnect(self) -> None:
-        """Close the connection, if any."""
+        """Close the connection if it is open."""
 
     def due(self, now_ns: int) -> bool:
-        """Return whether an exchange may be tried now.
+        """Return whether an exchange may be attempted now.
 
         After a failure, the next exchange must wait for a pause.
         """
         return self.connected or now_ns >= self._try_again_ns
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:
-        """Send a command and return the arm's answer; raise ArmLinkError if this fails."""
+        """Send a command with joint angles (6,) rad, and return the arm's answer.
+
+        Raises ArmLinkError if the exchange fails.
+        """
         loop = asyncio.get_running_loop()
         start_s = loop.time()
         try:
@@ -281,9 +293,9 @@ class ConnectedLink(ABC):
 
 
 def validate_joints(joints_rad: Floats) -> tuple[float, ...]:
-    """Return joint angles (6,) rad as Python numbers; raise ValueError unless six are finite.
+    """Return joint angles (6,) rad as a tuple; raise ValueError unless six angles are finite.
 
-    The limiter already ensures this, but drivers check it again before they send a command.
+    Drivers check the joint angles again, although the limiter has already checked them.
     """
     joints = tuple(float(angle) for angle in joints_rad)
     if len(joints) != JOINTS or not all(math.isfinite(angle) for angle in joints):
@@ -294,8 +306,8 @@ def validate_joints(joints_rad: Floats) -> tuple[float, ...]:
 def propagate_cancellation() -> None:
     """Raise CancelledError if the current task was cancelled.
 
-    A time-out of Python 3.11 suppresses this error if an answer or the time-out arrives in the same
-    iteration of the event loop as the cancellation.  The task would then never end.
+    In Python 3.11, a time-out can suppress a cancellation that occurs in the same iteration of the
+    event loop. The cancelled task would then never end.
     """
     task = asyncio.current_task()
     if task is not None and task.cancelling():

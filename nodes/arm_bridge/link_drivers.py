@@ -1,4 +1,4 @@
-"""Create the driver of an arm's controller by its name in a launch file."""
+"""Create the driver for an arm's controller from the driver's name in a launch file."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from flexsheet.nodes.arm_bridge.mxt import MxtLink
 Driver = Literal["modbus", "mxt", "lines"]
 
 TCP_DRIVERS: frozenset[Driver] = frozenset({"modbus", "lines"})
-"""The drivers whose controllers listen for TCP connections, which `flexsheet doctor` checks."""
+"""The drivers for controllers that accept TCP connections. `flexsheet doctor` checks these
+connections."""
 
 _LINKS: dict[Driver, Any] = {"modbus": ModbusLink, "mxt": MxtLink, "lines": LineLink}
 
@@ -20,10 +21,10 @@ _LINKS: dict[Driver, Any] = {"modbus": ModbusLink, "mxt": MxtLink, "lines": Line
 def make_link(
     driver: Driver, host: str, port: int, timeout_s: float | None, *, with_currents: bool = False
 ) -> ArmLink:
-    """Make the link to an arm, without opening a connection.
+    """Create the link to an arm, without opening a connection.
 
-    timeout_s: maximum time to wait for an answer; None: the driver's default.
-    with_currents: whether to request the motor currents, which only MXT reports.
+    timeout_s: maximum time to wait for an answer; None selects the driver's default.
+    with_currents: whether to request the motor currents, which only MXT controllers report.
     """
     options: dict[str, Any] = {} if timeout_s is None else {"timeout_s": timeout_s}
     if with_currents:

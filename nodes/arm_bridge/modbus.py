@@ -1,9 +1,9 @@
 """Exchange commands with an arm by Modbus TCP.
 
-Each cycle sends one request (function code 23) with magic number, version, sequence and CRC.
-`COMMAND` and `STATUS` define the register map; `website.registers_page` writes the tables of
-docs/modbus.md from them.  Numbers of 32 bits occupy two registers, the high one first.  The CRC-32
-(as in zlib) covers all registers before it in its block, high byte first.
+Each cycle sends one request (function code 23) with magic number, version, sequence number and CRC.
+`COMMAND` and `STATUS` define the register map. `website.registers_page` writes the tables of
+docs/modbus.md from this map. Numbers of 32 bits occupy two registers, the high register first. The
+CRC-32 (as in zlib) covers all preceding registers of its block, high byte first.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ FAULT_BITS = {
 
 
 def make_struct_format(block: Sequence[BlockField]) -> str:
-    """Return the format of a register block for Python's `struct`, big-endian."""
+    """Return the big-endian format of a register block for Python's `struct` module."""
     return ">" + "".join(f"{field.count}{field.kind}" for field in block)
 
 
@@ -101,7 +101,7 @@ _STATUS_REGISTERS = count_registers(STATUS)
 
 @dataclass(frozen=True, slots=True)
 class ModbusStatus(ArmStatus):
-    """The contents of a status block; `STATUS` describes the fields."""
+    """The contents of a status block, whose fields are described in `STATUS`."""
 
     accepted: int
     cycle: int
@@ -111,7 +111,11 @@ class ModbusStatus(ArmStatus):
 
 
 def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats) -> list[int]:
-    """Encode a command block as registers; sequence and time are taken modulo 2^32."""
+    """Encode a command block as a list of 16-bit registers.
+
+    joints_rad: joint angles (6,).
+    Sequence number and time are encoded modulo 2^32.
+    """
     body = struct.pack(
         _COMMAND_FORMAT[:-2],
         MAGIC,
@@ -127,7 +131,7 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
 
 
 def decode_status(registers: Sequence[int]) -> ModbusStatus:
-    """Decode a status block; raise ArmAnswerError if it is invalid."""
+    """Decode the registers of a status block; raise ArmAnswerError if the block is invalid."""
     if len(registers) != _STATUS_REGISTERS:
         raise ArmAnswerError(
             f"the status has {len(registers)} registers instead of {_STATUS_REGISTERS}"
@@ -162,9 +166,10 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
 
 
 class _Framer(FramerSocket):
-    """A framer that fails the pending request if an answer cannot be decoded.
+    """A Modbus framer that fails the pending request if an answer cannot be decoded.
 
-    Without it, pymodbus raises the error in the event loop, and the request waits for its time-out.
+    The framer of pymodbus raises the error in the event loop instead, and the request waits until
+    its time-out.
     """
 
     def __init__(self, client: AsyncModbusTcpClient) -> None:
@@ -190,9 +195,9 @@ class _Framer(FramerSocket):
 class ModbusLink(ConnectedLink):
     """A driver for one arm that uses one Modbus TCP connection.
 
-    After a failure the connection is closed if an answer can still arrive, because pymodbus 3.16.1
-    can return a late answer to the next request.  Other wrong answers are detected by their
-    sequence number and CRC.
+    After a failure, the connection is closed if an answer may still arrive. Otherwise pymodbus
+    3.16.1 could return the late answer to the next request. Other wrong answers are detected by
+    their sequence number and CRC.
     """
 
     def __init__(self, host: str, port: int, *, timeout_s: float = 0.03) -> None:

@@ -1,9 +1,9 @@
 """Estimate the pull of the sheet on an arm from the arm's motor currents.
 
-A motor current minus the current in the same pose without the sheet is proportional to a torque of
-the joint. Static friction of the gears adds an unknown torque of about a tenth of the rated torque.
-The estimate therefore detects errors of the sheet's tension of several newtons, but is not precise
-enough to calibrate the sheet.
+The difference between the motor currents with and without the sheet is proportional to the joint
+torques. Static friction of the gears adds an unknown torque of about a tenth of the rated torque.
+The estimate therefore detects errors of several newtons in the sheet's tension, but it is not
+precise enough to calibrate the sheet.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 STEP_RAD = 1e-5
 MAX_SPEED_RAD_PER_S = 0.02
-"""The maximum joint speed of a valid estimate.  At higher speeds, the currents also depend on
-sliding friction and acceleration."""
+"""The maximum joint speed at which the estimate is valid. At higher speeds, the currents also
+depend on sliding friction and acceleration."""
 
 PERIOD_NS = 50_000_000
 
@@ -57,12 +57,12 @@ def estimate_pull_n(
     *,
     forward: Callable[[Floats], Floats],
 ) -> tuple[float, float]:
-    """Return the pull (N) on the edge and its standard deviation, by weighted least squares.
+    """Return the pull (N) on the edge and its standard deviation (N), by weighted least squares.
 
     joints_rad, currents_percent: joint angles (6,) rad and motor currents (6,), percent.
-    edge_flange_m: centre (3,) of the edge in the flange frame. towards_base: direction of the pull,
-    a unit vector (3,) in the base frame. forward: function from joint angles (6,) rad to the
-    flange's pose (4, 4) in the base frame.
+    edge_flange_m: centre (3,) of the edge in the flange frame.
+    towards_base: direction of the pull, a unit vector (3,) in the base frame.
+    forward: function from joint angles (6,) rad to the flange pose (4, 4) in the base frame.
     """
     at_edge = np.append(edge_flange_m, 1.0)
     edge_m = (forward(joints_rad) @ at_edge)[:3]
@@ -78,7 +78,7 @@ def estimate_pull_n(
 
 
 class MotorForceEstimator:
-    """An estimator of the sheet's pull on an arm, which returns up to 20 estimates per second."""
+    """An estimator of the sheet's pull on an arm, limited to 20 estimates per second."""
 
     def __init__(self, calibration: MotorForceCalibration, side: Side) -> None:
         self._calibration, self._side = calibration, side
@@ -97,7 +97,7 @@ class MotorForceEstimator:
     ) -> Force | None:
         """Return the estimated force at `at_ns`; None if the last estimate is too recent.
 
-        The other arguments are those of `estimate_pull_n`.
+        For the other arguments, see `estimate_pull_n`.
         """
         before_ns, before_rad = self._last_ns, self._last_rad
         if before_ns is not None and at_ns - before_ns < PERIOD_NS:

@@ -1,9 +1,9 @@
-"""Exchange with a Mitsubishi controller by real-time external control (MXT) over UDP.
+"""Exchange commands with a Mitsubishi controller over UDP by real-time external control (MXT).
 
-A robot program runs `Open "ENET:..." As #1 : Mxt 1,1,<filter ms>`; then the controller
-reads one command packet in each of its cycles and answers with its measurements.  Packets
-are 196 bytes, little-endian, of fixed-width fields.  `PACKET` is their layout; docs/mxt.md states
-which parts the manufacturer documents and which public sources leave open.
+A robot program runs `Open "ENET:..." As #1 : Mxt 1,1,<filter ms>`. In each of its cycles, the
+controller then reads one command packet and answers with its measurements. Packets have 196 bytes
+and consist of little-endian fields of fixed width. `PACKET` defines their layout. docs/mxt.md
+states which parts the manufacturer documents, and which parts no public source explains.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ COMMAND_NONE, COMMAND_MOVE, COMMAND_END = 0, 1, 255
 TYPE_NONE, TYPE_JOINTS, TYPE_JOINTS_MEASURED, TYPE_CURRENTS_MEASURED = 0, 2, 8, 11
 
 MAX_PLAUSIBLE_RAD = 4.0 * math.pi
-"""The maximum plausible angle of a joint.  An answer with a larger angle is invalid."""
+"""The maximum plausible joint angle. An answer with a larger angle is invalid."""
 
 PACKET = (
     BlockField("command", "H", 1, "0 none, 1 move, 255 end"),
@@ -76,7 +76,7 @@ PACKET = (
 
 
 def make_struct_format(packet: Sequence[BlockField]) -> str:
-    """Return the format of a packet for Python's `struct`, little-endian without padding."""
+    """Return the format of a packet for Python's `struct` module, little-endian without padding."""
     return "<" + "".join(f"{field.count}{field.kind}" for field in packet)
 
 
@@ -87,7 +87,7 @@ _PACKET = struct.Struct(make_struct_format(PACKET))
 class MxtStatus(ArmStatus):
     """The contents of an answer packet.
 
-    count: number of communications of the controller.  timeouts: cycles without a command.
+    count: number of the controller's communications. timeouts: number of cycles without a command.
     """
 
     count: int
@@ -99,7 +99,7 @@ def encode(
 ) -> bytes:
     """Encode a command packet that requests the measured joint angles.
 
-    send_type, data: type of the command's data, and up to 8 numbers.
+    send_type, data: type of the data in the command, and up to 8 numbers.
     with_currents: whether to request the motor currents too.
     """
     padded = (*data, *([0.0] * (8 - len(data))))
@@ -108,7 +108,7 @@ def encode(
 
 
 def encode_joints(joints_rad: Floats, *, with_currents: bool = False) -> bytes:
-    """Encode a motion to joint angles (6,) rad; raise ValueError unless six are finite."""
+    """Encode a motion to joint angles (6,) rad; raise ValueError unless six angles are finite."""
     return encode(
         COMMAND_MOVE,
         send_type=TYPE_JOINTS,
@@ -118,9 +118,10 @@ def encode_joints(joints_rad: Floats, *, with_currents: bool = False) -> bytes:
 
 
 def decode_answer(packet: bytes) -> MxtStatus:
-    """Decode an answer; raise ArmAnswerError if it is invalid.
+    """Decode an answer packet.
 
-    Raises ArmRefusedError if the controller has ended external control.
+    Raises ArmAnswerError if the packet is invalid, and ArmRefusedError if the controller has ended
+    external control.
     """
     if len(packet) != PACKET_BYTES:
         raise ArmAnswerError(f"the answer has {len(packet)} bytes instead of {PACKET_BYTES}")
@@ -158,11 +159,11 @@ def has_advanced(count: int, before: int, steps: int) -> bool:
 class MxtLink:
     """A driver for a controller that runs an `Mxt` program.
 
-    The socket stays open, so that the controller always answers to the same port.  Late answers are
+    The socket stays open, so that the controller always answers to the same port. Late answers are
     detected by the controller's counter, which must advance by the number of commands since the
-    last answer.  After a lost command, the next answer is therefore dropped too.  The mode `idle`
+    last answer. After a lost command, the next answer is therefore dropped too. The mode `idle`
     restarts the comparison of the counter.
-    stale: number of late answers.
+    stale: number of late answers that were dropped.
     """
 
     def __init__(
@@ -186,9 +187,10 @@ class MxtLink:
         return True
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> MxtStatus:
-        """Send a command and return the arm's answer; raise ArmLinkError if this fails.
+        """Send a command with joint angles (6,) rad, and return the arm's answer.
 
-        The controller answers within its cycle time CONTROLLER_CYCLE_S.
+        The controller answers within its cycle time CONTROLLER_CYCLE_S. Raises ArmLinkError if the
+        exchange fails.
         """
         if mode == "idle":
             self._count, self._unanswered = None, 0
@@ -224,7 +226,7 @@ class MxtLink:
         return replace(status, freshness=freshness)
 
     async def _open(self) -> socket.socket:
-        """Return the connected socket, which receives only the controller's packets."""
+        """Return the connected socket, which receives packets only from the controller."""
         if self._socket is None:
             link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             link.setblocking(False)
@@ -256,9 +258,9 @@ class MxtLink:
             self.stale += 1
 
     def close(self) -> None:
-        """End external control.
+        """Command the controller to end external control.
 
-        If the packet is lost, the time-out of the controller ends external control.
+        If this packet is lost, the controller ends external control after its time-out.
         """
         if self._socket is not None:
             with contextlib.suppress(OSError):

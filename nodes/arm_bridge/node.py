@@ -1,4 +1,4 @@
-"""Move one edge of the sheet by commands to one arm."""
+"""Move one edge of the sheet by sending commands to one arm."""
 
 from __future__ import annotations
 
@@ -37,10 +37,11 @@ from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
 from flexsheet.nodes.node import Input, Node, Output, periodic
 
 MIN_SERVO_LAG_S = 0.002
-"""The minimum plausible value of a measured lag; no servo of an arm is faster."""
+"""The minimum plausible delay of a servo. A shorter measured delay is an error, because no servo of
+an arm is faster."""
 
 CHECK_PERIOD_NS = 100_000_000
-"""The period of the arm's self-checks.  Their results are published once per second."""
+"""The period of the arm's self-checks. The results are published once per second."""
 
 
 class ArmBridge(Node):
@@ -101,7 +102,10 @@ class ArmBridge(Node):
         self._cycling = asyncio.Lock()
 
     async def close(self) -> None:
-        """Send a stop to the arm; if this fails, the arm's own watchdog stops the arm."""
+        """Send a stop command to the arm.
+
+        If the command is lost, the arm's own watchdog stops the arm.
+        """
         async with self._cycling:
             self._geometry, joints_rad = None, self._control.commanded_rad
             try:
@@ -156,7 +160,7 @@ class ArmBridge(Node):
 
     @periodic("rate_hz")
     async def cycle(self) -> None:
-        """Send periodic commands to the arm when no target arrives."""
+        """Send periodic commands to the arm while no targets arrive."""
         if self._geometry is None:
             self.note = "waiting for a scene"
             return
@@ -193,7 +197,7 @@ class ArmBridge(Node):
         command = control.step(geometry, goal, other, step_s, clock_problem)
         if result := self._path_checker.poll(control.pending_check):
             control.on_path_result(*result)
-        # Store the target now: a newer one that arrives during the exchange is not used here.
+        # Store the target now, because a newer target may arrive during the exchange.
         last.target, last.received_ns = self.sheet_target.header, self.sheet_target.received_ns
         last.trajectory_ends_ns = 0
         if target is not None and trajectory is not None:
@@ -217,7 +221,7 @@ class ArmBridge(Node):
     def _estimate_force(
         self, geometry: ArmGeometry, other: OtherArm | None, status: ArmStatus
     ) -> None:
-        """Publish the pull of the sheet, if the arm has reported motor currents."""
+        """Publish the pull of the sheet on the arm, if the arm has reported motor currents."""
         if self._motor_force is None or status.currents_percent is None or other is None:
             return
         own = geometry.world_from_edge(status.joints_rad)[:3, 3]
@@ -250,9 +254,10 @@ class ArmBridge(Node):
             self.arm_latency.publish(ArmLatency(side=self.parameters.side, latency_s=latency_s))
 
     def _read_goal(self, trajectory: SheetTrajectory | None) -> Goal | None:
-        """Return the newest sheet target at the time at which the next command takes effect.
+        """Return the goal at the time when the next command takes effect, from the newest target.
 
-        trajectory: trajectory of the target if the other arm follows it too, otherwise None.
+        trajectory: trajectory of the target if the other arm follows the trajectory too, otherwise
+            None.
         """
         target = self.sheet_target.message
         if target is None:

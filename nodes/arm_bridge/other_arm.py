@@ -16,8 +16,8 @@ from flexsheet.nodes.models.rigid import is_rigid
 Floats = NDArray[np.float64]
 
 MAX_FUTURE_S = 0.02
-"""The maximum time by which the timestamp of a state may lie in the future.  Errors of the clock
-offsets are smaller."""
+"""The maximum time by which the timestamp of a state may lie in the future. The errors of the
+measured clock offsets are smaller."""
 
 MAX_TARGET_DIFFERENCE_NS = round(1e9 * MAX_TRAJECTORY_S)
 """The maximum time between the camera exposures of two targets whose trajectories overlap."""
@@ -32,9 +32,9 @@ class OtherArm:
 
     ready: whether the other arm may move.
     estop_engaged: whether the other arm's bridge has latched an e-stop.
-    agrees: whether the other arm may follow the trajectory of the same or an adjacent target.  The
-        age is then counted from the end of that trajectory.
-    ended: whether the other arm's bridge has ended since this state.
+    agrees: whether the other arm may follow the trajectory of the same target or of an adjacent
+        target. The age of the state is then counted from the end of that trajectory.
+    ended: whether the other arm's bridge has ended after it published this state.
     """
 
     joints_rad: Floats
@@ -58,10 +58,10 @@ class OtherArm:
         now_ns: int = 0,
         ended: bool = False,
     ) -> OtherArm:
-        """Convert a message of the other arm's bridge.
+        """Convert a state message of the other arm's bridge.
 
-        age_s: age of the message.
-        target_source_ns: time of the camera exposure from which this arm's target was computed.
+        age_s: age of the message. target_source_ns: time of the camera exposure on which this arm's
+            target is based.
         """
         other_ns = state.target_source_ns
         ends_ns = min(state.trajectory_ends_ns, other_ns + MAX_TRAJECTORY_END_NS)
@@ -87,7 +87,7 @@ class OtherArm:
 
     @cached_property
     def invalid_reason(self) -> str | None:
-        """Return why this state must not be used, or None."""
+        """Return the reason why this state must not be used, or None if it is valid."""
         if not np.isfinite(self.joints_rad).all():
             return "its joint angles are not finite"
         if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):
@@ -98,12 +98,12 @@ class OtherArm:
 
     @property
     def estopped(self) -> bool:
-        """Return whether an e-stop is engaged; no arm may then move."""
+        """Return whether an e-stop is engaged, which forbids motion of both arms."""
         return self.mode == "estop" or self.estop_engaged
 
     @property
     def interlock_reason(self) -> str | None:
-        """Return why the other arm's state forbids this arm's motion, or None."""
+        """Return the reason why the other arm's state forbids motion of this arm, or None."""
         if self.faults:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):

@@ -1,4 +1,4 @@
-"""Define the parameters of `arm_bridge`, the node that commands one arm."""
+"""Define the parameters of the node `arm_bridge`, which commands one arm."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from flexsheet.nodes.parameter_marks import DeviceHost, DevicePort
 
 
 class ArmBridgeParameters(NodeParameters):
-    """The parameters of an arm bridge."""
+    """The parameters of the node `arm_bridge`, which commands one arm."""
 
     side: Side = Field(description="arm of the scene that this bridge commands")
     host: DeviceHost = Field(default="127.0.0.1", description="address of the arm's controller")

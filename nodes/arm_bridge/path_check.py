@@ -1,9 +1,9 @@
 """Check before a motion whether both arms can move the sheet to its target.
 
-The bridge of each arm receives the joint angles of both arms. It simulates the sheet's motion and
+The bridge of each arm receives the joint angles of both arms. It simulates the sheet's motion, and
 checks at each pose whether both arms are within their limits. A check takes some milliseconds and
-therefore runs outside the cycle that sends commands. If necessary, the arms are first aligned: they
-move to joint angles at which the sheet is flat and on the path.
+therefore runs outside the cycle that sends commands. If necessary, the arms are first aligned. They
+then move to joint angles at which the sheet is flat and on the path.
 """
 
 from __future__ import annotations
@@ -48,34 +48,36 @@ START_BOUNDS = SheetBounds(
 
 REHEARSAL_STEP_S = 0.05
 MAX_REHEARSAL_S = 60.0
-"""The maximum duration of a simulated motion.  A motion across the workspace with START_BOUNDS
-takes less time."""
+"""The maximum duration of a simulated motion. Motions across the whole workspace with START_BOUNDS
+are shorter."""
 
 CORNER_EVERY = 4
-"""The number of simulated steps between two corners of the checked path.  Straight lines between
-the corners deviate from the motion by less than 1 mm."""
+"""The number of simulated steps between two corners of the checked path. The straight lines between
+the corners deviate from the simulated motion by less than 1 mm."""
 
 NEAR_M, NEAR_RAD, NEAR_STRETCH = 0.03, 0.2, 0.02
-"""The distances from the checked target up to which a check is also valid for a newer target."""
+"""The position (m), rotation (rad) and stretch differences up to which a check is valid for a newer
+target."""
 
 MAX_START_MOTION_RAD = 0.002
-"""The joint motion since a check up to which the check remains valid."""
+"""The maximum joint motion after a check. If a joint has moved farther, the check is invalid."""
 
 ALIGN_FRACTIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""The fractions of the path to which the arms may align.  The first feasible fraction is used."""
+"""The positions on the path, as fractions of its length, to which the arms may align. The first
+feasible position is used."""
 
 MAX_ALIGN_STEP_RAD = 0.02
 """The maximum change of a joint between two checked points of an alignment."""
 
 MAX_ALIGN_RAD = 1.0
-"""The maximum joint motion of an alignment.  A larger motion would change the branch of joint
-solutions."""
+"""The maximum joint motion of an alignment. A larger motion could switch to another branch of the
+inverse kinematics."""
 
 ALIGN_SPEED_M_PER_S, ALIGN_SPEED_RAD_PER_S = 0.06, 0.5
-"""The maximum speeds of the points of an edge and of the joints during an alignment."""
+"""The maximum speeds of the sheet's edge and of the joints during an alignment."""
 
 PEAK_TO_MEAN_SPEED = 1.5
-"""The ratio of the maximum speed to the mean speed of the smoothstep 3 x^2 - 2 x^3."""
+"""The ratio of the maximum speed to the mean speed of the smoothstep function 3 x^2 - 2 x^3."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +90,10 @@ class PathCheckRequest:
     other_rad: Floats
 
     def begins_at(self, own_rad: Floats, other_rad: Floats) -> bool:
-        """Return whether both arms are still at the start of the path."""
+        """Return whether both arms are still at the start of the path.
+
+        own_rad, other_rad: present joint angles (6,) of both arms.
+        """
         moved_rad = max(
             float(np.abs(own_rad - self.own_rad).max()),
             float(np.abs(other_rad - self.other_rad).max()),
@@ -96,21 +101,21 @@ class PathCheckRequest:
         return moved_rad <= MAX_START_MOTION_RAD
 
     def leads_to(self, target: SheetMotion) -> bool:
-        """Return whether a newer target is near the target of the checked path."""
+        """Return whether a newer target is close to the target of the checked path."""
         distance_m, angle_rad = measure_distance(self.goal, target)
         stretch = abs(target.stretch_ratio - self.goal.stretch_ratio)
         return distance_m <= NEAR_M and angle_rad <= NEAR_RAD and stretch <= NEAR_STRETCH
 
 
 def measure_distance(sheet: SheetMotion, target: SheetMotion) -> tuple[float, float]:
-    """Return the distance (m) and the angle (rad) between two poses of the sheet."""
+    """Return the distance (m) and the rotation angle (rad) between two poses of the sheet."""
     rotation = target.world_from_sheet[:3, :3] @ sheet.world_from_sheet[:3, :3].T
     offset = target.world_from_sheet[:3, 3] - sheet.world_from_sheet[:3, 3]
     return float(np.linalg.norm(offset)), float(np.linalg.norm(vector_from_rotation(rotation)))
 
 
 def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[SheetMotion]:
-    """Simulate the sheet's motion from the start to a goal at rest; return points of its path."""
+    """Simulate the sheet's motion to a goal at rest, and return the points of its path."""
     resting = replace(goal, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
     sheet, corners = start, [start]
     for step in range(1, round(MAX_REHEARSAL_S / REHEARSAL_STEP_S)):
@@ -128,14 +133,14 @@ def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[Sh
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """A straight joint motion of one arm from its position to the path of the sheet.
+    """A straight joint motion that moves one arm to a point on the path of the sheet.
 
     An alignment is necessary if the arms have stopped with a twisted sheet, or at the end of a
     joint's range. Their joint angles then do not correspond to a pose of a flat sheet.
 
-    sheet: first pose on the path that both arms can reach. from_rad, to_rad: this arm's joint
-    angles (6,) at start and end. duration_s: duration, equal for both arms; 0 if they need not
-    move.
+    sheet: first pose on the path that both arms can reach.
+    from_rad, to_rad: this arm's joint angles (6,) at the start and at the end.
+    duration_s: duration, which is equal for both arms; 0 if no motion is necessary.
     """
 
     sheet: SheetMotion
@@ -144,14 +149,14 @@ class Alignment:
     duration_s: float
 
     def joints_at(self, time_s: float) -> Floats:
-        """Return the joint angles (6,), in rad, at `time_s` after the start."""
+        """Return the joint angles (6,) rad at `time_s` after the start."""
         part = min(1.0, time_s / self.duration_s) if self.duration_s > 0.0 else 1.0
         joints: Floats = self.from_rad + smoothstep(np.array(part)) * (self.to_rad - self.from_rad)
         return joints
 
 
 def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> Alignment | str:
-    """Return the alignment of this arm to the path, or a text why an arm cannot follow the path."""
+    """Return the alignment of this arm to the path, or a text if an arm cannot follow the path."""
     left, right = (arm, other) if arm.left else (other, arm)
     if not (is_rigid(request.start.world_from_sheet) and is_rigid(request.goal.world_from_sheet)):
         return (
@@ -191,9 +196,10 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
 def _check_alignment(
     left: ArmGeometry, right: ArmGeometry, begin: PathStep, there: PathStep
 ) -> None:
-    """Raise PathError unless the joints of both arms can move straight from `begin` to `there`.
+    """Check a straight joint motion of both arms; raise PathError if it violates a limit.
 
-    Limits of the sheet that the start exceeds are widened.
+    begin, there: joint angles of both arms at the start and at the end.
+    Limits that are already violated at the start are widened.
     """
     changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
     max_change_rad = max(float(np.abs(change).max()) for change in changes)
@@ -240,7 +246,7 @@ def _find_duration_s(
 
 
 class PathChecker:
-    """A runner of path checks in a thread, one at a time."""
+    """A runner of path checks, which executes one check at a time in a thread."""
 
     def __init__(self, arm: ArmGeometry, other: ArmGeometry) -> None:
         self._arm, self._other = arm, other
@@ -249,9 +255,10 @@ class PathChecker:
     def poll(
         self, request: PathCheckRequest | None
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
-        """Return a finished request with its result, or None; must be called in every cycle.
+        """Return a finished request with its result, or None if no check has finished.
 
-        request: check to start unless another check is running; None: start no check.
+        request: check to start unless another check is running; None if no check is necessary.
+        This method must be called in every cycle.
         """
         if self._running is None:
             if request is not None:

@@ -1,9 +1,9 @@
 """Check whether the arms can reach poses of the sheet: many poses at once, or along a path.
 
 Two arms hold the sheet by its left and right edges. Poses of the sheet are (n, 4, 4) in the world
-with stretch ratios (n,); joint angles are (n, 6) rad. A margin is the distance to a limit and is
-positive within the limit. Margins of speeds are fractions of the limit. A branch is one of the
-discrete joint solutions of a pose.
+with stretch ratios (n,); joint angles are (n, 6) rad. A margin is the distance to a limit, and it
+is positive within the limit. Margins of speeds are fractions of the limit. A branch is one of the
+discrete solutions of the inverse kinematics.
 """
 
 from __future__ import annotations
@@ -46,13 +46,14 @@ POSE_LIMITS = (
     "edge force",
 )
 COMMAND_LIMITS = ("reach", *RANGES, "workspace", "flange distance", "edge force")
-"""The limits of a pose that the limiter also enforces for every command."""
+"""The names of the limits that the limiter also enforces for every command."""
 SPEED_LIMITS = (*SPEEDS, "tool speed")
 LIMITS = (*POSE_LIMITS, *SPEED_LIMITS)
-"""All limits.  If a pose violates several limits, the first one in this order is reported."""
+"""The names of all limits. If a pose violates several limits, the first violated limit in this
+order is reported."""
 
 BRANCH_SAMPLES = 500
-"""The approximate number of poses from which `find_best_reach` selects the branch."""
+"""The approximate number of sampled poses from which `find_best_reach` selects the branch."""
 
 SPEED_DAMPING = 1e-12
 """The damping term that limits the computed joint speeds at a singularity."""
@@ -61,11 +62,11 @@ MAX_STEP_RAD = 0.05
 """The maximum change of a joint between two samples of a path."""
 
 MIN_FRACTION = 1e-6
-"""The minimum distance between two samples of a path, as a fraction of the path.  If a joint
-changes by more than MAX_STEP_RAD over this distance, it jumps."""
+"""The minimum distance between two samples, as a fraction of the path. If a joint changes by more
+than MAX_STEP_RAD over this distance, the motion of the joint is discontinuous."""
 
 ROUNDING = 1e-9
-"""The amount by which rounding errors may reduce a margin."""
+"""The tolerance by which rounding errors may make a margin negative."""
 
 DETOURS_M = (
     (0.0, 0.0, 0.05),
@@ -75,15 +76,15 @@ DETOURS_M = (
     (0.0, 0.08, 0.0),
     (0.0, -0.08, 0.0),
 )
-"""The offsets (m) of detours in the world, in the order in which they are tried."""
+"""The offsets (m, world frame) of detours, in the order in which they are tried."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPoses:
     """Poses (n, 4, 4), stretch ratios (n,) and twists (n, k, 6) of the sheet in the world.
 
-    twists_world: k motions (m/s, rad/s) of the sheet's centre that the arms must follow from each
-        pose; k may be 0.
+    twists_world: k velocities (m/s, rad/s) of the sheet's centre that the arms must be able to
+        follow at each pose; k may be 0.
     """
 
     world_from_sheet: Floats
@@ -94,7 +95,10 @@ class SheetPoses:
         return len(self.stretch_ratio)
 
     def some(self, chosen: NDArray[np.intp] | Bools) -> SheetPoses:
-        """Return the poses that an array of indices or booleans selects."""
+        """Return a subset of the poses.
+
+        chosen: array of indices, or of one boolean per pose.
+        """
         return SheetPoses(
             self.world_from_sheet[chosen], self.stretch_ratio[chosen], self.twists_world[chosen]
         )
@@ -108,9 +112,9 @@ class SheetPoses:
 class ArmReach:
     """The joint angles and margins of one arm for n poses of the sheet on one branch.
 
-    joints_rad: (n, 6), NaN for poses out of reach.
-    margins: margins (n,) by limit, for each of `LIMITS`. Margins that depend on joint angles are
-        NaN for poses out of reach. Margins of singularities that the arm does not have are
+    joints_rad: joint angles (n, 6); NaN for poses that are out of reach.
+    margins: margins (n,) for each limit in `LIMITS`. Margins that depend on joint angles are NaN
+        for poses that are out of reach. Margins of singularities that the arm does not have are
         infinite.
     """
 
@@ -120,7 +124,10 @@ class ArmReach:
 
     @property
     def binding(self) -> NDArray[np.intp]:
-        """Return the index (n,) in `LIMITS` of the first violated limit of each pose, or -1."""
+        """Return the first violated limit of each pose as an index (n,) in `LIMITS`.
+
+        The index is -1 for a pose that violates no limit.
+        """
         found = np.full(len(self.joints_rad), -1)
         for number in reversed(range(len(LIMITS))):
             found[self.margins[LIMITS[number]] < 0.0] = number
@@ -128,13 +135,13 @@ class ArmReach:
 
     @property
     def reachable(self) -> Bools:
-        """Return whether the arm can reach each pose at rest, (n,)."""
+        """Return whether the arm can reach each pose at rest, as booleans (n,)."""
         binding = self.binding
         return np.asarray((binding < 0) | (binding >= len(POSE_LIMITS)))
 
     @property
     def trackable(self) -> Bools:
-        """Return whether the arm can reach each pose and follow its twists, (n,)."""
+        """Return whether the arm can reach each pose and follow its twists, as booleans (n,)."""
         return np.asarray(self.binding < 0)
 
 
@@ -151,7 +158,7 @@ def compute_reach(
 ) -> ArmReach:
     """Compute the joint angles and margins of an arm for poses of the sheet on one branch.
 
-    other: the arm that holds the other edge.
+    other: geometry of the arm that holds the other edge.
     """
     flanges = compute_flange_poses(geometry, places)
     joints = geometry.kinematics.solve_joints_on_branch(
@@ -165,8 +172,9 @@ def compute_reach(
 def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses) -> ArmReach:
     """Return the joint angles and margins on the branch that reaches the most poses.
 
-    If several branches reach as many poses, the branch with the larger margins is selected.  All
-    poses have the same branch, because an arm cannot change its branch while it holds the sheet.
+    If several branches reach equally many poses, the branch with the larger margins is selected.
+    The same branch is used for all poses, because an arm cannot change its branch while it holds
+    the sheet.
     """
     still = places.without_twists().some(
         np.arange(0, len(places), max(1, len(places) // BRANCH_SAMPLES))
@@ -193,7 +201,8 @@ def _margins(
 ) -> dict[str, Floats]:
     """Return the margins (n,) of all limits for n poses of the sheet.
 
-    joints: (n, 6).  flanges, others: world poses (n, 4, 4) of this arm's and the other's flange.
+    joints: joint angles (n, 6) rad. flanges, others: world poses (n, 4, 4) of this arm's flange and
+        of the other arm's flange.
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
     without = np.full(len(joints), np.inf)
@@ -224,7 +233,7 @@ def _margins(
 def _speeds(
     geometry: ArmGeometry, joints: Floats, flanges: Floats, places: SheetPoses
 ) -> tuple[Floats, Floats]:
-    """Return the largest joint speeds (n, 6) and tool speeds (n,) over all twists."""
+    """Return the maximum joint speeds (n, 6) rad/s and tool speeds (n,) m/s over all twists."""
     fastest, tool = np.zeros_like(joints), np.zeros(len(joints))
     centre = places.world_from_sheet[:, :3, 3]
     points = _tool_points(geometry, flanges)
@@ -247,7 +256,10 @@ def _speeds(
 
 
 def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
-    """Return world points (n, 4, 3), m: centre and ends of the clamped edge, and the flange."""
+    """Return the tool points (n, 4, 3) m in the world frame.
+
+    The points are the centre and both ends of the clamped edge, and the flange.
+    """
     points = np.einsum("nij,pj->npi", flanges[:, :3, :3], geometry.tool_points_flange)
     return np.asarray(points + flanges[:, None, :3, 3])
 
@@ -256,9 +268,9 @@ def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
 class SheetPath:
     """A path of the sheet that both arms can follow: m poses from start to goal.
 
-    left_rad, right_rad: joint angles (m, 6) of both arms; each arm stays on one branch. times_s:
-    (m,) times of the poses at the speed limits of joints and edges. via_m: offset of the detour in
-    the world; None if the path is straight.
+    left_rad, right_rad: joint angles (m, 6) of both arms, each on one branch.
+    times_s: times (m,) of the poses if joints and edges move with their maximum speeds.
+    via_m: offset of the detour in the world frame; None for a straight path.
     """
 
     places: SheetPoses
@@ -280,7 +292,7 @@ class PathStep:
 class PathError(FlexsheetError, ValueError):
     """An error for a path that the arms cannot follow.
 
-    limit: one of `LIMITS`, "jump" or "alignment".  fraction: position on the path, 0 to 1.
+    limit: a member of `LIMITS`, "jump" or "alignment". fraction: position on the path, 0 to 1.
     """
 
     code = "path"
@@ -311,12 +323,13 @@ def plan_path(
 ) -> SheetPath:
     """Plan a path for both arms between two poses and stretches of the sheet.
 
-    left_rad, right_rad: joint angles (6,) at the start; None: all branches are tried. detours_m:
-    offsets of the detours to try if the straight path violates a limit.
+    left_rad, right_rad: joint angles (6,) at the start; if None, all branches are tried.
+    detours_m: offsets of the detours that are tried if the straight path violates a limit.
 
-    On a straight path, the sheet rotates about one axis and its stretch changes linearly.  On a
-    detour, the sheet is shifted by the offset after the start, and shifted back at the end.  Raises
-    PathError with the limit that the straight path violates.
+    On a straight path, the sheet rotates about one axis and its stretch changes linearly. On a
+    detour, the sheet is shifted by the offset after the start, and shifted back at the end. Raises
+    PathError if neither the straight path nor a detour is possible. The error names the limit that
+    the straight path violates.
     """
     starts = list(product(_starts(left, start, left_rad), _starts(right, start, right_rad)))
     first: PathError | None = None
@@ -342,8 +355,8 @@ def plan_path_through(
 ) -> SheetPath:
     """Plan a path for both arms that is straight between the given corners.
 
-    left_rad, right_rad: joint angles (6,) at the first corner. Raises PathError if the path
-    violates a limit.
+    left_rad, right_rad: joint angles (6,) at the first corner.
+    Raises PathError if the path violates a limit.
     """
     begin = PathStep(
         corners[0],
@@ -363,9 +376,9 @@ def _shifted(
 def _sample_path(
     left: ArmGeometry, right: ArmGeometry, corners: Sequence[SheetMotion], begin: PathStep
 ) -> list[PathStep]:
-    """Sample a path through the corners so that joint angles change by at most MAX_STEP_RAD.
+    """Sample a path so densely that joint angles change by at most MAX_STEP_RAD per sample.
 
-    Raises PathError if an arm cannot reach a sample, or if a joint would jump.
+    Raises PathError if an arm cannot reach a sample, or if a joint motion is discontinuous.
     """
     track = [begin]
     for number, (near, far) in enumerate(pairwise(corners)):
@@ -418,10 +431,10 @@ def _explain_jump(
 
 
 def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[Floats]:
-    """Return the joint angles (6,) that an arm may have at the start of a path.
+    """Return the joint angles (6,) rad that an arm may have at the start of a path.
 
-    given: joint angles near the solution; None: return one solution per branch within the joint
-    ranges. Solutions with larger distances from the range limits are first.
+    given: joint angles near the solution. If None, one solution per branch within the joint ranges
+        is returned. Solutions with larger distances from the ends of the ranges are first.
     """
     if given is not None:
         return [_solve_joints(arm, start, given, fraction=0.0)]
@@ -462,8 +475,8 @@ def solve_step(
     """Solve the joint angles of both arms for a pose of the sheet.
 
     near: neighbouring step, whose joint angles are near the solution.
-    fraction: position on the path for the error text.
-    Raises PathError if one of COMMAND_LIMITS is violated.
+    fraction: position on the path (0 to 1), which the error text states.
+    Raises PathError if a limit of COMMAND_LIMITS is violated.
     """
     step = PathStep(
         sheet,
@@ -493,7 +506,10 @@ def solve_step(
 
 
 def interpolate_sheet(start: SheetMotion, goal: SheetMotion, fraction: float) -> SheetMotion:
-    """Return the sheet at rest at a fraction (0..1) of the straight path between two poses."""
+    """Return the sheet at rest at a position on the straight path between two poses.
+
+    fraction: position on the path, 0 to 1.
+    """
     begin, end = start.world_from_sheet, goal.world_from_sheet
     rotation_vector = vector_from_rotation(end[:3, :3] @ begin[:3, :3].T)
     rotation = rotation_from_vector(fraction * rotation_vector) @ begin[:3, :3]
@@ -516,7 +532,7 @@ def _check_limits(
     track: Sequence[PathStep],
     via: tuple[float, float, float] | None,
 ) -> SheetPath:
-    """Return the path, or raise PathError if a pose violates a limit of one of the arms.
+    """Return the path, or raise PathError if one of its poses violates a limit.
 
     A limit that is violated at the start may remain violated by the same amount.
     """

@@ -1,4 +1,4 @@
-"""Compute the state of an arm and its mean latency for the messages of an arm bridge."""
+"""Compute the state message of an arm and its mean latency."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.models.servo_lag import ServoLagEstimator
 
 REPORTED_TARGETS = 12
-"""The number of targets in one reported mean.  At 60 Hz, there are five reports per second."""
+"""The number of targets over which the reported latency is averaged. At 60 Hz, there are five
+reports per second."""
 
 
 @dataclass(slots=True)
 class LastExchange:
-    """The times of the newest exchange with the arm, ns on this computer's clock; 0: never.
+    """The times of the newest exchange with the arm.
 
-    target, received_ns: header and arrival of the sheet target from which the command was computed.
+    target, received_ns: header and arrival time of the sheet target from which the command was
+        computed.
     trajectory_ends_ns: end of the target's trajectory; 0 without a trajectory.
-    sent_ns, measured_ns: times of the last command and of the last answer.
+    sent_ns, measured_ns: times of the last command and of the last answer; 0 before the first
+        exchange.
     duration_s: duration of the last exchange.
+    All times are in ns on this computer's clock.
     """
 
     target: Header | None = None
@@ -33,7 +37,7 @@ class LastExchange:
     duration_s: float = 0.0
 
     def on_answer(self, now_ns: int) -> None:
-        """Store the time of an answer, and the duration of the exchange."""
+        """Store the time of an answer (ns), and the duration of the exchange."""
         self.measured_ns, self.duration_s = now_ns, (now_ns - self.sent_ns) * 1e-9
 
 
@@ -45,9 +49,9 @@ class LatencyMean:
         self._sum_s, self._count = 0.0, 0
 
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
-        """Add an exchange, unless its target was already added.
+        """Add an exchange, unless its target was added before.
 
-        Return the mean latency (s) after every REPORTED_TARGETS targets, otherwise None.
+        Returns the mean latency (s) after every REPORTED_TARGETS targets, otherwise None.
         """
         target, before = exchange.target, self._target
         self._target = target
@@ -70,7 +74,10 @@ def make_arm_state(
     lag: ServoLagEstimator,
     now_ns: int,
 ) -> ArmState:
-    """Make the state message of an arm that has answered at least once."""
+    """Make the state message of an arm that has answered at least once.
+
+    now_ns: time of the message.
+    """
     measured = control.last_measured_rad
     assert measured is not None
     if other is not None and other.invalid_reason is not None:

@@ -9,19 +9,20 @@ from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.models.servo_lag import LagEstimate
 
 LAG_THRESHOLD_S = 0.01
-"""The maximum deviation of the measured lag from the configured lag: five standard deviations of a
-calibrated lag (2 ms)."""
+"""The maximum deviation of the measured servo lag from the configured lag. It equals five standard
+deviations of a calibrated lag (2 ms)."""
 
 TRACKING_THRESHOLD_RAD = 0.005
-"""The maximum excess of the tracking error over the error of an ideal servo with the measured lag.
-It corresponds to 2 mm at 0.4 m: four times the effect of the largest tabulated backlash (0.6 mrad
-per joint)."""
+"""The maximum difference between the tracking error and the tracking error of an ideal servo with
+the measured lag. It corresponds to 2 mm at 0.4 m. The largest tabulated backlash (0.6 mrad per
+joint) causes a fourth of this displacement."""
 
 
 class ServoCheck:
-    """The self-checks of one arm that use estimates of the arm's lag.
+    """The self-checks of one arm's servo lag and tracking error.
 
-    configured_lag_s: lag of the arm in the parameters. command_period_s: period of its commands.
+    configured_lag_s: lag of the arm according to the parameters.
+    command_period_s: period of the commands to the arm.
 
     An overloaded computer sends commands late and reads answers late, which changes the measured
     lag of a correct arm. A deviation that both delays together explain is ignored.
@@ -35,7 +36,10 @@ class ServoCheck:
         self._expected_rad = 0.0
 
     def update(self, estimate: LagEstimate | None, at_ns: int) -> tuple[SelfCheck, ...]:
-        """Add the newest estimate of the lag, and return the checks that have enough data."""
+        """Add the newest estimate of the servo lag, and return the checks that have enough data.
+
+        at_ns: time of the estimate.
+        """
         if estimate is not None:
             deviation_s = estimate.lag_s - self._configured_lag_s
             # The arm holds a command until the next one, on average half an interval too long. It

@@ -1,4 +1,4 @@
-"""Detect from an arm's measured joint angles whether the arm stands still."""
+"""Detect from measured joint angles whether an arm is at rest."""
 
 from __future__ import annotations
 
@@ -10,38 +10,43 @@ from flexsheet.nodes.arm_bridge.link import Freshness
 Floats = NDArray[np.float64]
 
 STANDSTILL_COUNT = 5
-"""The number of consecutive fresh, unchanged measurements that show a standstill."""
+"""The number of consecutive unchanged measurements after which an arm at its last command is at
+rest."""
 
 SETTLED_COUNT = 100
-"""The number of consecutive fresh, unchanged measurements that show a standstill of an arm that is
-not at its last command.  It is sufficient for measurements that lag by 0.7 s."""
+"""The number of consecutive unchanged measurements after which an arm that is not at its last
+command is at rest. It is sufficient for measurements that lag by 0.7 s."""
 
 STANDSTILL_RAD = 1e-3
-"""The maximum difference of unchanged measurements: 200 times the encoder noise."""
+"""The maximum difference between measurements that count as unchanged: 200 times the encoder
+noise."""
 
 MAX_RESTART_SHIFT_M = 0.005
-"""The maximum distance between the commanded and the measured edge from which the arm may restart
-at the measured position.  Joint servos with a lag of 15 ms or more move there with less than 0.25
-m/s.
-"""
+"""The maximum distance between commanded and measured edge at which a motion may restart from the
+measured position. Joint servos with a lag of at least 15 ms then move there at less than 0.25
+m/s."""
 
 JUMP_MARGIN_RAD = 0.002
+"""The step by which measured joint angles may change in addition to a motion at a plausible
+speed."""
+
 JUMP_SPEED_RAD_PER_S = 0.5
-"""The step and the speed by which measurements may change without a command, because the operator
-may move the arm with its teach pendant."""
+"""The joint speed that is plausible without a command. The operator may move the arm with its teach
+pendant."""
 
 OVERSPEED = 1.5
-"""The factor by which an arm may exceed its commanded speed while it catches up."""
+"""The maximum ratio of an arm's speed to its commanded speed while the arm catches up."""
 
 MEMORY_S = 0.1
-"""The time constant with which the ranges of recently commanded speeds and joint angles decay."""
+"""The time constant with which the influence of earlier commanded speeds and joint angles
+decays."""
 
 ON_PATH_RAD = 0.005
-"""The distance from recently commanded joint angles within which every measurement is plausible."""
+"""The distance from recently commanded joint angles within which any measurement is plausible."""
 
 
 class StandstillMonitor:
-    """A counter of fresh, unchanged measurements since the last command that moved the arm.
+    """A monitor that counts unchanged measurements since the last command that moved the arm.
 
     has_jumped: whether measurements have changed faster than the arm can move.
     """
@@ -57,13 +62,16 @@ class StandstillMonitor:
     def is_standing(self, *, at_command: bool) -> bool:
         """Return whether the arm is at rest.
 
-        at_command: whether the measured joint angles are at the last command.
+        at_command: whether the measured joint angles are near the last command.
         """
         return self._count >= (STANDSTILL_COUNT if at_command else SETTLED_COUNT)
 
     @property
     def is_alive(self) -> bool:
-        """Return whether the measurements show encoder noise; a frozen measurement does not."""
+        """Return whether the measurements contain encoder noise.
+
+        Measurements without any noise indicate that the controller repeats old joint angles.
+        """
         return self._alive
 
     def restart(self) -> None:
@@ -71,15 +79,14 @@ class StandstillMonitor:
         self._count, self._alive = 0, False
 
     def forget(self) -> None:
-        """Discard the count and the last position after a gap in the measurements."""
+        """Discard the count and the last measured joint angles after a gap in the measurements."""
         self.restart()
         self._last_rad = np.full(6, np.nan)
 
     def on_command(self, joints_rad: Floats, velocity_rad_per_s: Floats, step_s: float) -> None:
         """Update the monitor after a command that covers `step_s`.
 
-        joints_rad: commanded joint angles (6,). velocity_rad_per_s: commanded joint velocities
-        (6,).
+        joints_rad, velocity_rad_per_s: commanded joint angles (6,) and joint velocities (6,).
         """
         self._elapsed_s += step_s
         speeds = np.abs(velocity_rad_per_s)
@@ -96,7 +103,7 @@ class StandstillMonitor:
             self.restart()
 
     def on_measurement(self, joints_rad: Floats, freshness: Freshness) -> None:
-        """Update the monitor after a measurement of the joint angles (6,) rad."""
+        """Update the monitor with a measurement of the joint angles (6,) rad."""
         if freshness == Freshness.REPEATED:
             return
         if not freshness.is_usable:

@@ -1,4 +1,4 @@
-"""Define the states and events of an arm's control, and the table of all transitions."""
+"""Define the states and events of an arm's controller, and the table of all transitions."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from flexsheet.messages.types import ArmMode
 
 
 class State(Enum):
-    """The states of an arm's control, with their descriptions for the documentation.
+    """The states of an arm's controller, with their descriptions for the documentation.
 
-    In states `..._TAUT` the sheet may be stretched, and the arm may slacken the sheet.
+    In states whose names end in `TAUT`, the sheet may be stretched, and the arm may slacken it.
     """
 
     STARTING = "the arm has not answered since its bridge started"
@@ -34,7 +34,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """The events of an arm's control, with their descriptions for the documentation."""
+    """The events of an arm's controller, with their descriptions for the documentation."""
 
     CONNECTION_LOST = "two exchanges without an answer, or an invalid answer"
     CONNECTED = "the arm has answered"
@@ -93,15 +93,16 @@ MODES: Mapping[State, ArmMode] = {
     S.STOPPING_TAUT: "stopping",
     S.RELAX: "relax",
 }
-"""The mode that is published for each state.  With a latched fault, the mode of TAUT is `fault`."""
+"""The published mode of each state. In the state TAUT with a latched fault, the mode is `fault`."""
 
 Row = dict[tuple[State, Event], State | None]
 
 
 def _row(event: Event, to: Mapping[State, State], *ignored_in: Iterable[State]) -> Row:
-    """Return the transitions of one event; raise ValueError if a state is given twice.
+    """Return the transitions of one event; raise ValueError if a state occurs twice.
 
-    to: next state by state.  ignored_in: groups of states that ignore the event.
+    to: mapping from each state to the next state. ignored_in: groups of states that ignore the
+        event.
     """
     ignored = [state for group in ignored_in for state in group]
     row: Row = {(state, event): None for state in ignored} | {
@@ -358,4 +359,4 @@ TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
         RELAXING,
     ),
 }
-"""The next state for each pair of state and event; None: the state ignores the event."""
+"""The next state for each pair of state and event. None means that the state ignores the event."""

@@ -1,7 +1,7 @@
-"""Read cameras that the Python package of OpenCV does not support.
+"""Read cameras that OpenCV's Python package does not support.
 
-The classes have the interface of cv2.VideoCapture.  The packages that they need are optional, and
-are imported when a device is opened.  `settings.BACKENDS` defines the units of the controls.
+The classes have the interface of cv2.VideoCapture. The packages that they need are optional, and
+are imported when a device is opened. `settings.BACKENDS` defines the units of the controls.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from flexsheet.nodes.camera.image_pair import DeviceError, Image
 
 GRAB_S = 1.0
-"""The timeout of a grab.  The reading thread can then end even if a camera sends no images."""
+"""The maximum time to wait for a frame. With this limit, the reading thread can end even if a
+camera sends no images."""
 
 BUFFERS = 4
 
@@ -48,15 +49,15 @@ def _import_introspected(name: str, version: str) -> Any:
 
 
 def _monotonic_ms(real_time_ns: int) -> float:
-    """Convert a system time (ns since 1970) to a time (ms) of the monotonic clock."""
+    """Convert a system time (ns since 1970) to a time of the monotonic clock (ms)."""
     return (real_time_ns - time.time_ns() + time.monotonic_ns()) * 1e-6
 
 
 class CapturedDevice(ABC):
-    """The base class of captures, which start their device when it is first used.
+    """A base class of captures that start their device when it is first used.
 
-    stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if it is unknown. wanted:
-    requested format by OpenCV property.
+    stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if unknown.
+    wanted: requested value of each OpenCV property of the image format.
     """
 
     def __init__(self, device: str) -> None:
@@ -72,7 +73,7 @@ class CapturedDevice(ABC):
 
     @abstractmethod
     def _start(self) -> None:
-        """Start the device with the format `wanted`; raise DeviceError if this fails."""
+        """Start the device with the requested image format; raise DeviceError if this fails."""
 
     def _ensure_started(self) -> None:
         if not self.started:
@@ -80,9 +81,9 @@ class CapturedDevice(ABC):
             self.started = True
 
     def set(self, property_id: int, value: float) -> bool:
-        """Set an OpenCV property, and return whether the device accepts it.
+        """Set an OpenCV property, and return whether the device accepts the value.
 
-        Properties of the format can be set only before the device is started.
+        Properties of the image format can be set only before the device is started.
         """
         if property_id in self.wanted and not self.started:
             self.wanted[property_id] = value
@@ -93,7 +94,7 @@ class CapturedDevice(ABC):
         return self._set_control(property_id, value)
 
     def get(self, property_id: int) -> float:
-        """Return the actual value of an OpenCV property; 0 if it is unknown."""
+        """Return the present value of an OpenCV property, or 0 if the value is unknown."""
         if property_id == cv2.CAP_PROP_POS_MSEC:
             return self.stamp_ms
         self._ensure_started()
@@ -106,7 +107,10 @@ class CapturedDevice(ABC):
         return 0.0
 
     def retrieve(self) -> tuple[bool, Image | None]:
-        """Return whether an image was grabbed, and the grey image (height, width) or None."""
+        """Return the grey image (height, width) that was grabbed last, as (True, image).
+
+        Returns (False, None) if no image was grabbed.
+        """
         return self.image is not None, self.image
 
 
@@ -125,9 +129,9 @@ class AravisCapture(CapturedDevice):
         self._camera = self._call(lambda: self._aravis.Camera.new(device or None), "open")
 
     def _call(self, call: Any, what: str) -> Any:
-        """Call a function of Aravis; raise DeviceError if it fails.
+        """Call a function of Aravis; raise DeviceError if the call fails.
 
-        what: action for the error text, such as "start".
+        what: name of the action in the error text, such as "start".
         """
         try:
             return call()
@@ -182,7 +186,7 @@ class AravisCapture(CapturedDevice):
         return 0.0
 
     def grab(self) -> bool:
-        """Wait for the next complete frame; return False if none arrives within GRAB_S."""
+        """Wait for the next complete frame; return False if no frame arrives within GRAB_S."""
         self._ensure_started()
         end_s = time.monotonic() + GRAB_S
         while (left_s := end_s - time.monotonic()) > 0.0:
@@ -208,10 +212,10 @@ class AravisCapture(CapturedDevice):
 
 
 class RealSenseCapture(CapturedDevice):
-    """The infrared pair of a RealSense camera, as one image with both views side by side.
+    """The infrared image pair of a RealSense camera, as one image with both views side by side.
 
     device: serial number, or empty for any camera.
-    The dot projector of the camera is switched off.  Both sensors are triggered together.  The
+    The dot projector of the camera is switched off. Both sensors are triggered together. The
     timestamp is the middle of the exposure if the camera reports sensor timestamps.
     """
 
@@ -282,7 +286,7 @@ class RealSenseCapture(CapturedDevice):
         return float(self._sensor.get_option(option))
 
     def grab(self) -> bool:
-        """Wait for the next pair; return False if none arrives within GRAB_S."""
+        """Wait for the next image pair; return False if no pair arrives within GRAB_S."""
         self._ensure_started()
         found, frames = self._pipeline.try_wait_for_frames(round(1e3 * GRAB_S))
         if not found:
@@ -315,7 +319,7 @@ class RealSenseCapture(CapturedDevice):
 
 
 class GstreamerCapture(CapturedDevice):
-    """A GStreamer pipeline, which determines the image format and the controls.
+    """A capture of a GStreamer pipeline, which determines the image format and the controls.
 
     device: description of the pipeline up to raw video, such as `v4l2src device=/dev/video0`.
     The source element of the pipeline provides the timestamps.
@@ -351,7 +355,7 @@ class GstreamerCapture(CapturedDevice):
             )
 
     def grab_sample(self) -> bool:
-        """Wait for the next image of the running pipeline; return False if none arrives."""
+        """Wait for the next image of the running pipeline; return False if no image arrives."""
         gst = self._gst
         sample = self._sink.emit("try-pull-sample", round(1e9 * GRAB_S))
         if sample is None:
@@ -390,7 +394,7 @@ CAPTURES: dict[str, type[AravisCapture | GstreamerCapture | RealSenseCapture]] =
     "gstreamer": GstreamerCapture,
     "realsense": RealSenseCapture,
 }
-"""The capture class of each value of `api` in the parameter `source` of a camera node."""
+"""The capture class for each value of `api` in the camera node's parameter `source`."""
 
 
 def list_devices(sysfs: Path = Path("/sys/class/video4linux")) -> list[str]:

@@ -28,10 +28,11 @@ MAX_RETRY_S = 30.0
 def open_reader(
     source: AnySource, camera: StereoCamera, now: Now, requested: Regions | None = None
 ) -> Reader:
-    """Open a source of images for a scene's camera.
+    """Open the source of a camera's images.
 
-    now: function that returns the current time (ns). requested: sensor regions that a camera must
-    deliver; None: full sensors. Raises DeviceError if the source cannot be opened.
+    camera: camera of the scene. now: function that returns the current time (ns). requested: sensor
+        regions that the camera must deliver; None for the full sensors.
+    Raises DeviceError if the source cannot be opened.
     """
     if isinstance(source, OpenCvSource):
         return CameraReader(source, camera, now, requested)
@@ -46,11 +47,11 @@ class ReaderThread(threading.Thread):
     """A thread that reads image pairs from a source, and reopens the source after a failure.
 
     deliver(images, lost): called for each image pair, with the total number of lost frames.
-    fail(error): called for each DeviceError.  The source is then opened again after a delay, which
+    fail(error): called for each DeviceError. The source is then opened again after a delay, which
         doubles from `retry_s` to MAX_RETRY_S until images arrive.
-    report(text): called after each opening for every device, with its format and settings.
-    warn(text): called after each opening for every setting that the device did not accept.
-    finish(pairs): called at the end of the source, with the number of pairs.
+    report(text): called for every device after it is opened, with its format and settings.
+    warn(text): called for every setting that a device does not accept.
+    finish(pairs): called at the end of the source, with the number of image pairs.
     regions: sensor regions to deliver; None for the full images.
 
     All functions are called in the thread itself.
@@ -82,7 +83,7 @@ class ReaderThread(threading.Thread):
         self._wait_s = retry_s
 
     def stop(self) -> None:
-        """Make the thread end after the current read."""
+        """Stop the thread after the current read operation."""
         self._stopping.set()
         reader = self._reader
         if reader is not None:

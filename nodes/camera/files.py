@@ -26,7 +26,7 @@ from flexsheet.nodes.camera.stamps import Pairing
 
 @dataclass(frozen=True, slots=True)
 class FileFrame:
-    """A decoded frame and its time since the first frame of the file."""
+    """A decoded image of a file, and its time since the first image of the file."""
 
     image: Image
     time_ns: int
@@ -35,7 +35,7 @@ class FileFrame:
 class VideoFile:
     """A video file that is read frame by frame.
 
-    rate_hz: frame rate; None: the frame times in the file are used.
+    rate_hz: frame rate. If it is None, the frame times in the file are used.
     Raises DeviceError if the file cannot be opened.
     """
 
@@ -77,7 +77,7 @@ class VideoFile:
 
 
 class FileReader:
-    """The base class of readers of files, in which reading never waits."""
+    """A base class of readers of files, whose `read` method never waits."""
 
     paced = True
     rate_hz: float | None = None
@@ -85,14 +85,14 @@ class FileReader:
     opened: tuple[str, ...] = ()
 
     def interrupt(self) -> None:
-        """Do nothing, since `read` does not wait."""
+        """Do nothing, because `read` does not wait."""
 
     def close(self) -> None:
         """Close all open files."""
 
 
 class VideoReader(FileReader):
-    """A reader of one video file with both views, or of two files that are paired by time."""
+    """A reader of one video file with both views, or of two video files that are paired by time."""
 
     def __init__(self, source: VideoSource, camera_rate_hz: float) -> None:
         self._source, self._camera_rate_hz = source, camera_rate_hz
@@ -115,7 +115,7 @@ class VideoReader(FileReader):
         self._pairing = Pairing(1.0 / rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next image pair, or None at the end; raise DeviceError if this fails."""
+        """Return the next image pair, or None at the end; raise DeviceError for a faulty file."""
         frames = self._next()
         if frames is None and self._source.loop:
             self.close()
@@ -144,9 +144,9 @@ class VideoReader(FileReader):
         )
 
     def _next(self) -> tuple[FileFrame, ...] | None:
-        """Return the next two frames of a pair, or the next frame with both views.
+        """Return the two frames of the next image pair, or one frame that contains both views.
 
-        Return None at the end of one of the files.
+        Return None at the end of a file.
         """
         if len(self._files) == 1:
             (file,) = self._files
@@ -167,7 +167,7 @@ class VideoReader(FileReader):
 
 
 class _LoopClock:
-    """A clock whose time continues when a file is read again from its start.
+    """A clock whose time continues to increase when a file is read again from its start.
 
     The interval between two passes equals the interval between the last two images of the file.
     rate_hz: frame rate, which determines the interval if the file has a single image.
@@ -179,7 +179,7 @@ class _LoopClock:
         self._newest_ns: int | None = None
 
     def continuous_ns(self, time_ns: int) -> int:
-        """Convert a time (ns) in the current pass to a time since the start of the first pass."""
+        """Convert a time (ns) in the current pass to a time (ns) since the start of the clock."""
         continuous_ns = self._start_ns + time_ns
         if self._newest_ns is not None:
             self._interval_ns = continuous_ns - self._newest_ns
@@ -193,10 +193,10 @@ class _LoopClock:
 
 
 def read_times(path: Path, pairs: int) -> list[int]:
-    """Read the times of image pairs from the column `t_s` of a CSV file, in s.
+    """Read the times of image pairs from the column `t_s` (seconds) of a CSV file.
 
     pairs: required number of rows.
-    Returns the times in ns since the first image pair.  Raises DeviceError if the file cannot be
+    Returns the times (ns) since the first image pair. Raises DeviceError if the file cannot be
     read, or if its times are not ascending numbers.
     """
     if not path.is_file():
@@ -266,7 +266,7 @@ class ImagesReader(FileReader):
         self._clock = _LoopClock(rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next image pair, or None at the end; raise DeviceError if this fails."""
+        """Return the next image pair, or None at the end; raise DeviceError if a file is faulty."""
         if self._next == len(self._pairs):
             if not self._loop:
                 return None

@@ -1,4 +1,4 @@
-"""Detect the user's eyes in an image, locate them in the world, and filter their motion."""
+"""Detect the user's eyes in an image, compute their positions in the world, and filter them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from flexsheet.nodes.models.one_euro import OneEuro
 from flexsheet.nodes.models.rigid import apply
 
 Detector = Callable[[Image], Floats | None]
-"""A function that returns the pixels (2, 2) of the user's left and right eye in a grey image.
+"""A function that returns the pixel positions (2, 2) of the left and right eye in a grey image.
 
-The function returns None if the image contains no face.
-"""
+The function returns None if the image contains no face."""
 
 PACKAGES_MISSING = (
     "the packages dlib-bin and face-recognition-models are not installed; run: "
@@ -30,10 +29,10 @@ LANDMARKS_FILE = "shape_predictor_5_face_landmarks.dat"
 
 
 def load_detector(search_width_px: int) -> Detector:
-    """Load the face detector and the landmark model of dlib.
+    """Load the face detector and the landmark model of the package dlib.
 
     search_width_px: width to which larger images are reduced for the face search. The eyes are then
-    located in the full image. If an image contains several faces, the largest face is used.
+        detected in the full image. If an image contains several faces, the largest face is used.
     Raises DeviceError if dlib or its models are not installed.
     """
     # The module with the models is only located, because its import needs setuptools.
@@ -69,10 +68,10 @@ def locate_eyes(
     """Return the midpoint (3,) of the eyes and the vector (3,) from the left to the right eye.
 
     Both results are in the world frame, m.
-    pixels: positions of the left and the right eye in the image, (2, 2) px.
+    pixels: positions (2, 2) of the left and the right eye in the image, px.
     interocular_m: distance between the eyes.
-    Both eyes are assumed to have the same depth. If the head is rotated by an angle about the
-    vertical, the distance from the camera is too large by a factor of about 1 / cos(angle).
+    Both eyes are assumed to have the same depth. If the head is rotated about the vertical by an
+    angle, the computed distance is too large by about 1 / cos(angle).
     """
     matrix = np.array(
         [[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]]
@@ -87,10 +86,10 @@ def locate_eyes(
 
 
 class EyeFilter:
-    """A 1 euro filter of the eyes' positions.
+    """A 1 euro filter for the positions of the eyes.
 
     min_cutoff_hz: cut-off frequency at rest. cutoff_per_speed_hz: increase of the cut-off frequency
-    per unit of speed.
+        per unit of speed.
     """
 
     def __init__(self, min_cutoff_hz: float, cutoff_per_speed_hz: float) -> None:
@@ -98,13 +97,13 @@ class EyeFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all earlier values. The next value then remains unfiltered."""
+        """Discard all earlier values, so that the next value remains unfiltered."""
         self._last: tuple[float, Floats, Floats] | None = None
 
     def update(self, at_s: float, value: Floats) -> Floats:
-        """Return the filtered value (n,) after a new value (n,).
+        """Add a value (n,), and return the filtered value (n,).
 
-        at_s: time of the value, later than that of the previous value.
+        at_s: time of the value, which must be later than the time of the previous value.
         """
         if self._last is None:
             self._last = at_s, value, np.zeros_like(value)

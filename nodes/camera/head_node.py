@@ -1,4 +1,4 @@
-"""Publish the positions of the user's eyes, which a camera in front of the user measures."""
+"""Measure the positions of the user's eyes with a camera in front of the user, and publish them."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
 JOIN_S = 1.0
 DRAIN_NS = 10_000_000
-"""The time after a search in which images are discarded, because they waited in the driver's queue.
-"""
+"""The time after a face search in which arriving images are discarded. These images have waited in
+the driver's queue and are outdated."""
 PixelCount = Annotated[int, Field(gt=0)]
 
 
 class HeadCameraParameters(NodeParameters):
-    """Parameters of the head camera."""
+    """The parameters of the head camera."""
 
     device: int | str = Field(
         default=0, description="number or path of the camera, or a stream that OpenCV opens"
@@ -84,11 +84,11 @@ class HeadCameraParameters(NodeParameters):
 
 
 class HeadCamera(Node):
-    """A node that publishes the positions of the user's eyes in the images of a UVC camera.
+    """A node that publishes the positions of the user's eyes from the images of a UVC camera.
 
-    The distance of the eyes follows from the interocular distance in the scene and from the focal
-    length. If the camera, its packages or a face are missing, the node publishes invalid eyes. The
-    renderer then uses the eyes of the scene.
+    The distance of the eyes is computed from the interocular distance in the scene and from the
+    focal length. If the camera, its packages or a face are missing, the node publishes invalid
+    eyes. The renderer then uses the eye positions in the scene.
     """
 
     opens_devices: ClassVar[bool] = True
@@ -133,9 +133,9 @@ class HeadCamera(Node):
             self.report_error("source", error)
 
     def _receive(self, at_ns: int, pixels: Floats | None) -> None:
-        """Publish the eyes of one image.
+        """Publish the eye positions in one image.
 
-        at_ns: time of the exposure.  pixels: (2, 2) px of both eyes, or None without a face.
+        at_ns: time of the exposure. pixels: positions (2, 2) of both eyes, px; None without a face.
         """
         scene, last_ns = self.current_scene, self._published_ns
         if scene is None or (last_ns is not None and at_ns <= last_ns):
@@ -178,8 +178,8 @@ class HeadCamera(Node):
     async def watch(self) -> None:
         """Publish invalid eyes while no images arrive.
 
-        The timestamp is `silence_s` in the past, so that the eyes of an image that is still being
-        searched are newer.
+        Their timestamp is `silence_s` in the past. The eyes in an image that is still being
+        searched are therefore newer.
         """
         p = self.parameters
         at_ns = self.clock.now_ns() - round(1e9 * (p.delay_s + p.silence_s))
@@ -191,7 +191,7 @@ class FaceReader(threading.Thread):
     """A thread that searches the newest image of a camera for eyes.
 
     deliver(at_ns, pixels): called for each searched image, with the time of its exposure and the
-    pixels (2, 2) of the eyes, or None without a face.
+        pixel positions (2, 2) of the eyes, or None without a face.
     fail(error): called for each DeviceError. The camera is then opened again after a delay.
     Both functions are called in the thread itself.
     """

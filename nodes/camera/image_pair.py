@@ -1,4 +1,4 @@
-"""Define the interface of readers, which read pairs of grey images from cameras or files."""
+"""Define the interface of readers of stereo images from cameras or files."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ Regions = tuple[Region, Region]
 class ImagePair:
     """A left and a right grey image (height, width) that were taken at about the same time.
 
-    exposure_ns: mean of both mid-exposure times on the reader's clock.  For files, time since the
-        start of the file.
-    exposure_s: duration of the exposure as reported by the device; None if unknown.
-    skew_s: time of the right exposure minus time of the left exposure.
+    exposure_ns: mean of both mid-exposure times on the reader's clock. For files, it is the time
+        since the start of the file.
+    exposure_s: duration of the exposure that the device reports; None if unknown.
+    skew_s: mid-exposure time of the right image minus that of the left image.
     regions: sensor regions of the images; None for full sensors.
     notes: remarks for the operator.
     """
@@ -77,9 +77,9 @@ class ImagePair:
 class Reader(Protocol):
     """The interface of readers of image pairs.
 
-    paced: whether `read` returns immediately, as for files.  The caller must then wait until each
-        pair is due.
-    rate_hz: frame rate of a device, from which lost frames are counted; None for files.
+    paced: whether `read` returns immediately, as for files. The caller must then wait until each
+        image pair is due.
+    rate_hz: frame rate of a device, which is used to count lost frames; None for files.
     warnings: texts about settings that the device did not accept.
     opened: texts about the actual format and settings of each device; empty for files.
     """
@@ -90,11 +90,14 @@ class Reader(Protocol):
     opened: tuple[str, ...]
 
     def read(self) -> ImagePair | None:
-        """Wait for the next pair and return it, or None at the end; may raise DeviceError."""
+        """Wait for the next image pair and return it, or None at the end; may raise DeviceError."""
         ...
 
     def interrupt(self) -> None:
-        """Make the current `read` and all later calls return None soon.  Thread-safe."""
+        """Make the current `read` call and all later calls return None.
+
+        Any thread may call this method.
+        """
         ...
 
     def close(self) -> None: ...
@@ -105,7 +108,7 @@ def make_stereo_message(
 ) -> StereoPair:
     """Make the message for an image pair.
 
-    device: name of the camera.  exposure_s: value if the device does not report its exposure time.
+    device: name of the camera. exposure_s: exposure time that is used if the device reports none.
     """
     origins = [(region.column, region.row) for region in images.regions or ()] or [(0, 0)] * 2
     return StereoPair(
@@ -121,7 +124,10 @@ def make_stereo_message(
 
 
 def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
-    """Convert a message to an image pair; exposure_ns: mean of both mid-exposure times."""
+    """Convert a message to an image pair.
+
+    exposure_ns: mean of both mid-exposure times.
+    """
     origins = (pair.left_origin_px, pair.right_origin_px)
     left, right = (
         Region(*origin, image.shape[1], image.shape[0])
@@ -138,7 +144,10 @@ def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
 
 
 def describe_skew(skew_s: float, limit_s: float) -> str:
-    """Return a text that explains why a pair was rejected for its skew."""
+    """Return a text that explains why an image pair was rejected.
+
+    skew_s: time between the left and the right exposure. limit_s: maximum of this time.
+    """
     return (
         f"{1e3 * skew_s:.1f} ms between left and right exposure, maximum {1e3 * limit_s:g} ms; "
         "restart the cameras, or connect a common trigger"
@@ -146,7 +155,7 @@ def describe_skew(skew_s: float, limit_s: float) -> str:
 
 
 def convert_to_gray(image: NDArray[Any]) -> Image:
-    """Convert an image to grey (h, w).
+    """Convert an image to a grey image (h, w).
 
     image: grey (h, w) or (h, w, 1), BGR (h, w, 3), or brightness and another channel (h, w, 2).
     """
@@ -156,9 +165,10 @@ def convert_to_gray(image: NDArray[Any]) -> Image:
 
 
 def split_side_by_side(image: Image, name: object) -> tuple[Image, Image]:
-    """Split an image (h, 2w) with both views side by side into left and right view (h, w).
+    """Split an image (h, 2w) with both views side by side into the left and right view (h, w).
 
-    name: name of the source in the error text.  Raises DeviceError if the width is odd.
+    name: name of the source in the error text.
+    Raises DeviceError if the width is odd.
     """
     if image.shape[1] % 2:
         raise DeviceError(
@@ -170,7 +180,7 @@ def split_side_by_side(image: Image, name: object) -> tuple[Image, Image]:
 
 
 def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
-    """Raise DeviceError unless each image has the size of its region or of the scene's camera.
+    """Check the image size; raise DeviceError if it differs from the region or from the scene.
 
     name: name of the source in the error text.
     """
@@ -191,7 +201,7 @@ def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
 
 
 def crop(images: ImagePair, regions: Regions) -> ImagePair:
-    """Crop images to sensor regions; raise DeviceError if the images do not contain them."""
+    """Crop images to sensor regions; raise DeviceError if an image does not contain its region."""
     if images.regions == regions:
         return images
     parts = []
@@ -214,5 +224,5 @@ def crop(images: ImagePair, regions: Regions) -> ImagePair:
 
 
 def encode_png(image: Image) -> bytes:
-    """Return an image as the bytes of a PNG file."""
+    """Encode an image as the bytes of a PNG file."""
     return bytes(cv2.imencode(".png", image)[1])

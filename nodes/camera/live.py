@@ -1,4 +1,4 @@
-"""Read live cameras. A thread for each camera records the arrival time of its frames."""
+"""Read live cameras with one thread per camera, which records the arrival time of the frames."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from flexsheet.nodes.camera.sources import OpenCvSource
 from flexsheet.nodes.camera.stamps import Pairing, StampCheck
 
 MAX_WAITING_FRAMES = 4
-"""The maximum number of frames that wait for a frame of the other camera.  A new frame replaces the
-oldest frame."""
+"""The maximum number of frames in the queue for pairing. If the queue is full, a new frame replaces
+the oldest frame."""
 FIRST_FRAME_S = 5.0
-"""The minimum timeout for the first frame, because the sensors need time to start."""
+"""The minimum timeout for the first frame after the start, because sensors need time to start."""
 RELEASE_S = 0.5
 
 RATE_FRAMES = 61
@@ -44,10 +44,10 @@ RATE_FRAMES = 61
 
 @dataclass(frozen=True, slots=True)
 class CapturedFrame:
-    """An image of one camera with two estimates (ns) of its mid-exposure time.
+    """An image of one camera with two estimates of its mid-exposure time.
 
-    by_arrival_ns: computed from the time of arrival. by_stamp_ns: computed from the driver's
-    timestamp; None without a timestamp.
+    by_arrival_ns: estimate that is based on the time of arrival. by_stamp_ns: estimate that is
+        based on the driver's timestamp; None without a timestamp.
     """
 
     image: Image
@@ -68,7 +68,10 @@ def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
 
 
 def open_device(device: int | str, api: str | None, backend: Backend | None) -> Any:
-    """Open a camera with the interface of cv2.VideoCapture; raise DeviceError if this fails."""
+    """Open a camera with the backend's driver; raise DeviceError if this fails.
+
+    The result has the interface of cv2.VideoCapture.
+    """
     if api in CAPTURES:
         return CAPTURES[api](str(device))
     return open_capture(device, backend.api if backend else cv2.CAP_ANY)
@@ -77,11 +80,12 @@ def open_device(device: int | str, api: str | None, backend: Backend | None) -> 
 class Stream(threading.Thread):
     """A thread that reads the frames of one camera.
 
-    views: 2 if each image contains both views side by side, else 1.
-    requested: region of the sensor to read; None: the full sensor.
+    views: 2 if each image contains both views side by side, otherwise 1.
+    requested: region of the sensor to read; None for the full sensor.
     changed: condition that is notified after each frame and after a failure.
     The thread also releases the device, because OpenCV crashes if another thread releases the
-    device during a grab.  Raises DeviceError if the device cannot be opened or configured.
+    device while a frame is grabbed. Raises DeviceError if the device cannot be opened or
+    configured.
     """
 
     def __init__(
@@ -127,7 +131,7 @@ class Stream(threading.Thread):
         return self._stamp_check is not None and self._stamp_check.trusted
 
     def stop(self) -> None:
-        """Make the thread end after the current frame."""
+        """Stop the thread after the current frame."""
         self._stopping.set()
         if self.ident is None:
             self._capture.release()
@@ -176,8 +180,8 @@ class CameraReader:
     """A reader of two free-running cameras, or of one camera with both views side by side.
 
     If the timestamps of all drivers are plausible, the mid-exposure time of a frame is its
-    timestamp minus `exposure_to_stamp_s`.  Otherwise it is the time of arrival minus
-    `exposure_to_grab_s`.
+    timestamp minus `exposure_to_stamp_s`. Otherwise the mid-exposure time is the time of arrival
+    minus `exposure_to_grab_s`.
     """
 
     paced = False
@@ -224,7 +228,7 @@ class CameraReader:
             stream.start()
 
     def read(self) -> ImagePair | None:
-        """Wait for the next image pair and return it; raise DeviceError if none arrives."""
+        """Wait for the next image pair and return it; raise DeviceError if no pair arrives."""
         with self._changed:
             counts = [stream.count for stream in self._streams]
             limit_ns = self._now() + round(1e9 * self._wait_s)
@@ -253,9 +257,10 @@ class CameraReader:
         return frame.by_arrival_ns
 
     def _pop_frames(self) -> tuple[CapturedFrame, ...] | None:
-        """Remove and return the next two frames of a pair, or the next frame with both views.
+        """Remove the next image pair from the queues, and return its one or two frames.
 
-        Return None if the frames have not arrived yet.
+        The result has one frame if the frame contains both views. Return None if no pair is
+        complete.
         """
         if len(self._streams) == 1:
             frames = self._streams[0].frames
@@ -286,9 +291,9 @@ class CameraReader:
         )
 
     def _describe_silence(self, counts: list[int]) -> str:
-        """Return an error text that explains why no pair arrived.
+        """Return an error text that explains why no image pair arrived.
 
-        counts: number of frames of each camera when the wait began.
+        counts: number of frames of each camera at the start of the wait.
         """
         silent = [
             repr(stream.device)
@@ -306,13 +311,16 @@ class CameraReader:
         )
 
     def interrupt(self) -> None:
-        """Make the current `read` and all later calls return None soon.  Thread-safe."""
+        """Make the current `read` call and all later calls return None.
+
+        Any thread may call this method.
+        """
         with self._changed:
             self._interrupted = True
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Close the cameras.  A camera whose grab does not return is released after the grab."""
+        """Close the cameras. A camera that is waiting for a frame is released after the frame."""
         for stream in self._streams:
             stream.stop()
         for stream in self._streams:

@@ -57,7 +57,7 @@ class CameraParameters(NodeParameters):
 
 
 class Camera(Node):
-    """A node that publishes stereo image pairs with the time of their exposure."""
+    """A node that publishes stereo image pairs with their exposure times."""
 
     role: ClassVar[NodeRole | None] = NodeRole.CAMERA
     opens_devices: ClassVar[bool] = True
@@ -155,9 +155,9 @@ class Camera(Node):
         self._publish(images, pair.device, pair.exposure_s, pair.dropped_frames)
 
     def _publish(self, images: ImagePair, device: str, exposure_s: float, lost: int) -> None:
-        """Publish an image pair, unless the time between its exposures exceeds the limit.
+        """Publish an image pair, unless its two exposures are too far apart in time.
 
-        exposure_s: value if the device does not report its exposure time.
+        exposure_s: exposure time that is used if the device reports none.
         lost: total number of lost frames, without rejected pairs.
         """
         limit_s = self.parameters.max_skew_s

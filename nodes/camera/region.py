@@ -1,4 +1,4 @@
-"""Compute the region of each sensor in which the finger can appear."""
+"""Compute the region of each camera sensor in which the finger can appear."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from flexsheet.nodes.models import camera, rigid
 Floats = NDArray[np.float64]
 
 GRID = 17
-"""The number of points along each edge of the box that the finger can reach.  The lens distortion
-between two points is negligible."""
+"""The number of grid points along each edge of the box in which the finger can be. Between two grid
+points, the change of the lens distortion is negligible."""
 MARGIN_PX = 16.0
-"""The margin for the marker's blur and for differences between calibration and scene."""
+"""The margin around a region, which allows for blur of the marker and for calibration errors."""
 ALIGN_PX = (16, 2)
-"""The numbers of columns and rows of whose multiples a region can start."""
+"""The column and row numbers at which a region starts must be multiples of these numbers."""
 NEAREST_M = 1e-3
 
 
@@ -33,7 +33,7 @@ class ExplicitRegions(LimitedModel):
 
 
 def volume_points(low_m: Floats, high_m: Floats) -> Floats:
-    """Return a grid of points (n, 3) that fills the box between two corners (3,)."""
+    """Return a grid of points (n, 3) that fills the box between two opposite corners (3,)."""
     axes = [np.linspace(low, high, GRID) for low, high in zip(low_m, high_m, strict=True)]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
@@ -41,10 +41,10 @@ def volume_points(low_m: Floats, high_m: Floats) -> Floats:
 def find_visible_region(
     points_camera: Floats, lens: Lens, width_px: int, height_px: int
 ) -> Region | None:
-    """Return the sensor region that shows all visible points (n, 3) m in the camera's frame.
+    """Return the sensor region that shows all visible points (n, 3) m in the camera frame.
 
     Return None if no point is visible, and the full sensor if some points are behind the camera.
-    The distortion polynomial is invalid beyond the image's corners.  Points beyond the corners are
+    The distortion polynomial is invalid beyond the image's corners. Points beyond the corners are
     therefore moved to the circle through the farthest corner.
     """
     in_front = points_camera[points_camera[:, 2] > NEAREST_M]
@@ -74,8 +74,8 @@ def find_visible_region(
 def find_finger_regions(scene: Scene) -> Regions:
     """Return the sensor region of each view in which a fingertip can appear.
 
-    The fingertip can appear in the box from finger.volume_min_m to finger.volume_max_m, extended
-    by the radius of the finger and a margin.  Raises DeviceError if a view does not show the box.
+    The fingertip can be in the box from finger.volume_min_m to finger.volume_max_m, extended by the
+    radius of the finger and a margin. Raises DeviceError if the box is not visible in a view.
     """
     finger, rig = scene.finger, scene.camera
     low = np.asarray(finger.volume_min_m) - finger.radius_m
@@ -97,10 +97,10 @@ def find_finger_regions(scene: Scene) -> Regions:
 
 
 def resolve_regions(setting: str | ExplicitRegions, scene: Scene) -> Regions | None:
-    """Return the sensor regions to publish; None for both full sensors.
+    """Return the sensor regions to publish, or None for both full sensors.
 
-    setting: "full", "finger" (the box that the finger can reach), or explicit regions.  Raises
-    DeviceError if a region is not inside its sensor.
+    setting: "full", "finger" (the regions in which the finger can appear), or explicit regions.
+    Raises DeviceError if a region is not inside its sensor.
     """
     if setting == "full":
         return None

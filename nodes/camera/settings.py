@@ -1,7 +1,7 @@
 """Set a camera's exposure, gain, white balance, focus and region to fixed values.
 
-Each setting is read back.  If the device does not accept a setting, a warning states the requested
-value and the actual value.  Units differ between OpenCV's backends (see its source files
+Each setting is read back. If the device does not accept a setting, a warning states the requested
+value and the actual value. Units differ between OpenCV's backends (see its source files
 modules/videoio/src/cap_v4l.cpp, cap_ximea.cpp and cap_aravis.cpp).
 """
 
@@ -21,7 +21,7 @@ MAX_RATE_HZ = 10_000.0
 
 
 class Device(Protocol):
-    """The part of the interface of cv2.VideoCapture that this module uses."""
+    """The part of the interface of cv2.VideoCapture that is used to configure a camera."""
 
     def get(self, property_id: int, /) -> float: ...
 
@@ -34,10 +34,11 @@ class Backend:
 
     exposure_unit_s, whole_units: unit of CAP_PROP_EXPOSURE, and whether its values are integers.
     auto_exposure: OpenCV property, and the value that selects manual exposure.
-    autos: names and properties of further automatic functions; the value 0 switches them off.
-    offsets: properties for first column and row of the sensor region; None if not supported.
+    autos: names and properties of further automatic functions, which the value 0 switches off.
+    offsets: properties for the first column and row of the sensor region; None if not supported.
     buffers: number of frame buffers to request from the driver.
-    stamp_fraction: time from the middle of the exposure to the driver's timestamp, in exposures.
+    stamp_fraction: time from the middle of the exposure to the driver's timestamp, as a fraction of
+        the exposure time.
     clock: whether CAP_PROP_POS_MSEC after a grab is the driver's timestamp of that frame.
     """
 
@@ -75,7 +76,7 @@ BACKENDS = {
         autos=(("auto white balance", cv2.CAP_PROP_XI_AUTO_WB),),
         offsets=(cv2.CAP_PROP_XI_OFFSET_X, cv2.CAP_PROP_XI_OFFSET_Y),
     ),
-    # The module `captures` opens the next three, OpenCV the others.
+    # The module `captures` opens the next three backends.  OpenCV opens the other backends.
     "aravis": Backend(
         api=cv2.CAP_ANY,
         exposure_unit_s=1e-6,
@@ -106,7 +107,7 @@ class DeviceSettings:
     """The actual settings of a device.
 
     exposure_s: exposure time; None if unknown.
-    got: text with format and settings, for the log and the status of the node.
+    got: text with the format and the settings, for the log and the status of the node.
     warnings: texts about settings that the device did not accept.
     """
 
@@ -117,10 +118,11 @@ class DeviceSettings:
 
 
 def choose_backend(device: int | str, api: str | None) -> Backend | None:
-    """Return the OpenCV backend with which to open a device.
+    """Choose the OpenCV backend for a device.
 
     api: name of a backend, or None to choose the backend by the device.
-    Return None if OpenCV must choose the backend; the camera's controls are then unknown.
+    Returns None if OpenCV must choose the backend. The units of the camera's controls are then
+    unknown.
     """
     if api is None:
         api = "v4l2" if isinstance(device, int) or device.startswith("/dev/") else "any"
@@ -130,10 +132,11 @@ def choose_backend(device: int | str, api: str | None) -> Backend | None:
 def set_format(
     capture: Device, backend: Backend | None, camera: StereoCamera, views: int, pixel_format: str
 ) -> None:
-    """Request the image size and frame rate of the scene, which the device may ignore.
+    """Request the image size and frame rate of the scene's camera.
 
-    views: 2 if each image contains both views side by side, else 1.
-    pixel_format: four characters such as MJPG; "" for OpenCV's choice.
+    views: 2 if each image contains both views side by side, otherwise 1.
+    pixel_format: four characters such as MJPG, or "" if OpenCV chooses the format.
+    The device may ignore the request.
     """
     if backend is not None and backend.buffers is not None:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, backend.buffers)
@@ -151,7 +154,10 @@ def set_format(
 def fix_settings(
     capture: Device, backend: Backend | None, camera: StereoCamera, device: object
 ) -> DeviceSettings:
-    """Set the scene's exposure and gain, switch automatic functions off, and check all settings."""
+    """Set the scene's exposure and gain, and switch off automatic functions.
+
+    The result contains warnings about all settings that the device did not accept.
+    """
     warnings: list[str] = []
 
     def warn(what: str, requested: str, actual: str) -> None:
@@ -225,7 +231,7 @@ def set_region(
 ) -> Region | None:
     """Set the region of the sensor that the device reads.
 
-    Return the actual region, or None for the full sensor.  If the actual region does not contain
+    Returns the actual region, or None for the full sensor. If the actual region does not contain
     the requested region, the full sensor is used.
     """
     if backend is None or backend.offsets is None:

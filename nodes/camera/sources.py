@@ -1,4 +1,4 @@
-"""Define the parameter `source` of a camera node: the device or files to read."""
+"""Define the camera node's parameter `source`, which selects the device or the files to read."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexsheet.nodes.parameter_marks import DeviceFile
 
 
 class CameraSource(LimitedModel):
-    """The base class for values of the camera node's parameter `source`."""
+    """A base class of the values of the camera node's parameter `source`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -95,7 +95,7 @@ class ImagesSource(CameraSource):
 
 
 def _expand_kind(source: object) -> object:
-    """Expand the short form of a source in a launch file, `source: twin`, to a mapping."""
+    """Expand the short form `source: twin` of a launch file to a mapping."""
     return {"kind": source} if isinstance(source, str) else source
 
 

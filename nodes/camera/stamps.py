@@ -9,23 +9,25 @@ from typing import TypeVar
 T = TypeVar("T")
 
 MAX_FUTURE_NS = 1_000_000
-"""The maximum time by which rounding may make a timestamp later than the frame's arrival."""
+"""The maximum time by which a timestamp may be later than the frame's arrival, because of
+rounding."""
 MAX_AGE_NS = 1_000_000_000
-"""The maximum age of a timestamp when the frame arrives.  It permits a driver with a few frame
-buffers at 10 Hz or more."""
+"""The maximum age of a timestamp when the frame arrives. It permits a driver with several frame
+buffers at rates of at least 10 Hz."""
 MAX_IMPLAUSIBLE = 3
 SLACK = 0.05
-"""The tolerance of the pairing, as a fraction of the period.  Without a tolerance, jitter would
-drop frames of cameras that expose half a period apart."""
+"""The tolerance for the pairing of frames, as a fraction of the frame period. Without a tolerance,
+jitter would drop frames of cameras that expose half a period apart."""
 
 
 class StampCheck:
-    """A check whether a driver's timestamps are times of this computer's monotonic clock.
+    """A plausibility check of a camera driver's timestamps.
 
-    A timestamp is plausible if it is later than the previous timestamp, and at most MAX_AGE_NS
-    before the frame's arrival.  Timestamps of another clock differ by hours or years.
-    trusted: whether the timestamps may be used; False after MAX_IMPLAUSIBLE consecutive implausible
-        timestamps.
+    The timestamps must be times of this computer's monotonic clock. A timestamp is plausible if it
+    is later than the previous timestamp, and at most MAX_AGE_NS before the frame's arrival.
+    Timestamps of another clock differ by hours or years.
+    trusted: whether the timestamps may be used. It is False after MAX_IMPLAUSIBLE consecutive
+        implausible timestamps.
     """
 
     def __init__(self) -> None:
@@ -47,10 +49,10 @@ class StampCheck:
 
 
 class Pairing:
-    """A pairing of the frames of two cameras with equal rates by their exposure times.
+    """A matcher that pairs the frames of two cameras with equal frame rates by exposure time.
 
-    The cameras have no common trigger.  Two frames are a pair if the time between their exposures
-    is at most half a period (plus `SLACK`).  Otherwise the older frame is dropped.
+    The cameras have no common trigger. Two frames are a pair if the time between their exposures is
+    at most half a period, plus a tolerance. Otherwise the older frame is dropped.
     unpaired: number of dropped frames.
     """
 
@@ -61,7 +63,7 @@ class Pairing:
     def pop_pair(
         self, left: deque[T], right: deque[T], exposure_ns: Callable[[T], int]
     ) -> tuple[T, T] | None:
-        """Remove the next pair from both queues and return it; None if there is none.
+        """Remove the next image pair from both queues and return it, or None if there is no pair.
 
         left, right: frames in the order of their exposures.
         exposure_ns: function that returns the exposure time of a frame.

@@ -1,4 +1,4 @@
-"""Measure the offsets of other hosts' clocks by pings between the clock nodes of the hosts."""
+"""Measure the clock offsets of other hosts by pings between the clock nodes of the hosts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PEER_TIMEOUT_NS = 60_000_000_000
 
 
 class ClockParameters(NodeParameters):
-    """The parameters of the clock node, from the key `clocks` of the launch file."""
+    """The parameters of the clock node, which the key `clocks` of the launch file defines."""
 
     rate_hz: Positive = Field(default=8.0, description="rate at which pings are sent, Hz")
     max_offset_uncertainty_s: Positive = Field(

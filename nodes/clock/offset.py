@@ -1,12 +1,12 @@
 """Estimate the offset of another clock from pings, with guaranteed bounds.
 
-A ping has four timestamps: it is sent at t1 on the own clock and received at t2 on the other clock.
-    The reply is sent at t3 on the other clock and received at t4 on the own clock. A message
-    arrives after it was sent. The time of the other clock minus that of the own clock is therefore
-    at most t2 - t1 at time t1, and at least t3 - t4 at time t4. The maximum drift limits the change
-    between both times. Nothing else is assumed about the delays of the network.
+A ping has four timestamps. It is sent at t1 on the own clock and received at t2 on the other clock.
+The reply is sent at t3 on the other clock and received at t4 on the own clock. A message always
+arrives after it was sent. The other clock minus the own clock is therefore at most t2 - t1 at time
+t1, and at least t3 - t4 at time t4. Between both times, the offset changes at most by the maximum
+drift. No assumption about the network's delays is necessary.
 
-Source: Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on intersecting
+Source: Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on the intersection of
     intervals.
 """
 
@@ -23,7 +23,7 @@ FIT_SPAN_NS = 5_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The clock offset from one ping, with its bounds.
+    """A measurement of the clock offset by one ping, with its bounds.
 
     The other clock minus the own clock was offset_ns +- half_ns at time `at_ns` of the own clock.
     """
@@ -35,7 +35,7 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class OffsetEstimate:
-    """The estimated time of the other clock minus that of the own clock, with guaranteed bounds.
+    """An estimate of the other clock minus the own clock, with guaranteed bounds.
 
     The bounds are offset_ns +- half_ns at time `at_ns` of the own clock.
     drift_ratio: estimated rate of change of the offset.
@@ -48,11 +48,12 @@ class OffsetEstimate:
 
 
 def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -> Sample | None:
-    """Make the sample of a ping from its four timestamps, ns, or None if they are inconsistent.
+    """Compute the clock offset from a ping's four timestamps (ns).
 
-    t1, t4: own clock when the ping was sent and its reply was received.
-    t2, t3: other clock when the ping was received and its reply was sent.
+    t1, t4: times on the own clock when the ping was sent and when its reply was received.
+    t2, t3: times on the other clock when the ping was received and when its reply was sent.
     max_drift_ratio: maximum relative drift of the clocks.
+    Returns None if the timestamps are inconsistent.
     """
     round_trip_ns, remote_ns = t4 - t1, t3 - t2
     drift_ns = max_drift_ratio * round_trip_ns
@@ -66,10 +67,11 @@ def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -
 
 
 def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float) -> tuple[int, int]:
-    """Return the lower and upper bound of the offset (ns) at `at_ns`, from all samples.
+    """Return the lower and the upper bound of the clock offset (ns) at time `at_ns`.
 
-    max_drift_ratio: maximum relative drift of the clocks. If the samples are inconsistent, the
-        lower bound is above the upper bound.
+    max_drift_ratio: maximum relative drift of the clocks.
+    Every sample limits the offset. If the samples are inconsistent, the lower bound is above the
+    upper bound.
     """
     errors = [one.half_ns + int(max_drift_ratio * abs(at_ns - one.at_ns)) + 1 for one in samples]
     low = max(one.offset_ns - error for one, error in zip(samples, errors, strict=True))
@@ -78,11 +80,12 @@ def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float)
 
 
 def fit_drift(samples: list[Sample]) -> tuple[float, float]:
-    """Fit a line to the offsets of the samples, and return its value and slope.
+    """Fit a line to the clock offsets by weighted least squares.
 
-    The value (ns) is that of the line at the newest sample, minus the offset of this sample. The
-    least squares are weighted by the inverse square of the bounds, which favours pings that did not
-    wait in a queue. Both results are 0 if the samples span less than `FIT_SPAN_NS`.
+    Returns the value of the line at the newest sample, minus the offset of this sample (ns), and
+    the slope of the line. The weights are the inverse squares of the samples' bounds. Pings that
+    waited in a queue therefore have small weights. Both results are 0 if the samples span less than
+    `FIT_SPAN_NS`.
     """
     newest = samples[-1]
     if newest.at_ns - samples[0].at_ns < FIT_SPAN_NS:
@@ -101,12 +104,12 @@ def fit_drift(samples: list[Sample]) -> tuple[float, float]:
 
 @dataclass(slots=True)
 class OtherClock:
-    """The samples of another clock over the last minute: the most accurate sample of each half
-    second.
+    """The offset measurements of another clock during the last minute.
 
+    Only the most accurate sample of each half second is stored.
     max_drift_ratio: maximum relative drift of the clocks.
-    resets: number of times when all samples were deleted, because a new sample was inconsistent
-        with them. This happens, for example, after a clock was set.
+    resets: number of times when all samples were deleted because a new sample was inconsistent with
+        them. This happens, for example, after a clock was set.
     """
 
     max_drift_ratio: float
@@ -114,7 +117,7 @@ class OtherClock:
     resets: int = 0
 
     def add(self, sample: Sample) -> None:
-        """Add a sample if it is the most accurate sample of its half second."""
+        """Add a sample, unless a sample of the same half second is more accurate."""
         samples = self.samples
         if samples and sample.at_ns <= samples[-1].at_ns:
             return
@@ -132,9 +135,9 @@ class OtherClock:
         samples.append(sample)
 
     def estimate(self, at_ns: int) -> OffsetEstimate | None:
-        """Estimate the offset at time `at_ns` of the own clock.
+        """Estimate the clock offset at time `at_ns` of the own clock.
 
-        Return None before the first sample.
+        Returns None before the first sample.
         """
         if not self.samples:
             return None

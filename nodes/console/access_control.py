@@ -1,10 +1,10 @@
 """Control access to the console page.
 
-By default, only users of this computer have access. Users of other computers need a token. A web
-page of another site, opened in a browser on this computer, could connect to the console's sockets.
-Listening on loopback is therefore insufficient, and the Host and Origin headers of every request
-are checked. No other page may show the console in a frame, because a frame can hide the element
-that the user clicks.
+By default, only users of this computer have access, and users of other computers need a token. A
+web page of another site that is open in a browser on this computer could connect to the console.
+Listening on the loopback address is therefore insufficient, and the Host and Origin headers of
+every request are checked. No other page may show the console in a frame, because a frame can hide
+the element that the user clicks.
 """
 
 from __future__ import annotations
@@ -38,25 +38,26 @@ MIN_TOKEN_LENGTH = 16
 COOKIE = "flexsheet-token"
 
 FRAMING_HEADERS = {"X-Frame-Options": "DENY", "Content-Security-Policy": "frame-ancestors 'none'"}
-"""The headers of every response that forbid other pages to show the console in a frame."""
+"""The response headers that forbid other pages to show the console in a frame."""
 
 FRAME_DESTINATIONS = ("iframe", "frame", "fencedframe", "embed", "object")
-"""The values of the header Sec-Fetch-Dest in requests for a page inside another page."""
+"""The values of the header Sec-Fetch-Dest that indicate a page embedded in another page."""
 
 SINGLE_HEADERS = ("Host", "Origin", "Upgrade", "Accept-Encoding", "Cookie", "Sec-Fetch-Dest")
-"""The headers that are read. A request that repeats one of these headers is malformed."""
+"""The request headers that the access control reads. A request that repeats one of these headers is
+malformed."""
 
 MALFORMED = (
     "the console cannot read this HTTP request; open the address of the console in a browser"
 )
 CLOSE_TIMEOUT_S = 1.0
-"""The time for which a refused connection stays open so that the client can read the reason."""
+"""The time for which a refused connection stays open, so that the client can read the reason."""
 
 PageRequest = Callable[[Any, Request], Response | None]
 
 
 class ConsoleError(FlexsheetError, RuntimeError):
-    """An error that is raised if the page cannot be served."""
+    """An error of the console that prevents it from serving the page."""
 
     code = "console"
     remedy = "Choose another port, or set a token if the page is open to the network."
@@ -65,8 +66,8 @@ class ConsoleError(FlexsheetError, RuntimeError):
 def read_token(path: Path) -> str:
     """Read the access token from a file.
 
-    Raise ConsoleError if the file cannot be read or other users can read it. Also raise it if the
-    token is too short or contains other characters than letters and digits.
+    Raise ConsoleError if the file cannot be read, or if other users can read it. Also raise it if
+    the token is too short or contains characters other than letters and digits.
     """
     try:
         mode, text = path.stat().st_mode, path.read_text().strip()
@@ -91,7 +92,8 @@ class AccessControl:
     """The access control for HTTP and WebSocket requests to the console page.
 
     address: IP address of the page. token: required token; None permits every user of this
-    computer. Raise ConsoleError if the address is not loopback and there is no token.
+        computer.
+    Raise ConsoleError if the address is not a loopback address and there is no token.
     """
 
     def __init__(self, address: str, token: str | None) -> None:
@@ -150,7 +152,7 @@ class AccessControl:
 
 
 def _names_an_address(host: str) -> bool:
-    """Return whether a Host header is an IP address or localhost. Other names can be forged."""
+    """Return whether a Host header is an IP address or localhost; other names can be forged."""
     try:
         name = urlsplit(f"//{host}").hostname or ""
         return name == "localhost" or bool(ipaddress.ip_address(name))
@@ -196,7 +198,7 @@ def forbid_framing(response: Response) -> Response:
 
 
 def make_page_logger() -> logging.Logger:
-    """Return the logger of the page's server, which logs errors as one line without traceback."""
+    """Return the logger of the page's server, which logs an error as one line of text."""
     logger = logging.getLogger("flexsheet.console")
     if not logger.filters:
         logger.addFilter(shorten_traceback)
@@ -204,7 +206,10 @@ def make_page_logger() -> logging.Logger:
 
 
 def shorten_traceback(record: logging.LogRecord) -> bool:
-    """Replace the traceback of a log record by its last line, and return True to log the record."""
+    """Replace the traceback of a log record by its last line.
+
+    Returns True, which makes the logger output the record.
+    """
     if record.exc_info and record.exc_info[1] is not None:
         error = record.exc_info[1]
         record.msg = f"{record.getMessage()}: {type(error).__name__}: {error}".replace("\n", " ")
@@ -218,7 +223,7 @@ class PageConnection(ServerConnection):
     refused = False
 
     def send_data(self) -> None:
-        """Send the data of the protocol. After a malformed request, first send a refusal."""
+        """Send the buffered data; after a malformed request, send a refusal first."""
         malformed = isinstance(self.protocol.handshake_exc, InvalidMessage)
         if malformed and not self.refused and not self.transport.is_closing():
             self.refused = True
@@ -235,10 +240,11 @@ class PageConnection(ServerConnection):
 
 
 def start_server(address: str, port: int, access: AccessControl, label: str) -> viser.ViserServer:
-    """Start a viser server with access control at exactly the requested address and port.
+    """Start a viser server with access control at the requested address and port.
 
-    label: heading of the control panel. Raise ConsoleError if the port is in use, or if the
-    installed version of viser does not support the access control.
+    label: heading of the control panel.
+    Raise ConsoleError if the port is in use, or if the installed version of viser does not support
+    the access control.
     """
     # viser uses the next free port if the requested port is in use, so test the port first.
     _check_port_is_free(address, port)
@@ -259,7 +265,7 @@ def start_server(address: str, port: int, access: AccessControl, label: str) -> 
 
 @contextmanager
 def _checking(access: AccessControl) -> Iterator[list[PageRequest]]:
-    """Add access control to all servers of the websockets library that start in the context.
+    """Add access control to all servers of the package websockets that start in the context.
 
     Yield the list of the request handlers that were replaced.
     """

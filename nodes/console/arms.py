@@ -1,8 +1,8 @@
-"""Compute the boxes that represent the arm links on the console page, and the links' poses.
+"""Compute the boxes that represent the arm links on the console page, and the poses of the links.
 
-The lengths come from the model of the arm in the scene. The thicknesses are approximate. A box is
-fixed in the frame of its link, whose origin is on the axis of the joint that moves the link. The
-frame of the last link is the flange frame.
+The lengths of the boxes come from the model of the arm in the scene. Their thicknesses are
+approximate. A box is fixed in the frame of its link, whose origin is on the axis of the joint that
+moves the link. The frame of the last link is the flange frame.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from flexsheet.nodes.models.rigid import pose_matrix, rotation_from_vector, tran
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A box that is part of a link, with size and centre in the frame of the link.
+    """A box that represents a part of a link, with size and centre (m) in the link's frame.
 
     link: index of the link, where 0 is the base. dark: whether the box has the darker colour.
     """
@@ -46,24 +46,26 @@ PIECES = (
 """The boxes that represent the links of a Mitsubishi RV-1A."""
 
 LINK_WIDTH_M = 0.07
-"""The width of the boxes that represent the links of other arms."""
+"""The width of the boxes that represent the links of all other arm models."""
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-"""The corners (8, 3) of a box with sides from -1 to 1."""
+"""The corners (8, 3) of a cube with coordinates from -1 to 1."""
 
 BRACKET_WIDTH_M = 0.012
-"""The width of the bar between a flange and its clamp."""
+"""The width of the drawn bar between a flange and its clamp."""
 
 CLAMP_SIZE_M = (0.012, 1.04, 0.012)
-"""The width, the ratio of length to edge length, and the thickness of the clamp of the sheet."""
+"""The size of the drawn clamp: width (m), ratio of its length to the edge length, and thickness
+(m)."""
 
 
 def compute_link_poses(
     world_from_base: Floats, joints_rad: Floats, model: ClosedFormArm | JointChain
 ) -> Floats:
-    """Compute the poses (7, 4, 4) of the base and the six links, of which the last is the flange.
+    """Compute the world poses (7, 4, 4) of the base and the six links of an arm.
 
-    world_from_base (4, 4): pose of the base. joints_rad (6,): joint angles.
+    world_from_base: pose (4, 4) of the base. joints_rad: joint angles (6,).
+    The last pose is the pose of the flange.
     """
     chain = model.chain() if isinstance(model, ClosedFormArm) else model
     poses = [world_from_base]
@@ -75,7 +77,10 @@ def compute_link_poses(
 
 
 def make_pieces(model: ClosedFormArm | JointChain) -> tuple[Piece, ...]:
-    """Return the boxes of an arm. For an unknown model, the boxes connect successive joints."""
+    """Return the boxes that represent an arm.
+
+    For an arm without prepared boxes, the boxes connect successive joints.
+    """
     if model == RV_1A:
         return PIECES
     chain = model.chain() if isinstance(model, ClosedFormArm) else model
@@ -90,9 +95,10 @@ def make_pieces(model: ClosedFormArm | JointChain) -> tuple[Piece, ...]:
 def rounded_box(
     size_m: tuple[float, float, float], centre_m: tuple[float, float, float], bevel: float = 0.18
 ) -> tuple[Floats, NDArray[np.int32]]:
-    """Return vertices (24, 3) and counter-clockwise triangles (44, 3) of a box with bevelled edges.
+    """Return vertices (24, 3), m, and triangles (44, 3) of a box with bevelled edges.
 
     bevel: ratio of the bevel to half of the shortest side.
+    The triangles are counter-clockwise.
     """
     half = 0.5 * np.array(size_m)
     cut = bevel * half.min()
@@ -104,9 +110,9 @@ def rounded_box(
 
 
 def make_bracket(flange_from_clamp_m: Floats) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return vertices (n, 3), m, and triangles (t, 3) of the bar from the flange to its clamp.
+    """Return vertices (n, 3), m, and triangles (t, 3) of the bar between a flange and its clamp.
 
-    flange_from_clamp_m (3,): centre of the clamp in the flange frame.
+    flange_from_clamp_m: centre (3,) of the clamp in the flange frame.
     """
     reach_m = np.abs(flange_from_clamp_m)
     vertices, triangles = rounded_box(

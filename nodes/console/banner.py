@@ -1,4 +1,4 @@
-"""Render the banner of the page: the state of the arms, a remedy, and the source of the view."""
+"""Render the banner of the console page: state of the arms, remedy, and source of the view."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexsheet.nodes.console.panels import MODES, make_paragraph
 
 
 class BannerState(IntEnum):
-    """The state that the banner shows. If several states apply, the largest value has priority."""
+    """The states that the banner shows. If several states apply, the largest value has priority."""
 
     READY = 0
     WAITING = 1
@@ -29,7 +29,7 @@ GROUNDS = {
     BannerState.FAULT: "bad",
     BannerState.ESTOP: "bad",
 }
-"""The suffix of the CSS class in page.css that sets the banner's background, for each state."""
+"""The suffix of the CSS class in page.css that sets the banner's background in each state."""
 
 FAULTY_MODES: tuple[ArmMode, ...] = ("fault", "estop", "disconnected")
 STILL_STOPPED = "the arms are still stopped"
@@ -37,11 +37,15 @@ STILL_STOPPED = "the arms are still stopped"
 
 @dataclass(frozen=True, slots=True)
 class GraphState:
-    """The state of the graph that the banner describes.
+    """The state of the running graph that the banner describes.
 
-    scene: name of the scene. arms: states of the arms by side. estop_reason: reason of the e-stop,
-    or None. sheet: newest target, or None. overload: sentence about an overloaded computer, or
-    empty. solver_note: note of the soft-body solver while it has no result for the scene, or empty.
+    scene: name of the scene.
+    arms: states of the arms by side.
+    estop_reason: reason of the e-stop; None if no e-stop is engaged.
+    sheet: newest sheet target, or None.
+    overload: sentence about an overloaded computer, or empty.
+    solver_note: note of the soft-body solver if it has no result for the scene yet, otherwise
+        empty.
     replay: name of the replayed bag, or None.
     """
 
@@ -55,14 +59,14 @@ class GraphState:
 
     @property
     def stopped(self) -> str | None:
-        """Return the reason of the engaged e-stop, or None if it is not engaged."""
+        """Return the reason of the engaged e-stop, or None if no e-stop is engaged."""
         if self.estop_reason is None and any(arm.mode == "estop" for arm in self.arms.values()):
             return STILL_STOPPED
         return self.estop_reason
 
     @property
     def banner(self) -> BannerState:
-        """Return the applicable state with the highest priority."""
+        """Return the state to show: the applicable state with the highest priority."""
         if self.stopped is not None:
             return BannerState.ESTOP
         if any(map(is_faulty, self.arms.values())):
@@ -75,7 +79,7 @@ class GraphState:
 
     @property
     def resettable(self) -> bool:
-        """Return whether there is an e-stop or a fault to reset."""
+        """Return whether an e-stop or a fault can be reset."""
         return self.stopped is not None or any(arm.faults for arm in self.arms.values())
 
 
@@ -85,7 +89,7 @@ def is_faulty(arm: ArmState) -> bool:
 
 
 def render(state: GraphState) -> str:
-    """Return the banner and the text under it as HTML."""
+    """Return the banner and the explanation below it as HTML."""
     shown = state.banner
     sentences = [state.overload, _remedy(state, shown), _explain(state, shown)]
     forces = [arm.edge_force_n for arm in state.arms.values() if arm.edge_force_n is not None]
@@ -134,7 +138,7 @@ def _describe(side: str, arm: ArmState) -> str:
 
 
 def _remedy(state: GraphState, shown: BannerState) -> str:
-    """Return a sentence about the necessary action of the user, or an empty text."""
+    """Return a sentence about the action that the user must take, or an empty text."""
     arms = state.arms.values()
     if shown is BannerState.ESTOP:
         return f"Release the stop when the arms are at rest; {_after_reset(state)}."
@@ -163,7 +167,10 @@ def _after_reset(state: GraphState) -> str:
 
 
 def _explain(state: GraphState, shown: BannerState) -> str:
-    """Return the reason why an arm without fault does not follow, or the state of the sheet."""
+    """Return the reason why an arm without a fault does not follow the finger.
+
+    If there is no such arm, return a sentence about the state of the sheet.
+    """
     if shown is BannerState.ESTOP:
         return ""
     for side, arm in state.arms.items():

@@ -1,7 +1,7 @@
-"""Execute the requests of the console page's viewers in the console node's event loop.
+"""Execute the viewers' requests in the console node's event loop.
 
-The "eye view" is the image that a user sees: a camera in the simulator traces the projected frame
-from the position of the user's eye.
+The "eye view" is the image that the user sees. A simulated camera at the user's eye computes it
+from the projected frame by ray tracing.
 """
 
 from __future__ import annotations
@@ -32,30 +32,31 @@ from flexsheet.nodes.console.state_file import ConsoleState, load_state, save_st
 Publish = Callable[[Message], None]
 
 SETTLE_S = 0.4
-"""The time that a slider must rest before the changed scene is published, in seconds."""
+"""The time without motion of a slider after which the changed scene is published."""
 
 EYE_VIEW_PERIOD_S = 6.0
 PIXELS_EVERY = 3
 MAX_DRAWING_S = 5.0
-"""The maximum time for which the console waits for a frame of the renderer, in seconds."""
+"""The maximum time to wait for a frame from the renderer."""
 
 CAPTURE_S = 1.0
-"""The time after a frame within which the simulated eye receives all its inputs, in seconds."""
+"""The time after a frame within which the simulated eye receives all its inputs."""
 
 MAX_TRACING_S = 120.0
-"""The maximum time for which the console waits for the traced image of the eye view, in seconds."""
+"""The maximum time to wait for the ray-traced image of the eye view."""
 
 DEFAULT_BOOKMARK = "bookmark"
 MAX_LABELS = 64
-"""The number of requests whose images are still shown if they arrive late."""
+"""The number of newest requests whose images are shown even if they arrive late."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sliders:
-    """The positions of the page's sliders.
+    """The positions of the sliders on the console page.
 
-    young_modulus_pa: Young's modulus of the object; None for a rigid object. stretch_ratio: minimum
-    stretch ratio of the sheet. size_ratio: size of the object, relative to the scene file.
+    young_modulus_pa: Young's modulus of the object; None for a rigid object.
+    stretch_ratio: minimum stretch ratio of the sheet.
+    size_ratio: size of the object, relative to its size in the scene file.
     """
 
     young_modulus_pa: float | None
@@ -64,7 +65,7 @@ class Sliders:
 
     @staticmethod
     def from_scene(scene: Scene) -> Sliders:
-        """Return the slider values of an unchanged scene."""
+        """Return the slider positions that correspond to an unchanged scene."""
         material = scene.object.material
         return Sliders(
             None if material is None else material.young_modulus_pa,
@@ -74,7 +75,7 @@ class Sliders:
 
 
 class SceneController:
-    """The controller of the graph's scene, which viewers select and change by sliders."""
+    """A controller of the graph's scene, which viewers select and change by sliders."""
 
     def __init__(
         self,
@@ -85,9 +86,9 @@ class SceneController:
     ) -> None:
         """Start with the scene `first`.
 
-        publish: function that publishes a scene. folder: folder of the scenes to choose from.
+        publish: function that publishes a scene. folder: folder with the selectable scenes.
         sliders: slider positions that the previous console process saved; None if no slider was
-        moved.
+            moved.
         """
         self._publish, self._folder = publish, folder
         self.names = scenes.list_scene_names(folder)
@@ -98,18 +99,21 @@ class SceneController:
         self._picker_task: asyncio.Task[None] | None = None
 
     def choose(self, name: str) -> None:
-        """Change to another scene of the run. Raise SceneChoiceError for an unknown name."""
+        """Change to another scene of the run; raise SceneChoiceError for an unknown name."""
         self.base, self.moved = scenes.load(self._folder, name), False
         self.sliders = Sliders.from_scene(self.base)
         self._send(self.base)
 
     def slide(self, now_s: float, **changes: float) -> None:
-        """Store slider positions, from which `apply_sliders` publishes a scene later."""
+        """Store new slider positions, which `apply_sliders` applies to the scene later.
+
+        now_s: current time. changes: new slider positions by name.
+        """
         self.sliders = replace(self.sliders, **changes)
         self._due_s = now_s + SETTLE_S
 
     def apply_sliders(self, now_s: float) -> bool:
-        """If the sliders have stopped moving, publish the changed scene and return True.
+        """Publish the changed scene and return True, if the sliders have stopped moving.
 
         Raise SceneChoiceError for invalid slider positions.
         """
@@ -132,9 +136,10 @@ class SceneController:
         self._publish(self.scene)
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
-        """Prepare in a thread the selection of object points, by which viewers move the finger.
+        """Prepare the selection of points on the object in a background thread.
 
-        failed: function that receives the cause if points of the object cannot be selected.
+        failed: function that receives the cause if the object permits no selection.
+        By selecting points, viewers move the finger.
         """
         if self._picker_task is not None:
             self._picker_task.cancel()
@@ -156,7 +161,7 @@ class SceneController:
 
 
 class EyeViewState(Enum):
-    """The state of a request for an eye view."""
+    """The states of a request for an eye view."""
 
     RESTING = auto()
     DRAWING = auto()
@@ -164,12 +169,13 @@ class EyeViewState(Enum):
 
 
 class EyeViewRequester:
-    """A requester of eye views, the images that a user sees.
+    """A requester of eye views, which are images from the position of the user's eye.
 
-    For each view, it requests one frame with pixels from the renderer, which the simulated eye then
-    traces. Only one image is requested at a time, because tracing takes a second of processor time.
-    When the simulated eye has its inputs, the display settings of another writer are restored.
-    Without such settings, the image correction of the scene or of the console is restored.
+    For each view, the requester orders one frame with pixels from the renderer, which the simulated
+    eye then traces. Only one image is requested at a time, because tracing takes a second of
+    processor time. When the simulated eye has all its inputs, the previous display settings are
+    restored. If no other node has sent display settings, the image correction of the scene or of
+    the console is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
@@ -191,25 +197,25 @@ class EyeViewRequester:
 
     @property
     def correction(self) -> Correction:
-        """Return the image correction that was chosen at the console or specified by the scene."""
+        """Return the image correction that a viewer has chosen, or that the scene specifies."""
         return resolve_method(self.chosen_correction, self._by_scene, "two_pass")
 
     def waited_s(self, now_s: float) -> float:
-        """Return the time since the last change of state, in seconds."""
+        """Return the time (s) since the last change of state."""
         return now_s - self._since_s
 
     def on_scene(self, scene: Scene) -> None:
-        """Use the image correction that a new scene specifies.
+        """Apply the image correction that a new scene specifies.
 
         A renderer that has received a display message ignores the correction of later scenes. If
-        the console sent the display message, this method therefore publishes the new correction.
+        the console has sent such a message, this method publishes the new correction.
         """
         self._by_scene = scene.methods.correction
         if self._owns_display and not self._borrowed:
             self._restore_display()
 
     def on_others_display(self, display: Display) -> None:
-        """Store the display settings of another writer, which are restored after an eye view."""
+        """Store the display settings of another node, to restore them after an eye view."""
         self._others_display, self._owns_display = display, False
 
     def advance(self, now_s: float) -> None:
@@ -248,12 +254,12 @@ class EyeViewRequester:
         self._next_s = 0.0
 
     def on_frame(self, frame: Frame, now_s: float) -> None:
-        """Process the first frame with the requested pixels, which the simulated eye traces."""
+        """Start the tracing of the eye view if a frame contains the requested pixels."""
         if self.state is EyeViewState.DRAWING and frame.label == self.label and frame.pixels:
             self._enter(EyeViewState.TRACING, now_s)
 
     def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """Process a traced image, and return whether this console has requested it."""
+        """Process a ray-traced image, and return whether this console has requested it."""
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
         return eye.label in self._labels
@@ -274,10 +280,10 @@ class EyeViewRequester:
 
 
 class Replay:
-    """The replay of a bag on the page, which publishes no messages.
+    """The replay of a bag on the console page, which publishes no messages.
 
     timeline: opened bag, or None. playing: whether the replay advances. rate: ratio of recorded
-    time to real time.
+        time to real time.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -299,22 +305,22 @@ class Replay:
         self.playing = True
 
     def leave(self) -> None:
-        """Close the bag and show the running graph again."""
+        """Close the bag, and show the running graph again."""
         self.timeline, self.playing = None, False
 
     def seek(self, seconds: float) -> None:
-        """Jump to a time since the start of the bag, limited to the duration of the bag."""
+        """Jump to a time (s) since the start of the bag, limited to the bag's duration."""
         if self.timeline is not None:
             self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
 
     def play_or_pause(self) -> None:
-        """Pause or continue the replay. At the end of the bag, start from the beginning."""
+        """Pause or continue the replay; at the end of the bag, restart from the beginning."""
         if self.timeline is not None and self.timeline.seconds >= self.timeline.duration_s:
             self.seek(0.0)
         self.playing = not self.playing
 
     def advance(self, duration_s: float) -> None:
-        """Advance the replay by a duration of real time, and stop at the end of the bag."""
+        """Advance the replay by a period of real time (s), and stop at the end of the bag."""
         if self.timeline is None or not self.playing:
             return
         self.seek(self.timeline.seconds + self.rate * duration_s)
@@ -324,7 +330,7 @@ class Replay:
 
 @dataclass(frozen=True, slots=True)
 class ConsoleFiles:
-    """The paths of the run's plan, the scenes, the bags, and the saved state of a console."""
+    """The file paths of a console: the run's plan, the scenes, the bags, and the saved state."""
 
     plan: Path
     scenes: Path
@@ -333,9 +339,9 @@ class ConsoleFiles:
 
 
 class ReleaseError(FlexsheetError, ValueError):
-    """An error that is raised if the host of the console may not reset an e-stop.
+    """An error that is raised if the host of the console is not permitted to reset an e-stop.
 
-    The text names the hosts that may reset it.
+    The text names the hosts that are permitted to reset the e-stop.
     """
 
     code = "release"
@@ -348,8 +354,8 @@ class ReleaseError(FlexsheetError, ValueError):
 class ConsoleController:
     """The main controller of the console, which also publishes e-stops, recordings and bookmarks.
 
-    A restarted console continues with the saved scene, sliders and recording. warn:
-    function that receives the cause if the saved state cannot be used.
+    warn: function that receives the cause if the saved state cannot be used.
+    After a restart, the console continues with the saved scene, sliders and recording.
     """
 
     def __init__(
@@ -374,18 +380,21 @@ class ConsoleController:
         self.stopped: str | None = None
 
     def begin(self) -> None:
-        """Publish the latched messages again, which were lost when the previous process exited."""
+        """Publish the latched messages again after a restart of the console.
+
+        The messages of the previous console process were lost when it exited.
+        """
         self.scenes.publish_current()
         if self.recording:
             self._publish(Recording(running=True))
 
     def stop(self, reason: str) -> None:
-        """Engage the e-stop of both arms, and publish the reason."""
+        """Engage the e-stop of both arms for the given reason."""
         self.stopped = reason
         self._publish(EStop(engaged=True, reason=reason))
 
     def release(self) -> None:
-        """Reset the e-stop. Raise ReleaseError if the nodes ignore resets from this host."""
+        """Reset the e-stop; raise ReleaseError if the nodes ignore resets from this host."""
         if others := self.facts.others_may_reset:
             raise ReleaseError(
                 f"the host of this console {NodeNote.MAY_NOT_RESET.phrase}; "
@@ -395,13 +404,16 @@ class ConsoleController:
         self._publish(EStop(engaged=False, reason="reset at the console"))
 
     def record(self, running: bool) -> None:
-        """Start or stop the recording of a bag."""
+        """Start or stop recording to a bag."""
         self.recording = running
         self._publish(Recording(running=running))
         self.save_state()
 
     def add_bookmark(self, label: str) -> str:
-        """Publish a bookmark, and return its label."""
+        """Publish a bookmark, and return its label.
+
+        An empty label is replaced by a default label.
+        """
         label = label.strip() or DEFAULT_BOOKMARK
         self._publish(Bookmark(label=label))
         return label
@@ -412,7 +424,7 @@ class ConsoleController:
         self.save_state()
 
     def save_state(self) -> None:
-        """Save the scene, the sliders, the recording and the finger for a restarted console."""
+        """Save the scene, sliders, recording and finger for a restart of the console."""
         scenes = self.scenes
         state = ConsoleState(
             base=scenes.base,
@@ -424,9 +436,10 @@ class ConsoleController:
 
 
 def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> ConsoleState:
-    """Load the state of the previous console, or make a state with the first scene of the plan.
+    """Load the saved state of the previous console process.
 
     warn: function that receives the cause if the saved state is invalid.
+    Without a valid state, the result contains the first scene of the plan.
     """
     try:
         state = load_state(files.state)

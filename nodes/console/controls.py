@@ -1,6 +1,6 @@
-"""Wrap the controls (GUI elements) of viser for all tabs of the page.
+"""Wrap the controls (GUI elements) of the library viser for all tabs of the console page.
 
-Every callback runs on a thread of viser and only passes a request to the node. Handles have the
+Every callback runs on a thread of viser, and only passes a request to the node. Handles have the
 type Any, because the type stubs of viser do not declare that values can be set.
 """
 
@@ -10,16 +10,18 @@ from collections.abc import Callable
 from typing import Any
 
 Request = Callable[..., None]
-"""A function request(name, *values) that passes a viewer's request to the node from any thread."""
+"""A function request(name, *values) that passes a viewer's request to the node.
+
+The function may be called from any thread."""
 
 
 def make_callback(request: Request, name: str, *values: Any) -> Callable[[Any], None]:
-    """Return a callback that makes a request with a given name and values."""
+    """Return a callback that sends a request with the given name and values."""
     return lambda event: request(name, *values)
 
 
 def on_value(handle: Any, changed: Callable[[Any], None]) -> None:
-    """Call `changed` with each value that a viewer sets, but not with values that the page sets."""
+    """Call `changed` with each value that a viewer sets, but not with values that the node sets."""
 
     # A coroutine runs in viser's event loop, so that values arrive in order.
     async def on_update(event: Any) -> None:
@@ -36,7 +38,7 @@ def show_value(handle: Any, value: Any) -> None:
 
 
 class Html:
-    """A piece of HTML on the page, which is sent only when it changes."""
+    """A block of HTML on the page that is transmitted only when it changes."""
 
     def __init__(self, gui: Any) -> None:
         self._handle, self._shown = gui.add_html(""), ""

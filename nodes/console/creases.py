@@ -1,4 +1,4 @@
-"""Split meshes at sharp edges, for a viewer that shades every vertex with a single normal."""
+"""Split meshes at sharp edges, for a viewer that shades each vertex with a single normal."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from flexsheet.nodes.arrays import Floats
 Triangles = NDArray[np.int32]
 
 CREASE_RAD = 0.7
-"""The minimum angle between the normals of two triangles at a sharp edge."""
+"""The minimum angle between the normals of two triangles at which their common edge is sharp."""
 
 
 def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.int64], Triangles]:
     """Duplicate the vertices at sharp edges, so that each side of an edge has its own vertices.
 
-    vertices (n, 3), triangles (t, 3): mesh. Return the index (k,) of the original vertex for each
-    new vertex, and the triangles (t, 3) with indices of the new vertices.
+    vertices, triangles: mesh with vertices (n, 3) and triangles (t, 3).
+    Returns the index (k,) of the original vertex for each new vertex, and the triangles (t, 3) with
+    indices of the new vertices.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components

@@ -1,4 +1,4 @@
-"""Show the page's tab with the images that the simulated eye sees."""
+"""Show the page's tab with the images of the simulated eye."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMAGES = (
 
 
 class EyeTab:
-    """The tab with the images that the simulated eye sees, which are hidden until they exist."""
+    """The tab with the images of the simulated eye, which are hidden until an image exists."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._enabled = gui.add_checkbox(

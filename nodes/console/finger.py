@@ -14,15 +14,15 @@ from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
 
 LABEL = "console"
 FRONT_M = 1.5
-"""The distance from the imaginary screen at which rays from the front start, in metres."""
+"""The z coordinate (m, world frame) of the origins of rays from the front."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ray:
     """A ray in the world frame that selects its first intersection with the object.
 
-    direction: vector of any length except 0. Raise ValueError for values that are not
-    finite, and for a direction of length 0.
+    direction: vector of any length except 0.
+    Raise ValueError for values that are not finite, and for a direction of length 0.
     """
 
     origin_m: tuple[float, float, float]
@@ -38,22 +38,23 @@ class Ray:
 
     @property
     def is_from_front(self) -> bool:
-        """Return whether the ray has the direction of the negative z axis, away from the user."""
+        """Return whether the ray points in the negative z direction, away from the user."""
         return self.direction[:2] == (0.0, 0.0) and self.direction[2] < 0.0
 
     @classmethod
     def from_front(cls, x_m: float, y_m: float) -> Ray:
-        """Return the ray along the negative z axis through the point (x, y)."""
+        """Return the ray in the negative z direction through the point (x, y)."""
         return cls((x_m, y_m, FRONT_M), (0.0, 0.0, -1.0))
 
 
 @dataclass(frozen=True, slots=True)
 class FingerIntent:
-    """The finger position that a viewer requests.
+    """A finger position that a viewer requests.
 
-    position: ray that selects the point on any object. depth_m: depth of a lowered finger below the
-    surface. lifted: whether the finger hovers above the point. Raise ValueError for a negative
-    depth or a depth that is not finite.
+    position: ray that selects a point on any object.
+    depth_m: depth below the surface if the finger is not lifted.
+    lifted: whether the finger hovers above the point.
+    Raise ValueError for a depth that is negative or not finite.
     """
 
     position: Ray = field(default_factory=lambda: Ray.from_front(0.0, 0.0))
@@ -68,7 +69,10 @@ class FingerIntent:
             )
 
     def target_m(self, picker: SurfacePicker) -> Floats:
-        """Return the requested world position (3,), in m, of the fingertip on an object."""
+        """Return the requested position (3,), in m, of the fingertip in the world frame.
+
+        picker: selector of points on the object.
+        """
         origin, direction = np.array(self.position.origin_m), np.array(self.position.direction)
         return picker.pick(origin, direction, -HOVER_M if self.lifted else self.depth_m)
 
@@ -76,9 +80,10 @@ class FingerIntent:
 class FingerController:
     """A controller that moves the simulated finger to the requested position at a limited speed.
 
-    Each step is published as a path of one point. The controller publishes nothing before the first
-    command of a viewer, so that other programs can control the finger. commanded: whether a viewer
-    has moved the finger. position_m: requested position (x, y) as seen from the front.
+    commanded: whether a viewer has moved the finger. position_m: requested position (x, y) as seen
+        from the front.
+    Each step is published as a path of one point. Nothing is published before the first command of
+    a viewer, so that other programs can control the finger.
     """
 
     def __init__(self, publish: Callable[[Message], None], *, speed_m_per_s: float) -> None:
@@ -92,7 +97,7 @@ class FingerController:
         self.intent = FingerIntent()
 
     def use(self, picker: SurfacePicker | None) -> None:
-        """Replace the object.
+        """Use the points of a new object.
 
         picker: selector of points on the object; None if the shape is unknown.
         """
@@ -100,20 +105,20 @@ class FingerController:
         self._update_target()
 
     def restore(self, intent: FingerIntent) -> None:
-        """Continue with the request that the previous console process saved."""
+        """Continue with the requested position that the previous console process has saved."""
         self.intent, self.commanded = intent, True
         self._update_target()
 
     def touch(self, origin: Floats, direction: Floats) -> None:
-        """Push at the point at which a ray from the viewer's eye meets the object.
+        """Request a push at the point where a ray from the viewer's eye meets the object.
 
-        origin, direction (3,): ray in the world frame, m.
+        origin, direction: origin (3,), m, and direction (3,) of the ray in the world frame.
         """
         position = Ray(tuple(map(float, origin)), tuple(map(float, direction)))  # type: ignore[arg-type]  # three each
         self._request(position=position, lifted=False)
 
     def move_to(self, x_m: float, y_m: float) -> None:
-        """Move to a position (x, y) as seen from the front, without a change of the depth."""
+        """Move to a position (x, y) as seen from the front, and keep the depth."""
         self._request(position=Ray.from_front(x_m, y_m))
 
     def push(self, depth_m: float) -> None:
@@ -142,8 +147,8 @@ class FingerController:
     def advance(self, duration_s: float, measured: Floats | None) -> bool:
         """Publish the next step towards the target, and return whether it was the last step.
 
-        duration_s: duration of the step. measured (3,): measured position of the finger, m; None if
-        it is unknown.
+        duration_s: duration of the step. measured: measured position (3,) of the finger, m; None if
+            unknown.
         """
         if self._target is None or self._picker is None or self._arrived:
             if measured is not None:

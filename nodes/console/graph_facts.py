@@ -1,4 +1,4 @@
-"""Read facts about the graph that the console needs from the run's plan."""
+"""Read the constant properties of the graph that the console needs from the run's plan."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from flexsheet.nodes import NodeRole
 
 @dataclass(frozen=True, slots=True)
 class GraphFacts:
-    """The facts about the graph that are constant while the console runs.
+    """The properties of the graph that are constant while the console runs.
 
     others_may_reset: other hosts that may reset an e-stop; empty if the console's own host may
-    reset it. recorders: names of the recorder nodes. records_on_request: whether a recorder waits
-    for the topic `recording`. solvers: names of the nodes that publish the skin of the soft object.
+        reset it.
+    recorders: names of the recorder nodes.
+    records_on_request: whether a recorder waits for a message on the topic `recording`.
+    solvers: names of the nodes that publish the surface mesh of the soft object.
     consoles: names of the console nodes.
     """
 
@@ -30,7 +32,7 @@ class GraphFacts:
 
     @classmethod
     def from_plan(cls, plan_file: Path, console: str) -> Self:
-        """Read the facts from the plan of the run.
+        """Read the properties of the graph from the plan of the run.
 
         console: name of the console's node.
         """

@@ -1,4 +1,4 @@
-"""Show the page's tab with the state of the graph: a strip chart of latencies, and tables."""
+"""Show the page's tab with the state of the graph: a chart of latencies, and tables."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def _scales(top_ms: float) -> dict[str, Any]:
 
 
 def max_latency_ms(columns: tuple[Floats, ...]) -> float:
-    """Return the upper end of the chart's scale, in ms: 1, 2, 5, 10 and so on.
+    """Return the upper limit of the chart's scale (ms), which is one of 1, 2, 5, 10 and so on.
 
-    columns: times (n,), s, and series (n,), ms.
+    columns: times (n,), s, and latency series (n,), ms.
     """
     values = np.concatenate(columns[1:])
     largest = float(values[np.isfinite(values)].max(initial=1.0))

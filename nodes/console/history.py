@@ -1,4 +1,4 @@
-"""Store samples of the latencies over the last half minute, for the page's strip chart."""
+"""Store the latencies of the last half minute for the chart on the page."""
 
 from __future__ import annotations
 
@@ -16,19 +16,22 @@ SERIES = ("finger found", "sheet placed", "body answered", "arm commanded", "fra
 
 
 class History:
-    """The samples of the latencies from the camera's exposure to each processing step, in ms."""
+    """The history of the latencies from the camera exposure to each processing step, in ms."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, tuple[float, ...]]] = deque()
 
     def add(self, now_s: float, source: MessageSource) -> None:
-        """Add a sample, and remove samples that are older than half a minute."""
+        """Add a sample, and remove samples that are older than half a minute.
+
+        now_s: current time. source: source of the messages.
+        """
         self._samples.append((now_s, read_latencies_ms(source)))
         while self._samples and self._samples[0][0] < now_s - WINDOW_S:
             self._samples.popleft()
 
     def columns(self) -> tuple[Floats, ...]:
-        """Return the times (n,), in s relative to the latest sample, and all series.
+        """Return the times (n,), in s relative to the latest sample, and the latency series.
 
         The series (n,) are in ms and contain NaN for missing values.
         """
@@ -40,7 +43,7 @@ class History:
         return (times, *values.T)
 
     def latest_and_max(self) -> dict[str, tuple[float, float]]:
-        """Return the latest sample and the maximum (ms) of each series, or NaN without samples."""
+        """Return the latest value and the maximum (ms) of each series; NaN without samples."""
         found = {}
         for name, values in zip(SERIES, self.columns()[1:], strict=True):
             valid = values[np.isfinite(values)]
@@ -51,8 +54,8 @@ class History:
 def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
     """Repeat isolated values of a chart, because the chart draws only lines between values.
 
-    columns: times (n,), s, and series (n,). A value between missing values is repeated at the
-    previous sample. A single sample is repeated half a second earlier.
+    columns: times (n,), s, and series (n,). A value between missing values is repeated at the time
+        of the previous sample. A single sample is repeated half a second earlier.
     """
     times, *series = columns
     if len(times) == 1:
@@ -70,9 +73,9 @@ def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
 
 
 def read_latencies_ms(source: MessageSource) -> tuple[float, ...]:
-    """Return the time (ms) from the exposure to the newest message of each processing step.
+    """Return the latencies (ms) from the exposure to the newest message of each processing step.
 
-    A value is NaN if there is no message. The time of the arms ends when the command was sent.
+    A latency is NaN if there is no message. The latency of the arms ends when the command is sent.
     """
     found = []
     for name, kind in (

@@ -1,9 +1,9 @@
-"""Add the console's title, style and script to the head of viser's page.
+"""Add the console's title, style sheet and script to the HTML head of viser's page.
 
-viser's page has the title "Viser", sliders without names, folders that no key opens, labels with
-too little contrast, and only a red dot for a lost connection. This module replaces the title. The
-files page.css and page.js correct the other defects. A page without a head element is served
-unchanged.
+viser's page has the title "Viser", sliders without names, folders that cannot be opened by
+keyboard, and labels with too little contrast. It shows only a red dot for a lost connection. This
+module replaces the title. The files page.css and page.js correct the other defects. A page without
+a head element is served unchanged.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ TITLE = b"<title>flexsheet console</title>"
 
 
 def inject_assets(response: Response) -> Response:
-    """Change title, style and script of an HTML page. Return other responses unchanged."""
+    """Change the title, style and script of an HTML page; return other responses unchanged."""
     kind = response.headers.get("Content-Type", "")
     if response.status_code != 200 or not kind.startswith("text/html"):
         return response

@@ -1,4 +1,4 @@
-"""Store the latest message of each topic, and decode it only when it is needed."""
+"""Store the latest message of each topic, and decode a message only when it is needed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ M = TypeVar("M", bound=Message)
 
 
 class MessageSource(Protocol):
-    """The interface of a source of the displayed messages, the running graph or a bag."""
+    """The interface of a source of the displayed messages: the running graph or a bag."""
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
         """Return the latest message of a topic with its header, or None before the first message.
@@ -24,7 +24,7 @@ class MessageSource(Protocol):
 
 
 class LatestMessages:
-    """A store of the latest message of each topic, which is decoded when it is first read.
+    """A store of the latest message of each topic, which decodes a message when it is first read.
 
     refused: function that receives the topic and the error if a message cannot be decoded.
     """
@@ -35,7 +35,10 @@ class LatestMessages:
         self._refused = refused
 
     def put(self, name: str, frames: Any) -> bool:
-        """Store the frames of a message, and return whether they replaced unread frames."""
+        """Store a message that is not decoded, and return whether it replaces an unread message.
+
+        name: name of the topic. frames: encoded frames of the message.
+        """
         unread = name in self._frames
         self._frames[name] = frames
         return unread
@@ -56,7 +59,7 @@ class LatestMessages:
 
 
 def check_type(entry: tuple[Message, Header] | None, kind: type[M]) -> tuple[M, Header] | None:
-    """Return an entry unchanged. Raise TypeError if its message does not have the type `kind`."""
+    """Return the entry unchanged; raise TypeError if its message does not have the type `kind`."""
     if entry is None:
         return None
     message, header = entry

@@ -85,7 +85,10 @@ class ConsoleParameters(NodeParameters):
 
 
 class Console(Node):
-    """The node that serves the page, and reads messages at its own rates while it has viewers."""
+    """A node that serves the console page.
+
+    While the page has viewers, the node decodes the latest messages at its own rates.
+    """
 
     takes_frames: ClassVar[bool] = True
     opens_devices: ClassVar[bool] = True
@@ -141,7 +144,10 @@ class Console(Node):
         await asyncio.to_thread(self._server.stop)
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
-        """Store the message until it is drawn. Process it now if its topic needs every message."""
+        """Store a message until the next update of the page.
+
+        If every message of the topic is needed, process the message immediately.
+        """
         source = self.inputs[port]
         source.counts.count(header, self.clock.now_ns())
         superseded = self._latest.put(source.topic.name, message)
@@ -171,7 +177,7 @@ class Console(Node):
         next(out for out in self.outputs.values() if out.topic.message is kind).publish(message)
 
     def _request(self, name: str, *values: Any) -> None:
-        """Pass a viewer's request to the node's event loop. Any thread may call this method."""
+        """Pass a viewer's request to the node's event loop; any thread may call this method."""
         self._loop.call_soon_threadsafe(self._call, self.operator.handle_request, name, *values)
 
     def _call(self, function: Any, *values: Any) -> None:

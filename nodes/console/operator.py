@@ -44,7 +44,7 @@ MAX_WIDTH_PX = 340
 
 BAG_LIST_PERIOD_S = 5.0
 MAX_STEP_S = 0.2
-"""The maximum time step of the finger and the replay, which prevents jumps after a pause."""
+"""The maximum time step of the finger and of the replay. The limit prevents jumps after a pause."""
 
 SIDES = ("left", "right")
 BOOKMARKS_SHOWN = 5
@@ -60,7 +60,7 @@ NO_RECORDER = (
 
 
 class Operator:
-    """The mediator between the page and the running graph, in the console node's event loop."""
+    """A mediator between the page and the running graph, in the console node's event loop."""
 
     def __init__(
         self,
@@ -75,8 +75,9 @@ class Operator:
     ) -> None:
         """Build the page.
 
-        name: name of the console's node. with_finger: whether the mouse can move the finger,
-        because the graph simulates the finger. with_eye: whether the graph simulates the eye.
+        name: name of the console's node.
+        with_finger: whether the graph simulates the finger, so that the mouse can move it.
+        with_eye: whether the graph simulates the eye.
         """
         self._name, self._live, self.controller = name, live, controller
         self._with_finger, self._with_eye = with_finger, with_eye
@@ -120,11 +121,11 @@ class Operator:
 
     @property
     def source(self) -> MessageSource:
-        """Return the source of the displayed messages, a replayed bag or the running graph."""
+        """Return the source of the displayed messages: the replayed bag or the running graph."""
         return self.controller.replay.timeline or self._live
 
     def handle_request(self, name: str, *values: Any) -> None:
-        """Execute a request of a viewer, and show errors on the page."""
+        """Execute a viewer's request, and show an error on the page if the request fails."""
         try:
             self._handlers[name](*values)
         except (ValueError, BagError) as error:
@@ -138,7 +139,7 @@ class Operator:
         self._page.show_problem(str(error))
 
     def on_message(self, message: Message, header: Header, now_s: float) -> None:
-        """Process a message of a topic of which every message is needed, not only the newest."""
+        """Process a message of a topic for which the newest message is not sufficient."""
         if isinstance(message, Status):
             self._statuses[message.node] = (message, now_s)
         elif isinstance(message, HostStatus):
@@ -262,7 +263,10 @@ class Operator:
         )
 
     def _solver_note(self) -> str:
-        """Return the note of the soft-body solver, or an empty text if the skin has arrived."""
+        """Return the note of the soft-body solver.
+
+        The result is empty if the solver has published the surface mesh.
+        """
         skin = self._live.latest("skin", Skin)
         if skin is not None and skin[1].source_ns >= self._sent_ns:
             return ""
@@ -341,7 +345,7 @@ class Operator:
             self.controller.record(True)
 
     def _show_bags(self) -> None:
-        """List the bags on the page, and select a bag that was just recorded."""
+        """List the bags on the page, and select a bag that has just been recorded."""
         bags = self.controller.replay.bags()
         recorded = next((bag for bag in bags if bag not in self._bags_before), None)
         self._page.record.show_bags(bags, recorded if self._awaits_bag else None)

@@ -1,4 +1,4 @@
-"""Build the panels of the page: controls and texts next to the 3D view."""
+"""Build the panels of the page with the controls and texts next to the 3D view."""
 
 from __future__ import annotations
 
@@ -36,7 +36,9 @@ class Page:
     ) -> None:
         """Build the panels.
 
-        others_may: other hosts that may reset an e-stop; empty if the console's host may reset it.
+        request: function that passes a viewer's request to the node. with_finger: whether the page
+            has controls for the finger. others_may: other hosts that may reset an e-stop; empty if
+            the console's host may reset it.
         """
         self._gui: Any = server.gui
         self._request, self._others_may = request, others_may
@@ -79,7 +81,7 @@ class Page:
         command.on_trigger(make_callback(self._request, "stop", "Escape at the console"))
 
     def show_scene(self, scene: Scene, controller: ConsoleController) -> None:
-        """Show the values of a scene of the graph or of a bag."""
+        """Show the values of a scene from the graph or from a bag."""
         self.view.set_scene(scene)
         self.touch.show_scene(
             scene, controller.scenes.base, controller.scenes.names, controller.scenes.sliders

@@ -1,4 +1,4 @@
-"""Make the texts and tables of the page as HTML, also for screen readers.
+"""Make the texts and tables of the page as HTML that is also suitable for screen readers.
 
 Every colour is accompanied by a symbol. The CSS classes are defined in page.css.
 """
@@ -17,10 +17,10 @@ from flexsheet.nodes.console.controller import EyeViewState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_RATIO = 0.5
-"""The fraction of a topic's minimum rate below which the topic is reported as slow."""
+"""The fraction of a topic's minimum rate below which the topic is shown as slow."""
 
 MAX_STATUS_AGE_S = 3.0
-"""The age of the last status message above which a node is reported as silent, in seconds."""
+"""The age (s) of the last status message above which a node is shown as silent."""
 
 MODES = {
     "starting": "starting",
@@ -33,14 +33,14 @@ MODES = {
     "relax": "relaxing the sheet",
     "estop": "stopped",
 }
-"""The texts for the modes of an arm."""
+"""The text that the page shows for each mode of an arm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
     """The line style of a series in a chart.
 
-    color: colour, which is visible on light and dark pages. dash: lengths of dashes and gaps, px.
+    color: colour that is visible on light and dark pages. dash: lengths of dashes and gaps, px.
     """
 
     color: str
@@ -63,7 +63,10 @@ def _mark(kind: tuple[str, str], text: str) -> str:
 def _table(
     caption: str, head: Iterable[str], rows: Iterable[Iterable[str]], *, numbers: Iterable[int] = ()
 ) -> str:
-    """Make an HTML table."""
+    """Make an HTML table.
+
+    numbers: indices of the columns that contain numbers.
+    """
     alignments = dict.fromkeys(numbers, ' class="fs-number"')
     heads = "".join(
         f'<th scope="col"{alignments.get(i, "")}>{escape(one)}</th>' for i, one in enumerate(head)
@@ -81,14 +84,14 @@ def _table(
 
 
 def make_paragraph(html: str) -> str:
-    """Wrap HTML in a paragraph with the style of the page."""
+    """Wrap HTML in a paragraph that has the style of the page."""
     return f'<p class="fs-words">{html}</p>'
 
 
 def make_latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
     """Make the legend of the latency chart, with the values of each series.
 
-    latencies: latest and maximum value (ms) by the name of the series; NaN for a missing value.
+    latencies: latest and maximum value (ms) by the name of the series; NaN for missing values.
     """
     rows = []
     for line, (name, (newest, worst)) in zip(LINES, latencies.items(), strict=True):
@@ -106,7 +109,7 @@ def make_latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
 def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
     """Make the table of the nodes with state, processor load, and last error or note.
 
-    statuses: latest status of each node and its age (s), by the name of the node.
+    statuses: latest status message of each node and its age (s), by the name of the node.
     """
     rows = []
     for name, (status, age_s) in sorted(statuses.items()):
@@ -133,10 +136,10 @@ def make_nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
 def make_topics_table(
     statuses: Mapping[str, tuple[Status, float]], sampling_readers: Collection[str] = ()
 ) -> str:
-    """Make the table of the topics with rate, maximum age at the readers, and lost messages.
+    """Make the table of the topics with rate, maximum message age, and number of lost messages.
 
-    statuses: latest status of each node and its age (s), by the name of the node. sampling_readers:
-    nodes that skip messages by design and are therefore not counted as readers.
+    statuses: latest status message of each node and its age (s), by the name of the node.
+    sampling_readers: nodes that skip messages by design, and are therefore not counted as readers.
     """
     written: dict[str, list[PortStatus]] = {}
     read: dict[str, list[PortStatus]] = {}
@@ -179,7 +182,7 @@ def make_topics_table(
 
 
 def finger(fingertip: Fingertip | None) -> str:
-    """Describe the position of the fingertip, or the reason why it is unknown, as HTML."""
+    """Describe as HTML the position of the fingertip, or the reason why it is unknown."""
     return f'<div class="fs-finger">{make_paragraph(_finger(fingertip))}</div>'
 
 
@@ -199,10 +202,12 @@ def _finger(fingertip: Fingertip | None) -> str:
 def eye(
     *, possible: bool, enabled: bool, state: EyeViewState, waited_s: float, ago_s: float | None
 ) -> str:
-    """Describe the state of the eye view, the image that the user's eye sees, as HTML.
+    """Describe as HTML the state of the eye view, which is the image that the user sees.
 
-    possible: whether the graph has a simulated eye. enabled: whether viewers requested images.
-    waited_s: duration of `state`. ago_s: age of the latest image; None if there is no image.
+    possible: whether the graph has a simulated eye.
+    enabled: whether viewers have requested images.
+    waited_s: time since the last change of `state`.
+    ago_s: age of the latest image; None if there is no image.
     """
     if not possible:
         return make_paragraph("This graph has no simulated eye (a node of type twin_eye).")
@@ -228,9 +233,10 @@ def eye(
 
 
 def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
-    """Describe the state of the recorder and the newest bookmarks as HTML.
+    """Describe as HTML the state of the recorder and the newest bookmarks.
 
-    note: status note of the recorder node; None if there is no recorder. bookmarks: labels.
+    note: status note of the recorder node; None if there is no recorder. bookmarks: labels of the
+        bookmarks.
     """
     if note is None:
         return make_paragraph(_mark(WARN, "this graph has no recorder"))
@@ -239,7 +245,7 @@ def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
 
 
 def problem(text: str) -> str:
-    """Make the HTML of the box that shows an error, or an empty text if there is no error."""
+    """Make the HTML of the box that shows an error; empty if there is no error."""
     if not text:
         return ""
     sentence = escape(text[:1].upper() + text[1:])

@@ -13,7 +13,7 @@ MAX_RAY_M = 3.0
 SURFACE_TOLERANCE_M = 1e-4
 MAX_STEPS = 64
 MIN_STEP_RATIO = 0.01
-"""The minimum length of a step around an object, as a fraction of a full step."""
+"""The minimum length of a step around an object, as a fraction of the maximum step length."""
 
 HOVER_M = 0.03
 """The height of a lifted finger above the object's surface."""
@@ -29,12 +29,13 @@ class SurfacePicker:
         self._low, self._high = scene.finger.volume_min_m, scene.finger.volume_max_m
 
     def pick(self, origin: Floats, direction: Floats, depth_m: float) -> Floats:
-        """Return the fingertip position (3,) that a ray from the viewer's eye selects.
+        """Return the fingertip position (3,), in m, that a ray from the viewer's eye selects.
 
+        origin, direction: origin (3,), m, and direction (3,) of the ray in the world frame; the
+            direction is not zero.
         If the ray meets the object, the position is `depth_m` below the surface along the normal. A
         negative depth is above the surface. If the ray misses the object, the position is the point
-        of the ray nearest to the object, but not below `depth_m`. origin (3,), m, direction (3,),
-        not zero: ray in the world frame.
+        of the ray that is nearest to the object, but not deeper than `depth_m`.
         """
         direction = direction / np.linalg.norm(direction)
         travelled, nearest_m, nearest = 0.0, np.inf, origin
@@ -53,8 +54,9 @@ class SurfacePicker:
         )
 
     def offset_point(self, near: Floats, depth_m: float) -> Floats:
-        """Return the point (3,) at a depth below the surface point nearest to `near` (3,), m.
+        """Return the point (3,), in m, at a depth below the surface point nearest to `near`.
 
+        near: point (3,), m.
         A negative depth results in a point above the surface.
         """
         found = self._shape.closest(apply(self._object_from_world, near))
@@ -62,11 +64,12 @@ class SurfacePicker:
         return self._within(apply(self._world_from_object, inside))
 
     def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
-        """Return the next point (3,), in m, of the finger on a path to the target.
+        """Return the next point (3,), in m, on the path of the finger to the target.
 
-        The step is at most `max_step_m` long and reaches no deeper into the object than `depth_m`
-        or than the current finger. If a step around the object makes no progress, the step is
-        straight.
+        finger, target: present and requested position (3,), m.
+        The step is at most `max_step_m` long. It enters the object at most to `depth_m`, or to the
+        present depth of the finger if that is larger. If a step around the object makes no
+        progress, the step is straight.
         """
         across = target - finger
         distance = float(np.linalg.norm(across))

@@ -62,9 +62,9 @@ class RecordTab:
         self._record.color = RECORDING_COLOR if recording else None
 
     def show_bags(self, names: Sequence[str], recorded: str | None = None) -> None:
-        """List the bags.
+        """List the bags in the selection control.
 
-        recorded: bag that was just recorded and is selected, or None.
+        recorded: bag that has just been recorded, which is then selected; None selects no bag.
         """
         options = tuple(names) or (NO_BAG,)
         if self._bag.options != options:

@@ -20,10 +20,10 @@ MAX_CHUNKS = 6
 
 
 class Timeline:
-    """A reader that returns the state of a recording at a selected time.
+    """A reader of the state that a recording had at a selected time.
 
-    seconds: selected time since the start of the bag. Raise BagError if the file is not a bag
-    or contains no topic that the page shows.
+    seconds: selected time since the start of the bag.
+    Raise BagError if the file is not a bag, or contains no topic that the page shows.
     """
 
     def __init__(self, path: Path) -> None:
@@ -47,8 +47,9 @@ class Timeline:
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
         """Return the last message of a topic at or before the selected time, with its header.
 
-        kind: type of the message. Return None if there is no such message, and raise TypeError for
-        another type.
+        kind: type of the message.
+        Return None if there is no such message.
+        Raise TypeError if the message has another type.
         """
         times, _ = self._positions.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
@@ -80,7 +81,10 @@ class Timeline:
         return self._reader.open_record(self._reader.channels[self._channels[name]], record)
 
     def _records(self, chunk: Chunk) -> dict[tuple[int, int], Record]:
-        """Return the messages of a chunk by channel and log time (ns), and cache recent chunks."""
+        """Return the messages of a chunk by channel and log time (ns).
+
+        Recently read chunks are cached.
+        """
         cached = self._chunks.get(chunk.offset)
         if cached is None:
             with self.path.open("rb") as file:

@@ -47,18 +47,20 @@ FROM_PROJECTOR: Color = (0, 108, 148)
 EYE: Color = (250, 250, 250)
 
 GRID: Color = (176, 181, 189)
+"""The colour of the floor grid's lines, which are visible on light and dark pages."""
+
 GRID_SECTION: Color = (128, 135, 146)
-"""The colours of the floor grid, which are visible on light and dark pages."""
+"""The colour of the floor grid's main lines, which are visible on light and dark pages."""
 
 SHEET_LIFT_M, LINES_LIFT_M = 0.0006, 0.0009
-"""The distances by which the sheet and its lines are drawn nearer to the viewer. They prevent
-flicker of a flat object in the plane of the sheet."""
+"""The distances by which the sheet and its lines are drawn nearer to the viewer. Without these
+distances, a flat object in the plane of the sheet would flicker."""
 
 LINES_EVERY = 5
 FINGER_LENGTH_M = 0.05
 FINGER_TILT_RAD = 0.6
 FINGER_NAME_M = (0.0, -0.06, 0.04)
-"""The position of the finger's name relative to the fingertip."""
+"""The position (m) of the finger's label relative to the fingertip."""
 NAME_ABOVE_M = np.array([0.0, 0.05, 0.0])
 FLOOR_M = 0.02
 """The distance of the drawn floor below the bases of the arms."""
@@ -70,15 +72,16 @@ VIEWPOINTS: dict[str, tuple[Any, Any] | None] = {
     "near": ((0.13, 0.1, 0.6), (0.0, 0.0, 0.0)),
     EYE_VIEW: None,
 }
-"""The camera position and target (m, world frame) of each view, or None for the user's eyes."""
+"""The camera position and the target point (m, world frame) of each view, or None for the user's
+eyes."""
 
 Drag = Callable[[Floats, Floats], None]
-"""A callback that receives the origin (3,), m, and the direction (3,) of a ray, world frame, from
-the viewer's eye through the pointer."""
+"""A callback for a ray from the viewer's eye through the pointer, in the world frame. Its arguments
+are the origin (3,), m, and the direction (3,) of the ray."""
 
 
 class SceneView:
-    """The 3D view of the scene that all viewers see."""
+    """The 3D view of the scene, which is the same for all viewers."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
@@ -98,7 +101,7 @@ class SceneView:
         server.initial_camera.fov = 0.75
 
     def look_from(self, client: viser.ClientHandle, name: str) -> None:
-        """Change the camera of one viewer to a view of `VIEWPOINTS`."""
+        """Set the camera of one viewer to a view of `VIEWPOINTS`."""
         viewpoint, scene = VIEWPOINTS[name], self._of_scene
         if viewpoint is None:
             if scene is None:
@@ -141,9 +144,10 @@ class SceneView:
         ]
 
     def set_skin(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
-        """Draw the object with the surface mesh of the soft-body solver.
+        """Draw the object as the surface mesh of the soft-body solver.
 
-        rest (n, 3): vertices at rest, world frame, m. triangles (t, 3): vertex indices.
+        rest: vertices (n, 3) of the undeformed object, world frame, m. triangles: vertex indices
+            (t, 3).
         """
         self._skin_source, split = split_creases(rest, triangles)
         corners = _f32(rest[self._skin_source])
@@ -156,11 +160,14 @@ class SceneView:
         self._make_touchable(self._object)
 
     def on_touch(self, touched: Drag, released: Callable[[], None]) -> None:
-        """Set the callbacks for the start or continuation, and for the end, of a press or drag."""
+        """Set the callbacks for touching the object with the pointer.
+
+        touched: called while the pointer is pressed or dragged. released: called at the end.
+        """
         self._touched, self._released = touched, released
 
     def draw(self, snapshot: SceneSnapshot) -> None:
-        """Update all poses and meshes of the 3D view to a snapshot of the messages."""
+        """Update all poses and meshes of the 3D view to the state in `snapshot`."""
         scene = self._of_scene
         if scene is None:
             return
@@ -217,7 +224,7 @@ class SceneView:
         )
 
     def _add_arm(self, side: str, arm: ArmSpec, height_m: float) -> list[Any]:
-        """Add the frames and boxes of an arm's links, bracket and clamp, and return the frames."""
+        """Add the links, the bracket and the clamp of an arm, and return their frames."""
         frames = [
             self._add("Arms", self._scene.add_frame(f"/{side}/{link}", show_axes=False))
             for link in range(7)
@@ -385,7 +392,7 @@ class SceneView:
 
 
 def lift_sheet(points: Floats, lift_m: float) -> Floats:
-    """Move the points (n, 3), in m, of the sheet towards the user along its mean normal."""
+    """Move the sheet's points (n, 3), in m, towards the user along the sheet's mean normal."""
     first, last = points[0], points[-1]
     right, left = points[COLUMNS - 1], points[-COLUMNS]
     normal = np.cross(right - left, last - first)
@@ -393,14 +400,17 @@ def lift_sheet(points: Floats, lift_m: float) -> Floats:
 
 
 def make_line_segments(points: Floats) -> Floats:
-    """Return segments (k, 2, 3) along every fifth row and column of the sheet's points (n, 3)."""
+    """Return line segments (k, 2, 3), m, along every fifth row and column of the sheet.
+
+    points: vertices (n, 3) of the sheet.
+    """
     grid = points.reshape(ROWS, COLUMNS, 3)
     lines = np.concatenate([grid[::LINES_EVERY], grid[:, ::LINES_EVERY].swapaxes(0, 1)])
     return np.stack([lines[:, :-1], lines[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
 def make_finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
-    """Return vertices (n, 3), m, and triangles (t, 3) of a fingertip with its tip at the origin."""
+    """Return vertices (n, 3), m, and triangles (t, 3) of a fingertip whose tip is the origin."""
     tilt = np.linspace(0.0, 0.5 * np.pi, 8)
     radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m, 0.0]])
     ends = [FINGER_LENGTH_M, FINGER_LENGTH_M + 0.4 * radius_m]

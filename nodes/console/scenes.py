@@ -1,4 +1,4 @@
-"""Load the scenes of a run, and change a scene as the page's sliders request."""
+"""Load the scenes of a run, and change a scene according to the page's sliders."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from flexsheet.nodes.models.shapes import GEOMETRIES
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
 
 MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
-"""The minimum and the step of the slider for the sheet's tension, as stretch ratios."""
+"""The minimum value and the step of the slider for the sheet's tension, as stretch ratios."""
 
 
 class SceneChoiceError(FlexsheetError, ValueError):
@@ -28,7 +28,7 @@ class SceneChoiceError(FlexsheetError, ValueError):
 
 
 def first_scene(plan_file: Path) -> Scene:
-    """Return the scene of the run's plan. Raise SceneChoiceError if the plan has no scene."""
+    """Return the scene of the run's plan; raise SceneChoiceError if the plan has no scene."""
     values = json.loads(plan_file.read_text())["scene"]
     if values is None:
         raise SceneChoiceError('the launch file has no scene; set its key "scene" for the console')
@@ -40,7 +40,7 @@ def list_scene_names(folder: Path) -> list[str]:
 
 
 def load(folder: Path, name: str) -> Scene:
-    """Load a scene of the run's folder. Raise SceneChoiceError for an unknown name."""
+    """Load a scene of the run's folder; raise SceneChoiceError for an unknown name."""
     names = list_scene_names(folder)
     if name not in names:
         raise SceneChoiceError(f'unknown scene "{name}"; choose one of: {", ".join(names)}')
@@ -52,9 +52,9 @@ def edit_scene(
 ) -> Scene:
     """Change the object's stiffness, the sheet's minimum stretch and the object's size.
 
-    The front of the object stays in place, and the object grows away from the user. size_ratio:
-    size relative to the size in `scene`. A rigid object stays rigid. Raise SceneChoiceError for
-    invalid values.
+    size_ratio: size relative to the size in `scene`.
+    The front of the object stays in place, and the object grows away from the user. A rigid object
+    stays rigid. Raise SceneChoiceError for invalid values.
     """
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
@@ -87,7 +87,10 @@ def edit_scene(
 
 
 def max_stretch_ratio(scene: Scene) -> float:
-    """Return the upper end of the tension slider as a stretch ratio, from limits of the scene."""
+    """Return the upper limit of the tension slider as a stretch ratio.
+
+    The result depends on the limits of the scene's sheet and arms.
+    """
     sheet = scene.sheet
     strongest = stretch_for_edge_force(sheet.max_edge_force_n, sheet)
     limit = min(sheet.max_stretch_ratio, strongest)
@@ -102,7 +105,7 @@ def _with(part: Any, **changes: Any) -> Any:
 
 
 def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
-    """Scale a shape about its origin. A plane is returned unchanged.
+    """Scale a shape about its origin; return a plane unchanged.
 
     Raise SceneChoiceError for a ratio that is not a positive number.
     """
@@ -115,8 +118,9 @@ def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """Return the extent (m) of the touchable surface from its origin towards the user (world z).
+    """Return the extent (m) of an object's touchable surface from its origin towards the user.
 
-    world_from_object (3, 3): rotation. The ends of a cylinder are not touchable.
+    world_from_object: rotation matrix (3, 3) of the object.
+    The user is in the direction of the world's z axis. The ends of a cylinder are not touchable.
     """
     return GEOMETRIES[geometry.shape].extent_m(geometry, world_from_object[2])

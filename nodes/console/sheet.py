@@ -1,7 +1,7 @@
-"""Compute the sheet that the page draws: a ruled surface that a finger deflects like a soap film.
+"""Compute the shape of the drawn sheet: a ruled surface that the finger deflects like a soap film.
 
-This deflection is for display only. `flexsheet.nodes.models.sheet` contains the mechanics of the
-sheet.
+This deflection is for display only. The module `flexsheet.nodes.models.sheet` contains the
+mechanics of the sheet.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from flexsheet.nodes.models.sheet import corners, sheet_from_edges
 
 COLUMNS, ROWS = 41, 41
 TRIANGLES = triangulate_grid(ROWS, COLUMNS)
-"""The triangles (t, 3) of the sheet's grid, counter-clockwise as seen by the user."""
+"""The triangles (t, 3) of the sheet's grid, which are counter-clockwise as seen by the user."""
 MIN_EDGE_DISTANCE_M = 0.05
 NEAR = 6
-"""The number of rows and columns of cells near a vertex that are tested against a ray."""
+"""The number of rows and columns of grid cells near a vertex that are tested against a ray."""
 
 MIRRORED = 2
 """The number of mirror images of the finger beyond each free edge."""
@@ -37,9 +37,10 @@ def compute_sheet_points(
 ) -> Floats | None:
     """Compute the world positions (ROWS * COLUMNS, 3), in m, of the drawn sheet's vertices.
 
-    Rows follow each other upwards, and columns to the right. The poses (4, 4) are those of the
-    sheet's edges. fingertip (3,): world frame, m, or None. Return None if the distance of the edges
-    is less than `MIN_EDGE_DISTANCE_M`.
+    world_from_left_edge, world_from_right_edge: poses (4, 4) of the sheet's edges.
+    fingertip: position (3,) in the world frame, m, or None.
+    Rows are ordered upwards, and columns to the right. Return None if the distance between the
+    edges is less than `MIN_EDGE_DISTANCE_M`.
     """
     left, right = world_from_left_edge, world_from_right_edge
     width_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
@@ -63,12 +64,13 @@ def compute_sheet_points(
 def film(
     x: Floats, y: Floats, finger: tuple[float, float], size_m: tuple[float, float], radius_m: float
 ) -> Floats:
-    """Compute the deflection (n,) of a film clamped at x = +-width / 2, per depth of the finger.
+    """Compute the deflection (n,) of a film that is clamped at x = +-width / 2.
 
-    x, y (n,): points, m. finger: position (x, y), m. size_m: width and height. The deflection
-    solves Laplace's equation for a point force in an infinite strip, whose Green's function is
+    x, y: coordinates (n,) of the points, m. finger: position (x, y), m. size_m: width and height.
+    The result is relative to the depth of the finger, and it is 1 within `radius_m` of the finger.
+    It solves Laplace's equation for a point force in an infinite strip, whose Green's function is
     known from a conformal map. Mirror images of the finger model the free edges at y = +-height /
-    2. Within `radius_m` of the finger, the deflection is 1.
+    2.
     """
     width_m, height_m = size_m
     finger_x, finger_y = finger
@@ -86,7 +88,8 @@ def film(
 def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
     """Compute Green's function (n,) of Laplace's equation in the strip |x| < pi / 2.
 
-    The source is at (source_x, 0). x, y (n,): points. The result is not normalized.
+    x, y: coordinates (n,) of the points.
+    The source is at (source_x, 0). The result is not normalized.
     """
     high = np.cosh(np.minimum(np.abs(y), 30.0))
     near = np.maximum(high - np.cos(x - source_x), 1e-12)
@@ -95,7 +98,7 @@ def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
 
 @lru_cache(maxsize=1)
 def _fractions() -> tuple[Floats, Floats]:
-    """Return the position of each vertex as fractions (n, 1) of the width and of the height."""
+    """Return the positions of the grid's vertices as fractions (n, 1) of width and height."""
     up, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
     return across.reshape(-1, 1), up.reshape(-1, 1)
 
@@ -103,9 +106,10 @@ def _fractions() -> tuple[Floats, Floats]:
 def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
     """Intersect rays from `origin` (3,) through the points `towards` (n, 3) with the sheet.
 
-    points (ROWS * COLUMNS, 3): vertices of the sheet. Return the intersections (n, 3), which are
-    NaN for rays that miss the sheet. Only triangles near the vertex whose direction is nearest to
-    the ray are tested. Source: Moeller and Trumbore 1997.
+    points: vertices (ROWS * COLUMNS, 3) of the sheet.
+    Returns the intersections (n, 3), which are NaN for rays that miss the sheet. For each ray, only
+    the triangles near one vertex are tested: the vertex whose direction is nearest to the ray.
+    Source: Moeller and Trumbore 1997.
     """
     direction = towards - origin
     directions = points - origin
@@ -127,7 +131,7 @@ def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
 
 
 def _around(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the indices (n, 2 * NEAR**2) of the triangles in the cells near vertices (n,)."""
+    """Return the indices (n, 2 * NEAR**2) of the triangles in the grid cells near n vertices."""
     rows, columns = np.divmod(vertices, COLUMNS)
     cells = np.arange(-NEAR // 2, NEAR - NEAR // 2)
     row = np.clip(rows[:, None, None] + cells[None, :, None], 0, ROWS - 2)

@@ -27,9 +27,12 @@ RAY_POSITIONS = (-0.55, 0.0, 0.55)
 class SceneSnapshot:
     """The contents of the 3D view at one time, in the world frame.
 
-    Lengths are in m; unknown values are None. links: poses (7, 4, 4) of each arm's links, by side.
-    edges: pose (4, 4) of each clamped edge, by side. sheet (n, 3): points of the sheet. skin (s,
-    3): deformed vertices. finger (3,): fingertip. finger_valid: whether the fingertip is tracked.
+    links: poses (7, 4, 4) of each arm's links, by side.
+    edges: pose (4, 4) of each clamped edge, by side.
+    sheet: points (n, 3) of the sheet.
+    skin: deformed vertices (s, 3) of the object's surface mesh.
+    finger: position (3,) of the fingertip. finger_valid: whether the fingertip is tracked.
+    Lengths are in m; unknown values are None.
     """
 
     links: dict[str, Floats]
@@ -76,7 +79,10 @@ def _message(entry: tuple[Fingertip, Header] | None) -> Fingertip | None:
 
 
 def _skin(source: MessageSource) -> Floats | None:
-    """Return the skin vertices (n, 3), m, at rest before the first result of the solver."""
+    """Return the vertices (n, 3), m, of the object's surface mesh.
+
+    Before the first result of the solver, these are the vertices of the undeformed object.
+    """
     skin, body = source.latest("skin", Skin), source.latest("soft_body", SoftBody)
     if skin is None:
         return None
@@ -87,9 +93,10 @@ def _skin(source: MessageSource) -> Floats | None:
 
 
 def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
-    """Select nine vertices at which light rays are drawn, in a grid on the user's side.
+    """Select nine vertices in a grid on the user's side, at which light rays are drawn.
 
-    rest (n, 3): vertices at rest, m. Return the indices (9,) of the vertices.
+    rest: vertices (n, 3) of the undeformed object, m.
+    Returns the indices (9,) of the vertices.
     """
     low, high = rest.min(axis=0), rest.max(axis=0)
     centre, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -103,11 +110,12 @@ def select_ray_vertices(rest: Floats) -> NDArray[np.int64]:
 
 
 def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """Compute the light rays through which the eye sees points (n, 3) of the deformed skin.
+    """Compute the light rays by which the eye sees points (n, 3), in m, of the deformed surface.
 
-    sheet: points of the drawn sheet. Return segments (m, 2, 3) from the eye to the sheet, and
-    segments (m, 2, 3) from the sheet to the projector. A point whose ray misses the sheet has no
-    segments. The result is empty for a scene without projector.
+    sheet: points of the drawn sheet.
+    Returns segments (m, 2, 3) from the eye to the sheet, and segments (m, 2, 3) from the sheet to
+    the projector. A point whose ray misses the sheet has no segments. The result is empty for a
+    scene without projector.
     """
     if scene.projector is None:
         return np.empty((0, 2, 3)), np.empty((0, 2, 3))

@@ -13,11 +13,11 @@ from flexsheet.nodes.console.scenes import SceneChoiceError
 
 
 class ConsoleState(BaseModel):
-    """The saved state of the console.
+    """The saved state of a console.
 
     base: selected scene. sliders: slider positions; None if no slider was moved. recording: whether
-    recording was requested. finger: requested finger position; None if no viewer has moved the
-    finger.
+        a viewer has requested a recording. finger: requested finger position; None if no viewer has
+        moved the finger.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -29,7 +29,7 @@ class ConsoleState(BaseModel):
 
 
 def load_state(path: Path) -> ConsoleState | None:
-    """Read the saved state, or return None if there is no file.
+    """Read the saved state of a console; return None if there is no file.
 
     Raise SceneChoiceError for an invalid file.
     """
@@ -46,5 +46,5 @@ def load_state(path: Path) -> ConsoleState | None:
 
 
 def save_state(path: Path, state: ConsoleState) -> None:
-    """Write the state of the console to a file atomically."""
+    """Write the state of the console to a file in one atomic operation."""
     write_file(path, state.model_dump_json())

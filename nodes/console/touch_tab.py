@@ -19,7 +19,7 @@ LIFT, LOWER = "Lift the finger (L)", "Lower the finger (L)"
 
 
 class TouchTab:
-    """The controls of the finger, the scene and the view."""
+    """The tab with the controls of the finger, the scene and the view."""
 
     def __init__(self, gui: Any, request: Request, view: SceneView, *, with_finger: bool) -> None:
         self._gui, self._request, self._view = gui, request, view
@@ -110,8 +110,8 @@ class TouchTab:
     def show_scene(self, scene: Scene, base: Scene, names: Sequence[str], sliders: Sliders) -> None:
         """Show the values of a scene in the controls.
 
-        base: scene before the sliders changed it. names: names of all scenes. sliders: slider
-        positions.
+        base: scene before it was changed by the sliders. names: names of all scenes. sliders:
+            slider positions.
         """
         if names:
             self._scene.options = tuple(names)

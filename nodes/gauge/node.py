@@ -16,7 +16,7 @@ from flexsheet.nodes.parameter_marks import DeviceFile
 
 
 class SerialSource(LimitedModel):
-    """A force gauge at a serial port that sends one line of text per measurement."""
+    """A source of forces: a gauge at a serial port that sends one line of text per measurement."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

@@ -16,7 +16,10 @@ NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 class GaugeError(FlexsheetError, OSError):
-    """Raised if the gauge cannot be opened or read. The text names the device and the cause."""
+    """An error for a gauge that cannot be opened or read.
+
+    The text names the device and the cause.
+    """
 
     code = "gauge"
     remedy = "Check the cable, the path in `port`, and the permission to open it (group dialout)."
@@ -26,14 +29,17 @@ class GaugeError(FlexsheetError, OSError):
 
 
 class GaugeReader(Protocol):
-    """The interface of a gauge driver: a file descriptor to wait for, and the received numbers."""
+    """The interface of a gauge driver.
+
+    A driver provides a file descriptor, on which the caller waits, and the received numbers.
+    """
 
     unreadable: int
 
     def fileno(self) -> int: ...
 
     def read(self) -> list[float]:
-        """Return the numbers that have arrived. Raises GaugeError if the connection is lost."""
+        """Return the numbers that have arrived; raise GaugeError if the connection is lost."""
         ...
 
     def close(self) -> None: ...
@@ -42,11 +48,14 @@ class GaugeReader(Protocol):
 class SerialGauge:
     """A gauge at a serial port that sends one measurement per line, such as "+0.123 N".
 
-    unreadable: number of lines that contain no finite number.
+    unreadable: number of received lines without a finite number.
     """
 
     def __init__(self, port: str, baud: int) -> None:
-        """Open the port without echo and control characters. Raises GaugeError if this fails."""
+        """Open the serial port without echo and control characters.
+
+        Raises GaugeError if the port cannot be opened.
+        """
         self.port, self.unreadable, self._rest = port, 0, b""
         speed = getattr(termios, f"B{baud}", None)
         if speed is None:

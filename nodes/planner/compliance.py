@@ -1,20 +1,21 @@
 """Choose the stretch and the normal offset of the sheet that render the force of an object.
 
-Two arms hold a stretched sheet at the surface of a virtual object.  If the sheet stayed in the
-object's tangent plane, a finger at depth d in the object would indent the sheet by d.  The force of
-the sheet would then equal the force of the object at one depth only.  The sheet is therefore moved
-along its normal by an offset r(d) behind the tangent plane; a negative offset is in front of it:
+Two arms hold a stretched sheet at the surface of a virtual object. If the sheet stayed in the
+object's tangent plane, a finger at depth d in the object would indent the sheet by d. The force of
+the sheet would then equal the force of the object at one depth only. The sheet is therefore moved
+along its normal by an offset r(d) behind the tangent plane. A negative offset is in front of the
+tangent plane:
 
     F_sheet(stretch, d - r(d)) = F_object(d).
 
-A retreat is an offset that increases with the depth.  Since the sheet follows with a delay, a
-retreat removes energy from slow pushes and damps them.  An advance is an offset that decreases with
-the depth, and adds energy.  `nodes.models.hand_loop` computes the largest slopes dr/dd at which the
-loop with any hand is stable.  The lowest stretch that renders the curve without an advance is
-chosen, or else the stretch with the smallest advance.
+A retreat is an offset that increases with the depth. The sheet follows with a delay, so a retreat
+removes energy from slow pushes and damps them. An advance is an offset that decreases with the
+depth, and it adds energy. `nodes.models.hand_loop` computes the largest slopes dr/dd at which the
+loop with any hand is stable. The lowest stretch that renders the curve without an advance is
+chosen. If there is no such stretch, the stretch with the smallest advance is chosen.
 
-The sheet does not advance if the forces are too small to be felt.  Otherwise the sheet would
-respond to the noise of the camera while a finger only strokes the object.
+The sheet does not advance if the forces are too small to be felt. Otherwise the sheet would respond
+to the noise of the camera while a finger only strokes the object.
 """
 
 from __future__ import annotations
@@ -48,39 +49,39 @@ from flexsheet.nodes.models.sheet.force_models import (
 USABLE_FRACTION = 0.85
 """The fraction of the maximum edge force and strain that the planner uses.
 
-The bridges stop the arms if commanded or measured poses exceed the limits.  A margin is necessary
-because each arm receives the state of the other arm one or two cycles late.
-"""
+The bridges stop the arms if commanded or measured poses exceed the limits. A margin is necessary
+because each arm receives the state of the other arm one or two cycles late."""
 
 FORCE_JND_FLOOR_N = 0.05
-"""The minimum force by which a force error is divided to obtain a relative error.  Smaller forces
-have relative errors of at least a tenth, for example in the first 2 mm of an object of 4 kPa."""
+"""The minimum divisor for the relative error of a force. Smaller forces have relative errors of at
+least a tenth, as in the first 2 mm of an object of 4 kPa."""
 
 DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
-"""The contact force up to which the sheet does not advance, and from which it advances fully.  The
-contact force is the maximum of the object's force and the sheet's force."""
+"""The contact forces between which the sheet's advance towards the finger increases from zero to
+its full value. The contact force is the maximum of the object's force and the sheet's force."""
 
 DEADBAND_START_M, DEADBAND_END_M = 0.3e-3, 1.2e-3
-"""The depth up to which the sheet does not advance, and from which it advances fully.  A fingertip
-at a smaller depth may only rest on the object."""
+"""The depths between which the sheet's advance towards the finger increases from zero to its full
+value. A fingertip at a smaller depth may only rest on the object."""
 
 TARGET_ERROR_RATIO = 0.10
 """The relative error of the rendered force above which the planner reports the error."""
 
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
-"""The minimum relative difference of stiffness that users notice.  0.15: if the deformation of the
-skin is a cue (Bergmann Tiest & Kappers 2009).  0.22: if neither work nor terminal force is a cue
-(Tan et al. 1995)."""
+"""The smallest relative difference of stiffness that users notice. The first value applies if users
+feel the deformation of the skin (Bergmann Tiest & Kappers 2009). The second value applies if
+neither work nor terminal force is a cue (Tan et al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
-"""The maximum advance of the sheet per depth of the push. With 0.5, the sheet feels 1.5 times as
-stiff. The bounds for a stable control loop of sheet and hand are usually lower."""
+"""The maximum advance of the sheet towards the finger per depth of the push. With a value of 0.5,
+the sheet feels 1.5 times as stiff. The bounds for a stable control loop of sheet and hand are
+usually lower."""
 
 SLOPE_TOLERANCE = 0.03
-"""The amount by which a slope may exceed its bound, since the bounds contain larger margins."""
+"""The amount by which a slope may exceed its bound. The bounds contain larger safety margins."""
 
 STRETCH_CANDIDATES = 17
-"""The number of stretch ratios that are tried between minimum and maximum."""
+"""The number of stretch ratios that are tried between the minimum and the maximum ratio."""
 
 
 class UnfitCurveError(FlexsheetError, ValueError):
@@ -94,8 +95,9 @@ class UnfitCurveError(FlexsheetError, ValueError):
 class ObjectCurve:
     """The force of an object as a function of depth, given by n ascending points from (0, 0).
 
-    The curve between the points is a monotone cubic.  Beyond the last point it is a line with the
-    last slope.  Raises UnfitCurveError if the points are not finite or not ascending.
+    The curve between the points is a monotone cubic. Beyond the last point, the curve is a line
+    with the slope at this point. Raises UnfitCurveError if the points are not finite or not
+    ascending.
     """
 
     depths_m: Floats
@@ -132,7 +134,7 @@ class ObjectCurve:
         return cls(np.array([0.0, max_depth_m]), np.array([0.0, stiffness_n_per_m * max_depth_m]))
 
     def force_n(self, depths_m: Floats) -> Floats:
-        """Return the forces (n,), N, at depths (n,), m; 0 for negative depths."""
+        """Return the forces (n,), N, at depths (n,), m; the force is 0 for negative depths."""
         last = self.depths_m[-1]
         inside = self._curve(np.clip(depths_m, 0.0, last))
         beyond = np.maximum(np.asarray(depths_m) - last, 0.0)
@@ -146,7 +148,7 @@ class StretchLimits:
 
     edge_force_n: maximum force on each clamp.
     max_advance_per_depth: maximum advance of the sheet per depth of the push.
-    bounds: bounds on the offset's slope; None for an analysis without a hand.
+    bounds: bounds on the slope of the offset; None for an analysis without a hand.
     """
 
     min_stretch_ratio: float
@@ -156,7 +158,10 @@ class StretchLimits:
     bounds: OffsetBounds | None = None
 
     def max_advance(self, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum advance per depth (n,) for stiffnesses (n,) N/m of the sheet."""
+        """Return the maximum advance (n,) of the sheet towards the finger per depth of the push.
+
+        stiffnesses_n_per_m: stiffnesses (n,) of the sheet.
+        """
         result = np.full(len(stiffnesses_n_per_m), self.max_advance_per_depth)
         if self.bounds is None:
             return result
@@ -170,9 +175,9 @@ def make_stretch_limits(
 ) -> StretchLimits:
     """Return the limits of the stretch within the usable fraction of the scene's limits.
 
-    bounds: bounds on the offset's slope for a stable control loop of sheet and hand. The edge force
-    is limited for a sheet that nothing pushes. `render_force` limits the additional force of a
-    push.
+    bounds: bounds on the slope of the offset for a stable control loop of sheet and hand.
+    The edge force is limited for a sheet without contact. `render_force` limits the additional
+    force of a push.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -188,7 +193,7 @@ def make_stretch_limits(
 
 
 def _flat_edge_force_n(model: SheetForceModel, stretch_ratio: float) -> float:
-    """Return the force (N) on each clamp of a sheet that nothing pushes."""
+    """Return the force (N) on each clamp of a sheet without contact."""
     push = SheetPush(stretch_ratio, finger_radius_m=0.03 * model.rubber.width_m)
     return float(model.evaluate(push, np.zeros(1)).edge_force_n[0])
 
@@ -199,8 +204,8 @@ class RenderedForce:
 
     indentation_m: deflection of the sheet from its plane under the finger.
     edge_force_n: force on each clamp.
-    advance_per_depth: largest advance of the sheet towards the finger per depth.
-    force_limited: whether the limit of the edge force reduced the indentation.
+    advance_per_depth: maximum advance of the sheet towards the finger per depth.
+    force_limited: whether the limit of the edge force has reduced the indentation.
     """
 
     depths_m: Floats
@@ -219,7 +224,10 @@ class RenderedForce:
 
     @property
     def error_ratio(self) -> Floats:
-        """Return the relative error (n,) of the rendered force; 0 if the forces cannot be felt."""
+        """Return the relative errors (n,) of the rendered forces.
+
+        The error is 0 for forces that cannot be felt.
+        """
         felt = np.maximum(self.object_force_n, self.force_n) >= FORCE_JND_FLOOR_N
         difference = (self.force_n - self.object_force_n) / np.maximum(
             self.object_force_n, FORCE_JND_FLOOR_N
@@ -232,10 +240,9 @@ _KNOTS = np.concatenate([np.zeros(3), np.geomspace(4e-3, 1.0, 56), np.ones(2)])
 DEPTH_FRACTIONS = 0.5 * (_KNOTS[1:-2] + _KNOTS[2:-1])
 """The depths at which the offset is computed, as fractions of the maximum depth.
 
-They are the Greville abscissae of a quadratic B-spline on `_KNOTS`, at which its control points
-lie. The slope of the spline is continuous and bounded by the slopes between its control points.
-Bounds that hold at these depths therefore hold at all depths.
-"""
+They are the Greville abscissae of a quadratic B-spline with the knots `_KNOTS`, where the control
+points of the spline lie. The slope of the spline is continuous and bounded by the slopes between
+its control points. Bounds that hold at these depths therefore hold at all depths."""
 
 SATURATION_FRACTION = 0.1
 """The fraction of the maximum indentation over which the indentation saturates smoothly."""
@@ -251,10 +258,10 @@ def render_force(
 ) -> RenderedForce:
     """Compute the best approximation of the object's force with one stretch at one position.
 
-    push: stretch ratio, finger radius and position.
+    push: stretch ratio, finger radius and position of the push.
     max_depth_m: maximum depth of the finger in the object.
-    The indentation is limited so that the edge force stays within its limit.  Its increase per
-    depth is at most 1 + `limits.max_advance`.
+    The indentation is limited so that the edge force stays within its limit. The indentation
+    increases per depth by at most 1 + `limits.max_advance`.
     """
     depths = max_depth_m * DEPTH_FRACTIONS
     desired = curve.force_n(depths)
@@ -289,7 +296,7 @@ def _indentation_for_edge_force(
 ) -> float:
     """Return the indentation (m) at which the force on each clamp is `edge_force_n`.
 
-    The result is 0 if the force is larger even without indentation.
+    The result is 0 if the force on each clamp is larger even without indentation.
     """
     grid = 2.0 * max_depth_m * DEPTH_FRACTIONS[1:]
     flat = _flat_edge_force_n(model, push.stretch_ratio)
@@ -303,9 +310,11 @@ def _indentation_for_edge_force(
 
 
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
-    """Remove the advance smoothly from indentations (n,) m that are too small to be felt.
+    """Reduce the sheet's advance towards the finger to zero if it is too small to be felt.
 
-    depths: (n,) m.  forces_n: (n,) contact forces.
+    depths, indentation: depths and indentations (n,), m. forces_n: contact forces (n,).
+    Returns the changed indentations (n,), m. The advance decreases smoothly with the depth and the
+    contact force.
     """
     force_weight = _fade(forces_n, DEADBAND_START_N, DEADBAND_END_N)
     depth_weight = _fade(depths, DEADBAND_START_M, DEADBAND_END_M)
@@ -318,7 +327,7 @@ def _fade(values: Floats, start: float, end: float) -> Floats:
 
 
 def _saturate(indentation: Floats, maximum: float) -> Floats:
-    """Limit indentations (n,) m to a maximum that they approach smoothly."""
+    """Limit indentations (n,), m, to a maximum that they approach smoothly."""
     if maximum <= 0.0:
         return np.zeros_like(indentation)
     knee, span = (1.0 - SATURATION_FRACTION) * maximum, SATURATION_FRACTION * maximum
@@ -331,10 +340,11 @@ def _saturate(indentation: Floats, maximum: float) -> Floats:
 class Compliance:
     """The offset of the sheet as a function of the depth in one object, at a constant stretch.
 
-    note: text about forces that the sheet cannot render; empty if it can render all forces. centre:
-    rendered forces of a push at the sheet's centre. _nodes: |x| and |y| (m) of the positions on the
-    sheet at which the offset was computed. _indentation, _growth: indentation at these positions
-    over the depth, and its derivative.
+    note: text about forces that the sheet cannot render; empty if the sheet can render all forces.
+    centre: rendered forces of a push at the sheet's centre.
+    _nodes: |x| and |y| (m) of the positions on the sheet at which the offset was computed.
+    _indentation, _growth: indentation at these positions as a function of depth, and its
+        derivative.
     """
 
     stretch_ratio: float
@@ -353,7 +363,7 @@ class Compliance:
         return float(self.centre.depths_m[-1])
 
     def indentation_m(self, depths_m: Floats | float, position_m: SheetPosition = CENTRE) -> Floats:
-        """Return the sheet's indentation (n,), m, for depths (n,), m, of the finger in the object.
+        """Return the sheet's indentations (n,), m, at depths (n,), m, of the finger in the object.
 
         position_m: (x, y) of the contact on the sheet.
         """
@@ -364,9 +374,9 @@ class Compliance:
     def normal_offset_m(
         self, depths_m: Floats | float, position_m: SheetPosition = CENTRE
     ) -> Floats:
-        """Return the sheet's distance (n,), m, behind the object's tangent plane.
+        """Return the sheet's distances (n,), m, behind the object's tangent plane.
 
-        depths_m: (n,) depths of the finger in the object; without contact the result is 0.
+        depths_m: depths (n,) of the finger in the object. Without contact, the distance is 0.
         position_m: (x, y) of the contact on the sheet.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
@@ -374,7 +384,7 @@ class Compliance:
         return result
 
     def offset_per_depth(self, depth_m: float, position_m: SheetPosition = CENTRE) -> float:
-        """Return the derivative of the offset with respect to the depth, at most 1."""
+        """Return the derivative of the normal offset with respect to the depth, at most 1."""
         if depth_m <= 0.0:
             return 0.0
         if depth_m >= self.max_depth_m:
@@ -382,10 +392,11 @@ class Compliance:
         return 1.0 - float(self._growth(depth_m) @ self._weights(position_m))
 
     def choose_bandwidth_rad_per_s(self) -> tuple[float, bool]:
-        """Choose the bandwidth (rad/s) of the depth's filter, and return whether hands are stable.
+        """Choose the bandwidth (rad/s) of the depth filter, and return whether the loop is stable.
 
-        The result is the largest bandwidth for which the offset's slopes for a push at the centre
-        are within their bounds, or else the smallest bandwidth.  Without bounds it is infinite.
+        The result is the largest bandwidth for which the slopes of the offset for a push at the
+        centre are within their bounds. If no bandwidth satisfies the bounds, the smallest bandwidth
+        is chosen. Without bounds, the bandwidth is infinite.
         """
         bounds, push = self.limits.bounds, self.centre
         if bounds is None:
@@ -400,15 +411,15 @@ class Compliance:
         return float(bounds.bandwidths_rad_per_s[0]), False
 
     def rendered_force_n(self, depths_m: Floats, position_m: SheetPosition = CENTRE) -> Floats:
-        """Return the force (n,), N, that the sheet's model predicts at depths (n,)."""
+        """Return the forces (n,), N, that the sheet's model predicts at depths (n,), m."""
         push = SheetPush(self.stretch_ratio, self.finger_radius_m, position_m)
         return self.model.evaluate(push, self.indentation_m(depths_m, position_m)).force_n
 
     def _weights(self, position_m: SheetPosition) -> Floats:
-        """Return weights (9,) for interpolation between the positions of `_nodes`.
+        """Return the weights (9,) for interpolation between the positions of `_nodes`.
 
-        The weights are linear in x^2 and y^2, since the sheet is symmetric.  They are not negative.
-        Bounds that hold at these positions therefore hold between them.
+        The weights are linear in x^2 and y^2, because the sheet is symmetric. They are not
+        negative. Bounds that hold at these positions therefore hold between them.
         """
         weights = [
             _interpolate_squares(nodes, abs(at))
@@ -418,7 +429,10 @@ class Compliance:
 
 
 def _interpolate_squares(nodes: Floats, at: float) -> Floats:
-    """Return weights (n,) for interpolation between nodes (n,) that is linear in the square."""
+    """Return weights (n,) for interpolation between nodes (n,).
+
+    The interpolation is linear in the square of the coordinate.
+    """
     squares, square = nodes**2, min(at, float(nodes[-1])) ** 2
     upper = int(np.clip(np.searchsorted(squares, square), 1, len(nodes) - 1))
     t = (square - squares[upper - 1]) / (squares[upper] - squares[upper - 1])
@@ -436,10 +450,10 @@ def fit_compliance(
     stretch_ratio: float | None = None,
     max_depth_m: float | None = None,
 ) -> Compliance:
-    """Find the stretch ratio and the sheet offset that render a force curve best.
+    """Find the stretch ratio and the sheet offset that best render a force curve.
 
-    stretch_ratio: fixed stretch ratio; None: choose the best stretch ratio.
-    max_depth_m: maximum depth of a push; None: use that of the scene.
+    stretch_ratio: fixed stretch ratio; None to choose the best stretch ratio.
+    max_depth_m: maximum depth of a push; None for the value of the scene.
     """
     depth_m = scene.working_range.push_depth_m if max_depth_m is None else max_depth_m
     radius_m, rubber = scene.finger.radius_m, model.rubber
@@ -504,10 +518,10 @@ def _find_best_stretch(
 
 
 def _note(rendered: RenderedForce, position_error_m: float) -> str:
-    """Return a text about forces that the sheet cannot render; empty if it can render all forces.
+    """Return a text about forces that the sheet cannot render, or an empty text.
 
     position_error_m: error of the sheet's position. The text also reports an object that is so soft
-        that this error changes its force noticeably.
+        that this error changes the force noticeably.
     """
     error = rendered.error_ratio
     off = np.abs(error) > TARGET_ERROR_RATIO
@@ -547,7 +561,7 @@ def compute_force_uncertainty_ratio(rendered: RenderedForce, position_error_m: f
 class StretchChoice:
     """A stretch that renders an object's stiffness.
 
-    note: text about a stiffness out of range; empty if the sheet can render the stiffness.
+    note: text about a stiffness that the sheet cannot render; empty if the sheet can render it.
     """
 
     stretch_ratio: float
@@ -555,7 +569,7 @@ class StretchChoice:
 
 
 def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
-    """Return the stretch limits of the scene, reduced to the usable edge force and strain."""
+    """Return the minimum and maximum stretch ratio within the usable edge force and strain."""
     at_max_force = stretch_for_edge_force(USABLE_FRACTION * sheet.max_edge_force_n, sheet)
     at_max_strain = 1.0 + USABLE_FRACTION * (sheet.max_stretch_ratio - 1.0)
     return sheet.min_stretch_ratio, max(sheet.min_stretch_ratio, min(at_max_strain, at_max_force))
@@ -564,7 +578,8 @@ def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
 def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
     """Return the stretch that renders an object's stiffness at small pushes without an offset.
 
-    The linear model of the sheet ignores the object's curved force and the size of the fingertip.
+    The linear model of the sheet ignores the nonlinearity of the object's force and the size of the
+    fingertip.
     """
     least, largest = compute_stretch_range(sheet)
     desired = stretch_for_edge_force(

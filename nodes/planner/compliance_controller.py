@@ -22,14 +22,14 @@ from flexsheet.nodes.planner.compliance import (
 from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
 
 EQUAL_RATIO = 0.02
-"""The relative difference below which two force curves are considered as equal.  Users notice a
-difference that is seven times as large."""
+"""The relative difference below which two force curves are treated as equal. Users notice only
+differences that are seven times as large."""
 
 FIRST_DELAY_S = 0.06
-"""The initial value of the delay from a measured depth until the sheet has moved."""
+"""The initial value of the delay between the measurement of a depth and the motion of the sheet."""
 
 DELAY_HYSTERESIS_S = 0.03
-"""The decrease of the measured delay up to which the bounds of the offset's slope do not change."""
+"""The minimum decrease of the measured delay that leads to new bounds on the offset's slope."""
 
 COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
 """The depths at which force curves are compared, as fractions of the maximum depth."""
@@ -38,15 +38,15 @@ COMPARED_FRACTIONS = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
 class ComplianceController:
     """A controller of the sheet's stretch and normal offset for the object under the finger.
 
-    mode: "force_curve" renders the object's force as a function of depth.  "stiffness" renders the
-        object's stiffness at small pushes by the stretch (Furukawa et al. 2007).
-        "constant_stretch" uses the minimum stretch.
-    hysteresis_ratio: fraction of the energy of loading that the rubber loses in a cycle; None: the
+    mode: "force_curve" renders the object's force as a function of depth. "stiffness" renders the
+        object's stiffness at small pushes by the stretch (Furukawa et al. 2007). "constant_stretch"
+        uses the minimum stretch.
+    hysteresis_ratio: fraction of the loading energy that the rubber loses in a cycle; None for the
         value in the scene.
-    bounds: bounds on the offset's slope for a stable control loop of sheet and hand; None if there
-        is no hand.
-    delay_s: time from a measured depth until the sheet has moved.
-    bandwidth_rad_per_s: bandwidth of the depth's filter; None without bounds.
+    bounds: bounds on the offset's slope for a stable control loop of sheet and hand; None without a
+        hand.
+    delay_s: time from the measurement of a depth until the sheet has moved.
+    bandwidth_rad_per_s: bandwidth of the depth filter; None without bounds.
     """
 
     def __init__(
@@ -75,11 +75,12 @@ class ComplianceController:
         self._compliance: Compliance | None = None
 
     def update(self, soft_body: SoftBody, *, in_contact: bool) -> None:
-        """Fit stretch and offset to the soft body under the finger.
+        """Fit the stretch and the offset of the sheet to the soft body under the finger.
 
-        In contact the stretch remains constant, because users could feel moving edges.
+        During contact, the stretch remains constant, because users could feel the motion of the
+        edges.
 
-        Raises UnfitCurveError if the force curve is invalid; the last fit is then used.
+        Raises UnfitCurveError if the force curve is invalid; the last valid fit is then used.
         """
         if self._mode == "constant_stretch":
             return
@@ -98,9 +99,9 @@ class ComplianceController:
         self._fitted_n = forces_n
 
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
-        """Update the measured delay.
+        """Update the measured delay between the measurement of a depth and the motion of the sheet.
 
-        Outside contact, stretch and offset are fitted again if the delay changes the bounds.
+        Without contact, stretch and offset are fitted again if the delay changes the bounds.
         """
         self.delay_s = delay_s
         if self._bounds is None or in_contact:
@@ -143,7 +144,10 @@ class ComplianceController:
         self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted), hand_note)))
 
     def _range_note(self, fitted: Compliance) -> str:
-        """Return why the force model is invalid for the deepest push; empty if it is valid."""
+        """Return the reason why the force model is invalid for the deepest push.
+
+        The result is empty if the model is valid.
+        """
         max_depth_m = self._scene.working_range.push_depth_m
         push = SheetPush(fitted.stretch_ratio, fitted.finger_radius_m)
         reason = self._model.invalid_reason(push, float(fitted.indentation_m(max_depth_m)))
@@ -152,11 +156,12 @@ class ComplianceController:
         return f"the sheet force model {self._model.name} is not valid here: {reason}"
 
     def normal_offset(self, depth_m: float, position_m: SheetPosition) -> tuple[float, float]:
-        """Return the sheet's offset behind the tangent plane (m), and its slope over the depth.
+        """Return the sheet's normal offset (m), and its derivative with respect to the depth.
 
         depth_m: depth of the finger in the object.
         position_m: (x, y) of the contact on the sheet.
-        If the rubber has hysteresis, the result depends on the depths of earlier calls.
+        A positive offset is behind the object's tangent plane. If the rubber has hysteresis, the
+        result depends on the depths of earlier calls.
         """
         force_ratio = 1.0 if self._hysteresis is None else self._hysteresis.update(depth_m)
         if self._compliance is None or depth_m <= 0.0:

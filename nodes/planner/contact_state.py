@@ -1,7 +1,8 @@
-"""Track the contact between the finger and the virtual object, and place the sheet there.
+"""Track the contact between the finger and the virtual object, and compute the sheet's pose.
 
 During the approach, the sheet is in the tangent plane at the surface point nearest to the finger
-(Furukawa et al. 2007, Fig. 7a).  In contact it rolls on the object without slip (Fig. 7b).
+(Furukawa et al. 2007, Fig. 7a). During contact, the sheet rolls on the object without slip (Fig.
+7b).
 """
 
 from __future__ import annotations
@@ -29,27 +30,26 @@ from flexsheet.nodes.planner.rolling import (
 )
 
 SHALLOW_RATIO, DEEP_RATIO = 0.15, 0.5
-"""Two ratios of the finger's depth to the radius of curvature.  Up to the first ratio, the contact
-is the surface point nearest to the finger.  From the second ratio on, the contact moves as far as
-the finger moves along the sheet."""
+"""Two ratios of the finger's depth to the radius of curvature. Below the first ratio, the contact
+is the surface point nearest to the finger. Above the second ratio, the contact moves as far as the
+finger moves along the sheet."""
 
 MIN_RADIUS_FRACTION = 0.15
-"""The minimum distance of a finger from a centre of curvature, as a fraction of the radius.  At a
-smaller distance, the side of the object on which the finger is would be ambiguous."""
+"""The minimum distance of a finger from a centre of curvature, as a fraction of the radius. At a
+smaller distance, it would be ambiguous on which side of the object the finger is."""
 
 MIN_CURVATURE_PER_M = 1e-3
 MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
-"""The maximum plausible distance of a finger from the object's origin, and its maximum speed."""
+"""The maximum plausible distance of a finger from the object's origin, and its maximum plausible
+speed."""
 
 MAX_TILT_RAD = 1.4
 """The maximum tilt of the sheet in any scene.
 
-Two normals within this tilt are never opposite, so the shortest rotation between them is
-unique.
-"""
+Two normals within this tilt are never opposite, so the shortest rotation between them is unique."""
 
 MIN_LIFT_M = 2e-4
-"""The minimum height of the object's rim around the contact above which the contact is reported as
+"""The height of the surrounding surface above the contact from which the contact is reported as
 concave."""
 
 
@@ -77,7 +77,7 @@ class ContactLimits:
 
 @dataclass(frozen=True, slots=True)
 class ContactCommand:
-    """The contact that the sheet must render, and the motion of the sheet.
+    """The commanded contact of the sheet with the object, and the motion of the sheet.
 
     twist: velocity (6,) of the sheet's centre in the object's frame, m/s and rad/s.
     """
@@ -100,7 +100,7 @@ class ContactStateMachine:
     """A state machine of one finger's contact with the object: approach, contact and hold.
 
     home: axes (3, 3) of the sheet before the first contact; the third axis is the sheet's normal.
-    Raises UnpresentableError if the front of the object is tilted more than the maximum.
+    Raises UnpresentableError if the tilt of the object's front exceeds the maximum.
     """
 
     def __init__(self, shape: Shape, home: Floats, limits: ContactLimits) -> None:
@@ -121,9 +121,9 @@ class ContactStateMachine:
         self._nearest_point = first.point
 
     def step(self, finger: Floats, velocity: Floats, object_from_sheet: Floats) -> ContactCommand:
-        """Return the command for a finger (3,) m that moves with `velocity` (3,) m/s.
+        """Return the command for a finger at the position (3,) m with the velocity (3,) m/s.
 
-        object_from_sheet: the sheet's current pose (4, 4), from which a new contact starts.
+        object_from_sheet: the sheet's present pose (4, 4), from which a new contact starts.
         """
         limits = self._limits
         if not (_norm(finger) <= MAX_DISTANCE_M and _norm(velocity) <= MAX_FINGER_SPEED_M_PER_S):
@@ -161,7 +161,10 @@ class ContactStateMachine:
         return ContactCommand("approach", reason, self.contact, twist, 0.0)
 
     def _begin_contact(self, contact: SheetContact, object_from_sheet: Floats) -> SheetContact:
-        """Return the contact at which the finger touches the sheet in its current pose (4, 4)."""
+        """Return the contact at which the finger touches the sheet.
+
+        object_from_sheet: the sheet's present pose (4, 4).
+        """
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
         point_sheet = inverse(object_from_sheet) @ np.append(contact.point, 1.0)
         axes = transport_axes(object_from_sheet[:3, :3], contact.normal)
@@ -195,14 +198,15 @@ class ContactStateMachine:
     def _blend_contact(
         self, found: Nearest, moved: Floats, velocity: Floats, depth: float
     ) -> tuple[Nearest, Floats]:
-        """Return the surface point to which the finger moves the contact, and its rate (3,) m/s.
+        """Return the surface point to which the contact moves, and its velocity (3,) m/s.
 
-        found: surface point nearest to the finger.  moved: motion (3,) m of the finger since the
-            last step.
+        found: surface point nearest to the finger. moved: displacement (3,) m of the finger since
+            the last step. velocity: velocity (3,) m/s of the finger. depth: depth (m) of the
+            finger.
 
-        At small depths, the contact is the surface point nearest to the finger.  Deep inside the
-        object this point is arbitrary, so the contact moves as far as the finger moves along the
-        sheet.  At depths in between, both motions are blended.
+        At small depths, the contact is the surface point nearest to the finger. Deep inside the
+        object, this point is arbitrary, so the contact moves as far as the finger moves along the
+        sheet. At depths in between, both motions are blended.
         """
         normal = self.contact.normal
         tangential = np.eye(3) - np.outer(normal, normal)
@@ -223,8 +227,8 @@ class ContactStateMachine:
     ) -> tuple[SheetContact, SheetReason | None]:
         """Roll the sheet on the object until the contact is at the surface point `found`.
 
-        If the contact reaches the limit of the sheet's usable area, the motion ends there.  The
-        second result is then the reason, otherwise None.
+        If the contact reaches the limit of the sheet's usable area, the motion ends there. The
+        second result then states the reason; otherwise it is None.
         """
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
@@ -255,10 +259,10 @@ def _is_too_deep(found: Nearest) -> bool:
 
 
 def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
-    """Return the rate (3,) m/s of the surface point that is nearest to a moving finger.
+    """Return the velocity (3,) m/s of the surface point that is nearest to a moving finger.
 
-    The rate is limited to its value at `MIN_RADIUS_FRACTION`, because it is infinite at a centre of
-    curvature.
+    The velocity is infinite at a centre of curvature. It is therefore limited to its value at the
+    distance `MIN_RADIUS_FRACTION`.
     """
     try:
         rate = projection_jacobian(found) @ velocity
@@ -269,5 +273,8 @@ def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
 
 
 def _norm(vector: Floats) -> float:
-    """Return the length of a vector (3,), which is not finite if an element is not finite."""
+    """Return the length of a vector (3,).
+
+    The result is not finite if an element of the vector is not finite.
+    """
     return hypot(*vector.tolist())

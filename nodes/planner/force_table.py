@@ -1,4 +1,4 @@
-"""Compute and cache the force table of a scene's sheet.  The computation takes 1 to 2 minutes."""
+"""Compute and cache the force table of a scene's sheet. The computation takes 1 to 2 minutes."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner.sheet_force import compute_membrane_table, make_rubber
 
 VERSION = 1
-"""The version of the computation.  Cached tables of another version are computed again."""
+"""The version of the computation. Cached tables of another version are computed again."""
 
 FIELDS = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
 """The fields of `TabulatedSheetModel` that the cache file contains."""
 
 XS, YS = np.array([0.0, 0.13, 0.25]), np.array([0.0, 0.19, 0.36])
-"""The positions x and y in the table, as fractions of the sheet's width and height."""
+"""The grid of push positions in the table, as fractions of the sheet's width and height."""
 
 
 def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
@@ -57,7 +57,7 @@ def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> TabulatedSheetModel:
-    """Return the force table of a scene from the cache, or compute and store the table."""
+    """Return the force table of a scene from the cache; if it is missing, compute and store it."""
     sheet = scene.sheet
     ends = sorted({sheet.min_stretch_ratio, sheet.max_stretch_ratio})
     return cached(
@@ -77,9 +77,9 @@ def load_or_compute(
 def load_force_model(
     scene: Scene, method: SheetForceMethod, cache_dir: Path | None
 ) -> tuple[SheetForceModel, str]:
-    """Return the force model of a sheet without calibration, and a note for the operator.
+    """Return the force model of an uncalibrated sheet, and a note for the operator.
 
-    If the method is "table" but the table is not in the cache, the scaled model is returned.
+    If the method is "table" but the cache contains no table, the scaled model is returned.
     """
     rubber = make_rubber(scene.sheet)
     if method != "table":

@@ -18,7 +18,7 @@ VERSION = 2
 
 
 def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
-    """Define the key and the format of the cache file of the bounds for a camera's rate."""
+    """Define the key and the format of the cache file with the bounds for a camera's frame rate."""
     depends_on = {
         "version": VERSION,
         "rate_hz": rate_hz,
@@ -36,7 +36,10 @@ def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
 
 
 def load_or_compute_bounds(rate_hz: float, cache_dir: Path | None) -> OffsetBoundsTable:
-    """Return the bounds for a camera's rate from the cache, or compute and store the bounds."""
+    """Return the bounds for a camera's frame rate from the cache.
+
+    If the cache does not contain the bounds, compute and store them.
+    """
     return cached(
         bounds_cache(rate_hz),
         cache_dir,

@@ -1,24 +1,26 @@
 """Model the hysteresis of the sheet's rubber.
 
-The force is 1 + h times the elastic force while the finger moves inwards (loading), and 1 - h times
-while it moves outwards. Here h = r / (2 - r), and r is the fraction of the energy of loading that
-the rubber loses. When the finger reverses, the factor changes linearly with the finger's travel.
+While the finger moves inwards (loading), the force is 1 + h times the elastic force. While it moves
+outwards, the force is 1 - h times the elastic force. Here h = r / (2 - r), and r is the fraction of
+the loading energy that the rubber loses. When the finger reverses, the factor changes linearly with
+the finger's travel.
 """
 
 from __future__ import annotations
 
 REVERSAL_RATIO = 0.2
-"""The travel over which the factor changes completely, as a fraction of the depth."""
+"""The travel of the finger after a reversal until the hysteresis is fully reversed, as a fraction
+of the depth."""
 
 MIN_REVERSAL_M = 4e-4
-"""The minimum travel over which the factor changes completely.  It prevents that tremor at small
-depths reverses the factor."""
+"""The minimum travel of the finger after a reversal until the hysteresis is fully reversed. At
+small depths, tremor would otherwise reverse the hysteresis."""
 
 
 class HysteresisCorrection:
     """A model of the ratio of the sheet's force to its elastic force.
 
-    ratio: fraction of the energy of loading that is lost in a cycle.
+    ratio: fraction of the loading energy that is lost in a cycle.
     """
 
     def __init__(self, ratio: float) -> None:
@@ -28,7 +30,7 @@ class HysteresisCorrection:
     def update(self, depth_m: float) -> float:
         """Add a depth (m) of the finger, and return the ratio of force to elastic force.
 
-        Each contact begins with loading. A repeated depth does not change the ratio.
+        Each contact begins with loading. If the depth does not change, the ratio does not change.
         """
         if depth_m <= 0.0:
             self._depth_m, self._direction = 0.0, 1.0

@@ -1,9 +1,10 @@
 """Move the sheet towards a target with limited speed, acceleration and jerk.
 
-Position, orientation and stretch are limited separately, in three stages per step.  The first stage
-determines the desired velocity towards the target, from which the sheet can stop there.  The second
-stage determines the acceleration that reaches this velocity without overshoot.  The third stage
-changes the present acceleration towards this acceleration as far as the jerk limit permits.
+Position, orientation and stretch are limited separately, in three stages per step. The first stage
+determines a velocity towards the target from which the sheet can stop at the target. The second
+stage determines an acceleration that reaches this velocity without overshoot. The third stage
+changes the present acceleration towards the determined acceleration as far as the jerk limit
+permits.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ LINEAR, ANGULAR, STRETCH = slice(0, 3), slice(3, 6), slice(6, 7)
 
 @dataclass(frozen=True, slots=True)
 class JerkBounds:
-    """The maximum jerk of the sheet's centre, rotation and stretch ratio."""
+    """The maximum jerk of the sheet's translation, rotation and stretch ratio."""
 
     jerk_m_per_s3: float
     turn_jerk_rad_per_s3: float
@@ -41,10 +42,10 @@ class JerkBounds:
 
 @dataclass(frozen=True, slots=True)
 class JerkLimitedState:
-    """The motion of the sheet with the state of the jerk limiter.
+    """The motion of the sheet and the state of the jerk limiter.
 
     mean_velocity, acceleration: values (7,) for translation (3), rotation (3) and stretch ratio
-    (1), averaged over the last time step.
+        (1), averaged over the last time step.
     """
 
     sheet: SheetMotion
@@ -66,8 +67,9 @@ def limit_jerk(
     max_jerk: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """Return mean velocity and acceleration (n,) of the next step towards a goal velocity (n,).
+    """Return the mean velocity and the acceleration (n,) of the next step.
 
+    goal_velocity: velocity (n,) to reach.
     The acceleration stays within its limit, and changes by at most max_jerk * step_s.
     """
     change = goal_velocity - mean_velocity
@@ -97,7 +99,8 @@ def step_sheet(
 ) -> JerkLimitedState:
     """Return the state of the sheet after one step of `step_s` towards its target.
 
-    target: motion of the target at the end of the step; None: decelerate to rest.
+    target: motion of the target at the end of the step. If it is None, the sheet decelerates to
+        rest.
     """
     goals = (
         np.zeros(7)
@@ -138,9 +141,10 @@ def step_sheet(
 def _desired_velocities(
     now: SheetMotion, target: SheetMotion, bounds: SheetBounds, edges: EdgeBound, step_s: float
 ) -> Floats:
-    """Return the desired mean velocities (7,) of the next step: linear, angular and stretch.
+    """Return the desired mean velocities (7,) of the next step.
 
-    The velocities respect the speed limit of the sheet's edges.
+    The elements are linear velocity (3), angular velocity (3) and stretch rate (1). They respect
+    the speed limit of the sheet's edges.
     """
     displacement = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(
@@ -183,7 +187,8 @@ def divide_edge_speed(
     speeds, distances: linear and angular speed (m/s, rad/s), and remaining distances (m, rad).
 
     The speed limit is divided between translation and rotation in proportion to their remaining
-    distances, so that both end together.  If one of them needs less, the other gets more.
+    distances, so that both end at the same time. If one motion needs less than its part, the other
+    motion receives the difference.
     """
     limit, reach = edges.speed_m_per_s, edges.reach_m
     linear, angular = speeds[0], reach * speeds[1]

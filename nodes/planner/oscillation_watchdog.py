@@ -7,36 +7,39 @@ from collections import deque
 import numpy as np
 
 WINDOW_S = 1.4
-"""The duration of the window in which amplitudes are compared.  Each half of the window contains a
-period of 1.4 Hz."""
+"""The duration of the window whose two halves are compared. Each half contains one period of an
+oscillation of 1.4 Hz."""
 
 MIN_AMPLITUDE_M = 2e-4
-"""The amplitude of the depth (root mean square) below which an oscillation cannot be felt."""
+"""The root mean square amplitude of the depth below which an oscillation cannot be felt."""
 
 GROWTH_RATIO = 1.15
-"""The ratio of the amplitude in the second half of the window to that in the first half above which
-the watchdog is triggered."""
+"""The ratio of the amplitude in the second half of the window to that in the first half that
+triggers the watchdog."""
 
 STEADY_RATIO = 0.95
+"""The ratio of the amplitude in the second half of the window to that in the first half above which
+an oscillation does not decay."""
+
 SUSTAINED_S = 1.5
-"""A ratio and a time that define a sustained oscillation.  The watchdog is triggered if the ratio
-of the amplitudes in both halves of the window stays above STEADY_RATIO for SUSTAINED_S."""
+"""The time without decay of an oscillation after which the watchdog is triggered."""
 
 FADE_S = 0.3
 """The time in which the motion of the sheet's offset is reduced to zero."""
 
 SLOW_S = 0.35
-"""The time constant of the slow part of depth and offset, which does not count as oscillation."""
+"""The time constant of the filter that removes slow changes of depth and offset. Slow changes do
+not count as oscillation."""
 
 
 class OscillationWatchdog:
     """A watchdog that stops the motion of the sheet's offset if this motion drives an oscillation.
 
-    The sheet delivers energy to the finger if the integral of the offset over the depth is positive
-    in a cycle. Voluntary motion against the sheet loses energy to the sheet. The watchdog is
-    therefore triggered only by an unstable control loop.
+    The sheet transfers energy to the finger if the integral of the offset over the depth is
+    positive in a cycle. A voluntary motion of the finger against the sheet transfers energy to the
+    sheet. The watchdog is therefore triggered only by an unstable control loop.
 
-    weight: factor on the offset's motion, from 1 (follows the finger) to 0 (at rest).
+    weight: factor for the offset's motion, from 1 (follows the finger) to 0 (at rest).
     triggers: number of oscillations that were stopped.
     """
 
@@ -54,9 +57,9 @@ class OscillationWatchdog:
         self._fading = False
 
     def update(self, depth_m: float, offset_m: float, step_s: float) -> float:
-        """Return the weight (0 to 1) of the offset's motion after a measurement.
+        """Add a measurement, and return the weight (0 to 1) of the offset's motion.
 
-        depth_m: measured depth.  offset_m: offset of the sheet at the time of the measurement.
+        depth_m: measured depth. offset_m: offset of the sheet at the time of the measurement.
         step_s: time since the last measurement.
         """
         if self._slow is None:
@@ -98,9 +101,9 @@ class OscillationWatchdog:
 
 
 def _oscillates(depths: np.ndarray) -> bool:
-    """Return whether depths (n,) m change their sign at least twice.
+    """Return whether the depths (n,), m, change their sign at least twice.
 
-    Smaller values than MIN_AMPLITUDE_M are ignored.  A single push changes the sign only once.
+    Values smaller than MIN_AMPLITUDE_M are ignored. A single push changes the sign only once.
     """
     large = depths[np.abs(depths) > MIN_AMPLITUDE_M]
     return int(np.count_nonzero(np.diff(np.sign(large)))) >= 2

@@ -1,4 +1,4 @@
-"""Define the planner's parameters, and the limits that follow from them."""
+"""Define the planner's parameters and the limits that are derived from them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,10 @@ class PlannerParameters(NodeParameters):
     )
 
     def choose_compliance(self, scene: Scene) -> ComplianceMode:
-        """Return the compliance mode for a scene: constant_stretch if the object is rigid."""
+        """Return the compliance mode for a scene.
+
+        The result is `constant_stretch` if the object is rigid.
+        """
         if scene.object.material is None:
             return "constant_stretch"
         return resolve_method(self.compliance_mode, scene.methods.compliance, "force_curve")
@@ -106,7 +109,7 @@ class PlannerParameters(NodeParameters):
     )
 
     def trajectory_settings(self) -> TrajectorySettings:
-        """Return the limits of the planned trajectory."""
+        """Return the limits of the planned trajectory that the parameters define."""
         return TrajectorySettings(
             SheetBounds(
                 self.speed_m_per_s,

@@ -1,10 +1,11 @@
 """Compute the contact of a flat sheet that touches a smooth object, or rolls on the object.
 
-All vectors are in the object's frame.  The sheet's frame has x from the left edge to the right
-edge, y along the edges and z out of the object.  Rolling without slip or spin moves the sheet's
-axes along the contact's path by parallel transport.  The contact's path on the sheet has the same
-length as its path on the object (Furukawa et al. 2007, Fig. 7b, for any smooth shape).  Source: do
-Carmo, Differential Geometry of Curves and Surfaces, section 4-4.
+All vectors are in the object's frame. In the sheet's frame, the x axis points from the left edge to
+the right edge. The y axis is parallel to the edges, and the z axis points out of the object.
+Rolling without slip or spin moves the sheet's axes along the contact's path by parallel transport.
+The contact's path on the sheet has the same length as its path on the object (Furukawa et al. 2007,
+Fig. 7b, for any smooth shape). Source: do Carmo, Differential Geometry of Curves and Surfaces,
+section 4-4.
 """
 
 from __future__ import annotations
@@ -19,25 +20,28 @@ from flexsheet.nodes.models.rigid import angle_between, transform
 from flexsheet.nodes.models.shapes import Nearest, Shape
 
 MIN_STEP_RATIO = 1.0 / 512.0
-"""The resolution of the search for the last point within the maximum tilt, as a fraction of the
-search distance."""
+"""The resolution of the search for the last surface point within the maximum tilt, as a fraction of
+the search distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
-"""A finer resolution of the search for tilts that are more than NEAR_LIMIT_RAD below the limit.  It
-is needed deep inside the object, where a small step changes the normal by many degrees."""
+"""The finer resolution of the search, and the minimum distance from the maximum tilt at which it is
+used. It is necessary deep inside the object, where a small step can change the normal by many
+degrees."""
 
 RIM_RADIUS_M = 0.03
-"""The radius around the contact in which the object may rise above the tangent plane."""
+"""The radius around the contact in which the object is tested for points above the tangent
+plane."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetContact:
     """A contact of the sheet with the object.
 
-    point, normal: surface point (3,) m and unit normal (3,). shape_operator: derivative (3, 3), in
-    1/m, of the normal along the surface. axes: (3, 3); its columns are the axes of the sheet, the
-    third column is the normal. position_sheet_m: (x, y) of the contact on the sheet. lift_m:
-    distance between the sheet's plane and the point; 0 unless the object is concave there.
+    point, normal: surface point (3,) m and unit normal (3,).
+    shape_operator: derivative (3, 3), in 1/m, of the normal along the surface.
+    axes: axes of the sheet as columns (3, 3); the third column is the normal.
+    position_sheet_m: (x, y) of the contact on the sheet.
+    lift_m: distance between the sheet's plane and the point; 0 unless the object is concave there.
     """
 
     point: Floats
@@ -49,7 +53,7 @@ class SheetContact:
 
     @property
     def nearest(self) -> Nearest:
-        """Return the contact's surface point as a result of `Shape.closest`."""
+        """Return the contact's surface point in the format of the results of `Shape.closest`."""
         no = np.zeros((), dtype=bool)
         return Nearest(self.point, self.normal, np.zeros(()), self.shape_operator, no, no)
 
@@ -60,19 +64,22 @@ class SheetContact:
         return transform(self.axes, self.point - self.axes @ contact_sheet)
 
     def height_m(self, finger: Floats) -> float:
-        """Return the height of a point (3,) m above the sheet's plane; negative below the plane."""
+        """Return the height (m) of a point (3,) m above the sheet's plane.
+
+        The height is negative for points below the plane.
+        """
         return float((finger - self.point) @ self.normal) - self.lift_m
 
 
 def transport_axes(axes: Floats, normal: Floats) -> Floats:
     """Rotate axes (3, 3) by the smallest rotation that maps the third axis to `normal` (3,).
 
-    This is parallel transport along the shorter arc between both normals.  The result is undefined
-    for opposite normals, and orthogonal without rounding drift.
+    This rotation is the parallel transport along the shorter arc between both normals. The result
+    is undefined for opposite normals. It is orthogonal, because rounding errors do not accumulate.
     """
     both = axes[:, 2] + normal
-    # The rotation is the product of two Householder reflections.  The first one negates the third
-    # axis and leaves the others unchanged; the second one maps the negated axis to the normal.
+    # The rotation is the product of two Householder reflections.  The first reflection
+    # negates the third axis.  The second reflection maps the negated axis to the normal.
     result = axes - np.outer(both, both @ axes) * (2.0 / (both @ both))
     result[:, 2] = normal
     return result
@@ -81,9 +88,10 @@ def transport_axes(axes: Floats, normal: Floats) -> Floats:
 def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
     """Return the contact after the sheet has rolled to the surface point `found`.
 
-    To compute the displacement of the contact on the sheet, the chord between both points is
-    projected onto the plane halfway between the tangent planes, and scaled to the length of the
-    arc.  The displacement is exact on circles; elsewhere its error is of third order in the angle.
+    The displacement of the contact on the sheet is computed from the chord between both points. The
+    chord is projected onto the plane halfway between the tangent planes, and scaled to the length
+    of the arc. The displacement is exact on circles. On other curves, its error is of third order
+    in the angle.
     """
     axes = transport_axes(contact.axes, found.normal)
     middle = transport_axes(contact.axes, _normalize(contact.normal + found.normal))
@@ -105,9 +113,9 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
     """Return the contact of a sheet that waits at a surface point for an approaching finger.
 
     home: axes (3, 3) of the sheet before they are rotated to the normal.
-    half_width_m: maximum distance of the contact from the sheet's centre.  The contact is on the
-        sheet's horizontal centre line.  Within this limit, the sheet's centre has the position of
-        the object's origin along the sheet's x axis.
+    half_width_m: maximum distance of the contact from the sheet's centre.
+    The contact is on the sheet's horizontal centre line. If the maximum distance permits, the
+    sheet's centre and the object's origin have the same coordinate along the sheet's x axis.
     """
     axes = transport_axes(home, found.normal)
     x = float(np.clip(axes[:, 0] @ found.point, -half_width_m, half_width_m))
@@ -115,10 +123,12 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
 
 
 def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
-    """Return the twist (6,) of the rolling sheet's centre while the contact moves at `rate` (3,).
+    """Return the twist (6,) of the rolling sheet's centre for a given velocity of the contact.
 
-    The twist is linear velocity (m/s) and angular velocity (rad/s). Without spin, the angular
-    velocity is n x dn/dt with the normal n. Without slip, the sheet's point in contact is at rest.
+    rate: velocity (3,) m/s of the contact on the object.
+    The twist consists of linear velocity (m/s) and angular velocity (rad/s). Without spin, the
+    angular velocity is n x dn/dt with the normal n. Without slip, the sheet's point in contact is
+    at rest.
     """
     tangential = rate - contact.normal * (rate @ contact.normal)
     angular = cross(contact.normal, contact.shape_operator @ tangential)
@@ -130,9 +140,9 @@ def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
 def compute_tangent_twist(
     contact: SheetContact, rate: Floats, home: Floats, half_width_m: float
 ) -> Floats:
-    """Return the twist (6,) of a waiting sheet while its surface point moves at `rate` (3,) m/s.
+    """Return the twist (6,) of a waiting sheet while its surface point moves.
 
-    home, half_width_m: see `make_tangent_contact`.
+    rate: velocity (3,) m/s of the surface point. home, half_width_m: see `make_tangent_contact`.
     With the normal n and the third axis h of `home`, the angular velocity of the sheet is n x dn/dt
     plus -(h x n) . dn/dt / (1 + h . n) about the normal.
     """
@@ -151,15 +161,19 @@ def compute_tangent_twist(
 
 
 def cross(a: Floats, b: Floats) -> Floats:
-    """Return the cross product (3,) of two vectors (3,), several times as fast as np.cross."""
+    """Return the cross product (3,) of two vectors (3,).
+
+    For single vectors, this function is several times as fast as np.cross.
+    """
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def measure_spin_rad(axes: Floats, home: Floats) -> float:
-    """Return the rotation angle of `axes` (3, 3) about its normal relative to `home` (3, 3).
+    """Return the angle (rad) by which `axes` (3, 3) are rotated about their normal.
 
-    `home` is first rotated by the smallest rotation that makes both normals equal.
+    home: axes (3, 3) with the angle 0. They are first rotated by the smallest rotation that makes
+        both normals equal.
     """
     ready = transport_axes(home, axes[:, 2])
     return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
@@ -172,8 +186,8 @@ def limit_tilt(
 
     The second result is whether this point differs from `found`.
     front: unit vector (3,) from which the tilt is measured.
-    start: surface point within the tilt, from which the search starts.  The search follows the
-        straight line to `found` in increasing steps.  Each step is projected onto the surface, so
+    start: surface point within the maximum tilt, at which the search starts. The search follows the
+        straight line to `found` in increasing steps. Each step is projected onto the surface, so
         that the search stays on the sheet's side of the object.
     """
     limit, near = np.cos(max_tilt_rad), np.cos(max(max_tilt_rad - NEAR_LIMIT_RAD, 0.0))
@@ -192,10 +206,11 @@ def limit_tilt(
 
 
 def compute_rim_lift_m(shape: Shape, contact: SheetContact) -> float:
-    """Return how far (m) the tangent plane must be lifted so that the object does not penetrate it.
+    """Return the distance (m) by which the tangent plane must be lifted above a concave object.
 
-    The result is 0 if the object is not concave.  Only the surface within `RIM_RADIUS_M` of the
-    contact is considered, because a finger deforms the sheet only there.
+    At this distance, the object does not penetrate the plane. The result is 0 if the object is not
+    concave. Only the surface within `RIM_RADIUS_M` of the contact is considered, because a finger
+    deforms the sheet only there.
     """
     return shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
 

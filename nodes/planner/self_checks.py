@@ -14,7 +14,8 @@ from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.models.sheet.force_models import SheetForceModel, SheetPush
 
 MAX_STIFFNESS_RATIO = 0.05
-"""The maximum relative difference of the stiffness: three standard deviations of a calibration."""
+"""The maximum relative difference of the stiffness, which equals three standard deviations of a
+calibration."""
 
 
 def check_stiffness(
@@ -22,8 +23,8 @@ def check_stiffness(
 ) -> tuple[SelfCheck, ...]:
     """Compare Young's modulus times thickness in the scene with the calibrated product.
 
-    Return () without a calibration.  A difference is an error because rendered forces are computed
-    from the calibration, but the sag and the limits of the edge force from the scene.
+    Returns () without a calibration. A difference is an error: rendered forces depend on the
+    calibration, but the sag and the limits of the edge force depend on the scene.
     """
     if calibration is None:
         return ()
@@ -43,22 +44,23 @@ def check_stiffness(
 
 
 MAX_FORCE_RATIO = 0.12
-"""The maximum relative error of the predicted force.  The contributions are 5 % by hysteresis of
-the rubber, 3 % by the sheet model, 3 to 6 % by 0.3 mm of the depth, and 1 % by the gauge."""
+"""The maximum relative error of the predicted force. Hysteresis of the rubber contributes 5 %, and
+the sheet model 3 %. A depth error of 0.3 mm contributes 3 to 6 %, and the gauge 1 %."""
 
 MIN_INDENTATION_M = 0.005
+"""The minimum push depth for a comparison. The relative errors at smaller depths are too large."""
+
 MIN_FORCE_N = 0.2
-"""The minimum push depth and force that are compared.  The relative errors of smaller values are
-too large."""
+"""The minimum force for a comparison. The relative errors of smaller forces are too large."""
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""The criterion for a push at rest: from QUIET_S before to QUIET_S after the measured force, the
-indentation changes by at most QUIET_M."""
+"""The criterion for a push at rest. From QUIET_S before to QUIET_S after the measured force, the
+indentation must not change by more than QUIET_M."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedPush:
-    """The state of the sheet that the planner commands for the time `valid_at_ns`.
+    """The state of the sheet that the planner has commanded for the time `valid_at_ns`.
 
     position_m: (x, y) of the contact on the sheet.
     """
@@ -70,9 +72,10 @@ class PlannedPush:
 
 
 class MeasuredForceCheck:
-    """A comparison of measured forces of the finger with forces that the sheet's model predicts.
+    """A comparison of measured finger forces with the forces that the sheet's model predicts.
 
-    The ratio of both is the true product of modulus and thickness divided by the assumed product.
+    The ratio of measured to predicted force estimates the true product of modulus and thickness,
+    divided by the assumed product.
     """
 
     def __init__(self, scene: Scene, model: SheetForceModel) -> None:
@@ -83,9 +86,9 @@ class MeasuredForceCheck:
         self._monitor = ResidualMonitor(1, threshold=MAX_FORCE_RATIO)
 
     def add_push(self, push: PlannedPush) -> None:
-        """Add a planned push, and compare older measured forces with the sheet model.
+        """Add a planned push, and compare earlier measured forces with the sheet model.
 
-        The compared forces were measured at least QUIET_S before this push takes effect.
+        Only forces that were measured at least QUIET_S before this push takes effect are compared.
         """
         self._pushes.append(push)
         limit_ns = push.valid_at_ns - round(1e9 * QUIET_S)
@@ -93,7 +96,7 @@ class MeasuredForceCheck:
             self._compare(*self._waiting.popleft())
 
     def add_force(self, force: Force, at_ns: int) -> None:
-        """Add a measured force; ignore it unless it is valid and along the sheet's normal.
+        """Add a measured force that is valid and along the sheet's normal; ignore other forces.
 
         at_ns: time of the measurement.
         """
@@ -119,7 +122,7 @@ class MeasuredForceCheck:
 
     @property
     def result(self) -> tuple[SelfCheck, ...]:
-        """Return the self-check, or () if too few forces have been compared."""
+        """Return the result of the self-check, or () if too few forces have been compared."""
         if not self._monitor.has_data:
             return ()
         return (

@@ -1,4 +1,4 @@
-"""Make the force model of a scene's sheet, and benchmark the force models."""
+"""Make the force model of a scene's sheet, and benchmark the available force models."""
 
 from __future__ import annotations
 
@@ -26,12 +26,14 @@ from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
 
 ReferenceForce = Callable[[SheetSpec, float, float, SheetPosition, float], float]
-"""A function that returns the reference force (N) for a sheet, a stretch ratio, a depth (m), a
-position and a fingertip radius (m)."""
+"""A function that returns the reference force (N) of a push.
+
+Its arguments are the sheet, the stretch ratio, the depth (m), the position and the fingertip radius
+(m)."""
 
 
 def make_rubber(sheet: SheetSpec) -> Rubber:
-    """Convert the sheet of a scene to ideal (neo-Hookean) rubber."""
+    """Convert the sheet of a scene to a model of ideal (neo-Hookean) rubber."""
     return Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
 
 
@@ -76,8 +78,8 @@ def compute_membrane_table(
 ) -> TabulatedSheetModel:
     """Compute a table of the sheet's force by finite elements of the membrane.
 
-    stretches: (n,) stretch ratios.  xs_m, ys_m: coordinates of the pushes on the sheet.
-    progress: function that is called with the number of finished pushes and their total number.
+    stretches: stretch ratios (n,). xs_m, ys_m: coordinates of the pushes on the sheet.
+    progress: function that receives the number of finished pushes and the total number of pushes.
     """
 
     def measure(stretch_ratio: float, depths: Floats, position_m: SheetPosition) -> Floats:
@@ -103,7 +105,8 @@ def compute_membrane_table(
 
 BENCHMARK_DEPTHS_M = (0.002, 0.005, 0.010, 0.020, 0.040)
 SLOW_DEPTHS_M = (0.005, 0.020)
-"""The depths at which slow models are benchmarked, with the mean stretch at the sheet's centre."""
+"""The push depths at which slow models are benchmarked, with the mean stretch at the sheet's
+centre."""
 BENCHMARK_POSITIONS: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
     ("off-centre", 0.13, 0.19),
@@ -120,7 +123,7 @@ def sheet_force_family(reference: ReferenceForce, make_table: MakeTable | None) 
     """Define the benchmark of the force models over stretch, depth and position.
 
     reference: function that returns the reference force.
-    make_table: function that loads or computes the table; None: omit models that need minutes.
+    make_table: function that loads or computes the table; None to omit models that need minutes.
     """
     return Family(
         name="sheet-force",

@@ -1,4 +1,4 @@
-"""Compute the sheet's offset from depths so that the control loop with the hand is stable."""
+"""Compute the sheet's offset from the depth so that the control loop with the hand is stable."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ OffsetAtDepth = Callable[[float], float]
 class StabilizedOffset:
     """A filter that computes the sheet's offset behind the object's tangent plane.
 
-    The measured depth is filtered by the filter of `hand_loop`. It is not predicted over the whole
-    delay, because this would shift the least stable frequency of the control loop into the range of
-    hand oscillation. The offset never exceeds the depth, so the sheet stays in contact with a
-    finger that moves away.
+    The measured depth is smoothed by the filter of the module `hand_loop`. The depth is not
+    predicted over the whole delay. Such a prediction would shift the least stable frequency of the
+    control loop into the range of hand oscillations. The offset never exceeds the depth, so the
+    sheet stays in contact with a finger that moves away.
     """
 
     def __init__(self) -> None:
@@ -35,10 +35,11 @@ class StabilizedOffset:
         bandwidth_rad_per_s: float,
         delay_s: float,
     ) -> tuple[float, float]:
-        """Return the offset (m) and its rate (m/s) after a measurement of the depth.
+        """Add a measured depth, and return the offset (m) and its rate (m/s).
 
-        offset_at_depth: function from the depth (m) to the offset (m). step_s: time since the last
-        measurement. bandwidth_rad_per_s: bandwidth of the depth's filter; infinite for no filter.
+        offset_at_depth: function from the depth (m) to the offset (m).
+        step_s: time since the last measurement.
+        bandwidth_rad_per_s: bandwidth of the depth filter; infinite for no filter.
         delay_s: time from a measurement until the sheet has moved.
         """
         if measured_depth_m <= 0.0:
@@ -63,7 +64,7 @@ class StabilizedOffset:
         return offset_m, rate_m_per_s
 
     def _offset_at(self, delay_s: float) -> float:
-        """Return the offset that was commanded `delay_s` ago, or 0 before the first command."""
+        """Return the offset (m) that was commanded `delay_s` ago, or 0 before the first command."""
         while len(self._commanded) > 1 and self._commanded[1][0] <= self._time_s - delay_s:
             self._commanded.popleft()
         if not self._commanded or self._commanded[0][0] > self._time_s - delay_s:

@@ -9,22 +9,23 @@ RESTART_COUNT = 3
 was set back."""
 
 MIN_STEP_NS = 1_000_000
-"""The minimum plausible interval between two exposures; no camera is faster."""
+"""The minimum plausible interval between two exposures. No camera is faster."""
 
 AGE_WEIGHT = 0.05
-"""The weight of the newest age in its exponential mean.  At 60 Hz the time constant is 0.33 s."""
+"""The weight of the newest value in the exponential mean of the fingertip's age. At 60 Hz, it
+corresponds to a time constant of 0.33 s."""
 
 DELAY_WEIGHT = 0.11
-"""The weight of an arm's newest report in its exponential mean.  At 5 Hz the time constant is 1.8
-s.
-"""
+"""The weight of the newest value in the exponential mean of an arm's reported latency. At 5 Hz, it
+corresponds to a time constant of 1.8 s."""
 
 
 class MonotonicTimestampFilter:
-    """A filter that drops late fingertips, which were exposed before the last passed fingertip.
+    """A filter that drops every fingertip that was exposed before the last accepted fingertip.
 
-    The sheet is already planned for a later time than that of a late fingertip.  `RESTART_COUNT`
-    consecutive late fingertips indicate that the clock was set back.  The filter then restarts.
+    The sheet is already planned for a later time than that of the dropped fingertip.
+    `RESTART_COUNT` consecutive late fingertips indicate that the clock was set back. The filter
+    then restarts.
     """
 
     def __init__(self) -> None:
@@ -32,7 +33,7 @@ class MonotonicTimestampFilter:
         self._late_ns: list[int] = []
 
     def update(self, source_ns: int, first_step_s: float) -> float | None:
-        """Return the time (s) since the last passed fingertip; None if the new one is dropped.
+        """Return the time (s) since the last accepted fingertip, or None for a dropped fingertip.
 
         source_ns: time of the exposure.
         first_step_s: result for the first fingertip and after a restart.
@@ -49,10 +50,10 @@ class MonotonicTimestampFilter:
 
 
 class ActuationDelayEstimator:
-    """An estimator of the delay from a fingertip's publication until the arms have moved.
+    """An estimator of the delay from the publication of a fingertip until the arms have moved.
 
-    The delay is the latency that the arms report, less the mean age of published fingertips.
-    delay_s: mean over both arms; before any report, the initial value.
+    The delay is the latency that the arms report, minus the mean age of published fingertips.
+    delay_s: mean delay over both arms, or the initial value before any report.
     """
 
     def __init__(self, initial_s: float, max_s: float) -> None:
@@ -62,12 +63,15 @@ class ActuationDelayEstimator:
         self._delays_s: dict[Side, float] = {}
 
     def on_fingertip(self, age_s: float) -> None:
-        """Add the age (s) of a usable fingertip at the time of its publication."""
+        """Add the age (s) that a usable fingertip had when it was published."""
         before_s = age_s if self._age_s is None else self._age_s
         self._age_s = before_s + AGE_WEIGHT * (age_s - before_s)
 
     def on_latency(self, side: Side, latency_s: float) -> None:
-        """Add the time (s) from the exposure until an arm has moved, if it is plausible."""
+        """Add the reported time (s) from the exposure until an arm has moved.
+
+        An implausible time is ignored.
+        """
         if self._age_s is None or not 0.0 <= latency_s - self._age_s <= self._max_s:
             return
         before_s = self._delays_s.get(side, self._initial_s)

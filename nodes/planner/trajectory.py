@@ -25,25 +25,24 @@ from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
 
 EDGE_SPEED_FRACTION = 0.7
-"""The fraction of the maximum tool speed that the planner uses.  A late arm can catch up with the
-remaining speed."""
+"""The fraction of the maximum tool speed that the planner uses. A late arm can use the remaining
+speed to catch up."""
 
 EDGE_MARGIN_M = 0.03
-"""The minimum distance of a contact from a clamped edge, so that the finger does not touch the
-clamp."""
+"""The minimum distance of a contact from a clamped edge. It prevents contact between the finger and
+the clamp."""
 
 MAX_DEPTH_FRACTION = 1.4
-"""The ratio of the finger's depth to the scene's push depth above which the finger has passed
-through the object."""
+"""The ratio of the finger's depth to the scene's maximum push depth above which the finger has
+passed through the object."""
 
 MAX_STEP_S = 0.1
-"""The time without fingertips after which the sheet restarts from rest, since the arms have
-stopped.
-"""
+"""The time without fingertips after which the sheet restarts from rest. The arms have then
+stopped."""
 
 
 KEEP_S = 0.15
-"""The time for which a trajectory continues with constant velocity.  It is sufficient to repeat a
+"""The time for which a trajectory continues with constant velocity. It is long enough to repeat a
 lost packet, which takes 0.1 to 0.15 s."""
 
 MIN_BRAKE_S, MAX_BRAKE_S = 0.1, 0.2
@@ -56,7 +55,7 @@ class PlannedStep:
 
     trajectory: motion after the step if no newer target arrives.
     contact_sheet_m: (x, y) of the contact on the sheet.
-    normal_offset_m: distance of the sheet's surface behind the object's tangent plane.
+    normal_offset_m: distance of the sheet behind the object's tangent plane.
     """
 
     motion: SheetMotion
@@ -72,8 +71,9 @@ class PlannedStep:
 class TrajectorySettings:
     """The limits of the sheet's trajectory.
 
-    contact_on_m, contact_off_m: distances from the sheet at which contact begins and ends.
-    tilt_margin_rad: angle by which the sheet may exceed the scene's tilt.
+    contact_on_m, contact_off_m: distances of the finger from the sheet at which contact begins and
+        ends.
+    tilt_margin_rad: angle by which the sheet may exceed the maximum tilt of the scene.
     max_spin_rad: maximum rotation of the sheet about its normal by rolling.
     """
 
@@ -88,8 +88,8 @@ class TrajectorySettings:
 class SheetTrajectoryPlanner:
     """A planner of the sheet's motion on one virtual object.
 
-    Equal measurements and timestamps result in equal motions, because no clock is used.  Raises
-    UnpresentableError if the front of the object is tilted more than the maximum.
+    No clock is used, so equal measurements and timestamps result in equal motions. Raises
+    UnpresentableError if the tilt of the object's front exceeds the maximum.
     """
 
     def __init__(self, scene: Scene, settings: TrajectorySettings) -> None:
@@ -135,8 +135,9 @@ class SheetTrajectoryPlanner:
     ) -> PlannedStep:
         """Move the sheet for `step_s` towards the contact with a finger.
 
-        position_world, velocity_world: predicted motion (3,) of the finger, m and m/s.
-        measured_world: measured position (3,) m of the finger; None: equal to position_world.
+        position_world, velocity_world: predicted position and velocity (3,) of the finger, m and
+            m/s.
+        measured_world: measured position (3,) of the finger, m; None if equal to position_world.
         """
         finger = apply(self._object_from_world, position_world)
         velocity = self._object_from_world[:3, :3] @ velocity_world
@@ -172,7 +173,8 @@ class SheetTrajectoryPlanner:
     ) -> float:
         """Update the offset behind the tangent plane, and return the rate (m/s) of the offset.
 
-        moved_m, speed_m_per_s: predicted motion of the finger along the object's normal.
+        moved_m, speed_m_per_s: predicted displacement and speed of the finger along the object's
+            normal.
         """
         x, y = self._command.contact.position_sheet_m
         at = (float(x), float(y))
@@ -191,11 +193,14 @@ class SheetTrajectoryPlanner:
 
     @property
     def watchdog_triggers(self) -> int:
-        """Return the number of oscillations of finger and sheet that were stopped."""
+        """Return the number of oscillations of finger and sheet that the watchdog has stopped."""
         return self._offset.watchdog.triggers
 
     def _sag_m(self, sheet: SheetMotion, x_m: float, y_m: float) -> float:
-        """Return the sag (m) of the sheet by its weight at (x_m, y_m), along the sheet's normal."""
+        """Return the sag (m) of the sheet under its own weight, along the sheet's normal.
+
+        x_m, y_m: position on the sheet.
+        """
         distance_m = self._rubber.width_m * sheet.stretch_ratio
         return float(
             compute_sag_m(
@@ -210,13 +215,13 @@ class SheetTrajectoryPlanner:
 
     @property
     def in_contact(self) -> bool:
-        """Return whether the last valid finger was in contact."""
+        """Return whether the last valid finger position was in contact."""
         return self._command.phase in ("contact", "hold")
 
     def hold(self, reason: SheetReason, step_s: float) -> PlannedStep:
         """Decelerate the sheet for `step_s` because the finger's position is unknown.
 
-        reason: reason that is published.
+        reason: reason that is published in the target.
         """
         self._advance(None, step_s)
         phase: Phase = "wait" if self._command.phase == "wait" else "hold"
@@ -238,7 +243,7 @@ class SheetTrajectoryPlanner:
 
     @property
     def motion(self) -> SheetMotion:
-        """Return the sheet's planned pose and motion."""
+        """Return the sheet's planned pose and velocity."""
         return self._state.sheet
 
     def _make_step(self, command: ContactCommand) -> PlannedStep:
@@ -256,7 +261,10 @@ class SheetTrajectoryPlanner:
 
 
 def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajectory | None:
-    """Return the motion of the sheet after a target until rest; None if it cannot stop in time."""
+    """Return the trajectory of the sheet from a target until rest.
+
+    The result is None if the sheet cannot stop in time.
+    """
     brake_s = max(
         MIN_BRAKE_S,
         measure_length(motion.twist_world[:3]) / bounds.acceleration_m_per_s2,
@@ -266,7 +274,10 @@ def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajecto
 
 
 def offset_along_normal(sheet: SheetMotion, offset_m: float, rate_m_per_s: float) -> SheetMotion:
-    """Move a sheet back along its normal by an offset that changes at the given rate."""
+    """Move the sheet backwards along its normal by an offset, and correct its velocity.
+
+    rate_m_per_s: rate at which the offset changes.
+    """
     normal = sheet.world_from_sheet[:3, 2]
     pose, twist = sheet.world_from_sheet.copy(), sheet.twist_world.copy()
     pose[:3, 3] -= offset_m * normal

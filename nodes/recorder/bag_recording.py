@@ -1,6 +1,6 @@
-"""Write messages to bags.
+"""Write messages to recordings (bags).
 
-If the disk fills up, the current bag is closed, and a new one is started when space is free again.
+If the disk is full, the current bag is closed. A new bag is started when space is free again.
 """
 
 from __future__ import annotations
@@ -27,13 +27,14 @@ RETRY_NS = 5_000_000_000
 
 
 class BagRecording:
-    """A recording of messages to bags, while it is requested.
+    """A recorder of messages to bags, which writes while recording is requested.
 
-    A bag is ended when the free disk space falls to `keep_free_bytes`, which leaves space for its
-    index. When twice as much is free again, a new bag starts with the last messages of all latched
-    topics. Disk errors during writing are passed to `on_error`, not raised.
+    A bag is closed when the free disk space falls to `keep_free_bytes`, which leaves space for the
+    bag's index. When twice as much space is free again, a new bag starts with the last messages of
+    all latched topics. Disk errors during writing are passed to `on_error` and not raised.
 
-    note: state of the recording, one line. lost: number of messages lost since the last bag.
+    note: state of the recording in one line. lost: number of messages that were lost since the last
+        bag.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class BagRecording:
         return None if self._bag is None else self._bag.path
 
     def start(self) -> None:
-        """Start a bag whose name contains the current time. Raises BagError or OSError."""
+        """Start a bag whose name contains the current time; raises BagError or OSError."""
         self.requested, self.lost = True, 0
         # The time of day is only used to name the bag.
         now = datetime.now(UTC)
@@ -76,7 +77,10 @@ class BagRecording:
         self.check_disk()
 
     def set_requested(self, requested: bool) -> None:
-        """Start a bag, or end the current bag. Disk errors are passed to `on_error`."""
+        """Start a bag if recording is requested, otherwise end the current bag.
+
+        Disk errors are passed to `on_error`.
+        """
         try:
             if requested and not self.requested:
                 self.start()
@@ -127,7 +131,7 @@ class BagRecording:
             self._end_bag(error)
 
     def write(self, topic: Topic, frames: Any, header: Header) -> bool:
-        """Write a message. Return true if the message is lost because no bag is open.
+        """Write a message, and return True if the message is lost because no bag is open.
 
         The last message of each writer of a latched topic is stored for the next bag. Recording
         commands are not stored.
@@ -147,7 +151,7 @@ class BagRecording:
         return self.requested
 
     def close(self) -> None:
-        """Close the bag. Raises BagError if the bag could not be written completely."""
+        """Close the bag; raise BagError if the bag could not be written completely."""
         if self._bag is not None:
             self._bag.close()
 
@@ -182,7 +186,7 @@ class BagRecording:
 
 
 def free_path(path: Path) -> Path:
-    """Return `path`, or if it exists, a path with the suffix -2, -3, ... that does not exist."""
+    """Return a path that does not exist: `path`, or `path` with a suffix -2, -3, and so on."""
     if not path.exists():
         return path
     for number in count(2):
@@ -195,9 +199,9 @@ def free_path(path: Path) -> Path:
 def open_bag(
     path: Path, recording: Mapping[str, str], *, compress: bool, attach: Iterable[Path]
 ) -> BagWriter:
-    """Open a bag at a free path, and attach files to it. Raises BagError or OSError.
+    """Open a bag at a free path, and attach files to the bag; raises BagError or OSError.
 
-    recording: table of text that identifies the recording. attach: files to store in the bag.
+    recording: texts that identify the recording, by name. attach: files to store in the bag.
     """
     bag = BagWriter(free_path(path), {"recording": recording}, compress=compress)
     try:

@@ -1,4 +1,4 @@
-"""Record topics to a bag, with the schemas that are needed to decode the messages."""
+"""Record topics to a bag, with the schemas that are necessary to decode the messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Recorder(Node):
     """A node that writes the messages it receives to a bag.
 
     An existing bag is never overwritten. If the disk is full, the graph continues without a
-    recording. Lost messages are counted as dropped, and the note of the node contains the reason.
+    recording. Lost messages are counted as dropped, and the node's status note contains the reason.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RECORDER
@@ -59,7 +59,7 @@ class Recorder(Node):
 
     @periodic("watch_hz")
     def watch_disk(self) -> None:
-        """End the bag before the disk is full, and start a new bag when there is space again."""
+        """End the bag before the disk is full, and start a new bag when space is free again."""
         self._recording.check_disk()
         self.note = self._recording.note
 

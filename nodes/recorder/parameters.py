@@ -1,4 +1,4 @@
-"""Declare the parameters of the recorder."""
+"""Define the parameters of the recorder."""
 
 from __future__ import annotations
 

@@ -1,14 +1,14 @@
 """Predict a hand's motion by combining the predictions of a bank of steady-state Kalman filters.
 
 Each filter assumes one motion model: white noise in the acceleration or in the jerk, alone or with
-an oscillator.  The prediction is the weighted sum of the filters' predictions.  The weights
-minimise its mean square error at the prediction horizon.  They are computed from the covariance of
-the filters' errors at that horizon in the last seconds.  Negative weights are allowed, because then
-the sum can represent a motion spectrum that no single model has.
+an oscillator. The prediction is the weighted sum of the filters' predictions. The weights minimise
+the mean square error of this sum at the prediction horizon. They are computed from the covariance
+of the filters' errors at that horizon in the last seconds. Negative weights are allowed, because
+the sum can then represent a motion spectrum that no single model has.
 
 Sources: Bates and Granger, Operational Research Quarterly 20, 1969 (combination by the covariance
-of the errors); Singer, IEEE Trans. Aerospace and Electronic Systems 6, 1970 (decaying
-acceleration); Chu, Fan, Lin, Int. J. Control 77, 2004 (doubling for the Riccati equation).
+    of the errors); Singer, IEEE Trans. Aerospace and Electronic Systems 6, 1970 (decaying
+    acceleration); Chu, Fan, Lin, Int. J. Control 77, 2004 (doubling for the Riccati equation).
 """
 
 from __future__ import annotations
@@ -25,89 +25,95 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.filters import Estimate, Filter, OneEuroTracking, Unfiltered
 
 Model = tuple[float, float, float, float]
-"""The parameters of a motion model: spectral density of the acceleration noise, m^2/s^3, and of the
-jerk noise, m^2/s^5; frequency, Hz, and standard deviation, m, of the oscillator."""
+"""The parameters of a motion model. The first two are the spectral densities of the acceleration
+noise (m^2/s^3) and of the jerk noise (m^2/s^5). The last two are the frequency (Hz) and the
+standard deviation (m) of the oscillator."""
 
 STATES = 5
-"""Number of states of a model per axis: position, velocity and acceleration of the finger without
-the oscillator, then displacement and velocity of the oscillator."""
+"""The number of states of a model per axis. The states are position, velocity and acceleration of
+the finger without the oscillator, and displacement and velocity of the oscillator."""
 
 OBSERVED = np.array([1.0, 0.0, 0.0, 1.0, 0.0])
-"""Observation matrix: its product with a state is the measured position of the finger."""
+"""The observation vector. Its product with a state is the position of the finger."""
 
 ACCELERATION_DECAY_PER_S = 6.0
-"""Exponential decay rate of the acceleration (Singer 1970), since a hand cannot keep an
+"""The exponential decay rate of the acceleration (Singer 1970). A hand cannot maintain an
 acceleration for long."""
 
 MAX_OSCILLATOR_WIDTH_HZ = 2.0
-"""Maximum half-power bandwidth of an oscillator.  It covers the width of a tremor's spectral peak
-and the drift of its frequency.  Slow oscillators, which model voluntary motion around one point,
-have a damping ratio of one half."""
+"""The maximum half-power bandwidth of an oscillator. It covers the width of a tremor's spectral
+peak and the drift of its frequency. Slow oscillators, which model voluntary motion around one
+point, have a damping ratio of one half."""
 
 SCORED_HORIZONS_S = (0.0, 0.05, 0.1)
-"""Horizons for which prediction errors are measured and weights computed.  Each is rounded up to
-whole frames, and the first one is one frame.  Weights for other horizons are interpolated."""
+"""The horizons for which prediction errors are measured and weights are computed. Horizons are
+rounded up to whole frames, and the first horizon is one frame. Weights for other horizons are
+interpolated."""
 
 MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
-"""The age up to which earlier filter states are stored."""
+"""The maximum age of the earlier filter states that are stored to measure prediction errors."""
 
 STAMP_JITTER_NS = 2_000_000
-"""The time by which a state may be younger than the horizon for which its error is measured.  It
-permits jitter of the camera's timestamps."""
+"""The tolerance for jitter of the camera's timestamps, by which a state may be younger than the
+horizon for which its error is measured."""
 
 MEMORY_S, MEMORY_POINTS = 1.0, 60
-"""Time constant for averaging the covariance of the filters' errors, and the minimum number of
-points in that average."""
+"""The time constant and the minimum number of points for averaging the covariance of the filters'
+errors."""
 
 RECENT_S, RECENT_POINTS = 0.2, 10
-OUTDATED_RATIO = 1.5
-OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
-"""The detection of an outdated error covariance, which was estimated during another kind of motion.
+"""The time constant and the minimum number of points for averaging recent mean square errors."""
 
-RECENT: time constant and minimum number of points for averaging recent mean square errors.
-OUTDATED_RATIO: the covariance is outdated if the mean square error of the weighted sum exceeds that
-of the best model by this factor.
-OUTDATED_MEMORY: time constant and minimum number of points for averaging an outdated covariance.
-"""
+OUTDATED_RATIO = 1.5
+"""The error ratio above which the error covariance is outdated.
+
+The covariance was then estimated during another kind of motion. The ratio is the mean square error
+of the weighted sum divided by the mean square error of the best model."""
+
+OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
+"""The time constant and the minimum number of points for averaging the error covariance while it is
+outdated."""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
-"""The initial variance of every filter's prediction errors, and the number of points that have the
-same weight as this initial value.  The unit is m instead of m^2, because errors are divided by the
-square root of their magnitude."""
+"""The weight (in points) and the value of the initial variance of every filter's prediction errors.
+The unit of the variance is m instead of m^2, because errors are divided by the square root of their
+magnitude."""
 
 MIN_ERROR_M = 1e-9
 """A constant that is added to the magnitude of errors to avoid a division by zero."""
 
 SHRINKAGE = 0.02
 """The regularisation of the weights towards equal weights, as a fraction of the mean square
-difference between the predictions.  It is necessary because the covariance of the errors covers
-only a few seconds."""
+difference between the predictions. It is necessary because the covariance of the errors is
+estimated from only a few seconds."""
 
 COMBINE_EVERY_POINTS = 4
-"""Number of points after which the weights are computed again."""
+"""The number of points after which the weights are computed again."""
 
 MIN_GAIN = 0.1
-"""The minimum gain of the filtered position.  The gain is computed from the mean square innovation,
-whose relative error is about 0.1."""
+"""The minimum gain of the filtered position. It is limited because the gain is computed from the
+mean square innovation, whose relative error is about 0.1."""
 
 START_POINTS = 32
-"""Number of points at the start of a track for which the gains are those of a Kalman filter with
-a large initial covariance.  Later points use the steady-state gains."""
+"""The number of points at the start of a track for which a Kalman filter with a large initial
+covariance determines the gains. Later points use the steady-state gains."""
 
 INITIAL_SPEED_M_PER_S, INITIAL_ACCELERATION = 0.1, 1.0
-"""Standard deviations of speed and acceleration (m/s^2) at the start of a track."""
+"""The standard deviations of speed (m/s) and acceleration (m/s^2) at the start of a track."""
 
 MIN_INTERVAL_S, MAX_INTERVAL_S = 0.004, 0.15
+"""The range of frame intervals for which gains are computed."""
+
 INTERVAL_RATIO, NOISE_RATIO = 1.08, 1.5
-"""The logarithmic grid on which gains are computed and cached: the range of the frame interval, the
-ratio between adjacent intervals, and the ratio between adjacent noise variances."""
+"""The ratios between adjacent frame intervals and between adjacent noise variances for which gains
+are computed and cached."""
 
 TIME_STEP_S = 1e-5
-"""The resolution of the times for which transitions are cached.  In this time, a finger at 0.1 m/s
-moves by 1 um."""
+"""The time resolution of cached state transitions. In this time, a finger at 0.1 m/s moves by 1
+um."""
 
 MAX_CORRELATION = 0.3
-"""Correlation of the measurement noise between axes above which the axes are rotated."""
+"""The correlation of the measurement noise between two axes above which the axes are rotated."""
 
 
 NO_OSCILLATOR = (10.0, 0.0)
@@ -122,7 +128,7 @@ MODELS: tuple[Model, ...] = (
     *((0.0, 1e1, frequency_hz, 1e-4) for frequency_hz in (6.0, 9.0)),
 )
 """The motion models: slow and fast motion, voluntary motion around one point, tremor, and tremor
-during fast motion.  Weighted sums of these models cover the motion spectra between them."""
+during fast motion. Weighted sums of these models approximate the motion spectra between them."""
 
 ACCELERATION_NOISE, JERK_NOISE, FREQUENCY_HZ, DEVIATION_M = np.array(MODELS).T
 FREQUENCY_RAD_PER_S = 2.0 * np.pi * FREQUENCY_HZ
@@ -131,7 +137,7 @@ FREQUENCY_RAD_PER_S = 2.0 * np.pi * FREQUENCY_HZ
 def _integrate_slow(dt: float) -> Floats:
     """Return the matrix (3, 3) that advances position, velocity and acceleration by dt (s).
 
-    The acceleration decays with the rate ACCELERATION_DECAY_PER_S.
+    The acceleration decays at the rate ACCELERATION_DECAY_PER_S.
     """
     rate = ACCELERATION_DECAY_PER_S
     remaining, gone = math.exp(-rate * dt), -math.expm1(-rate * dt)
@@ -143,7 +149,7 @@ def _integrate_slow(dt: float) -> Floats:
 
 
 def compute_transition(dt: float) -> Floats:
-    """Compute the matrix (models, 5, 5) that advances the state of each model by dt (s)."""
+    """Compute the matrices (models, 5, 5) that advance the state of each model by dt (s)."""
     natural = FREQUENCY_RAD_PER_S
     decay = np.minimum(np.pi * MAX_OSCILLATOR_WIDTH_HZ, 0.5 * natural)
     swing = np.sqrt(natural**2 - decay**2)
@@ -160,7 +166,7 @@ def compute_transition(dt: float) -> Floats:
 
 
 def compute_process_noise(dt: float) -> Floats:
-    """Compute the covariance (models, 5, 5) that the process noise of dt (s) adds to each state."""
+    """Compute the covariances (models, 5, 5) that process noise adds to the states in dt (s)."""
     acceleration, jerk = np.zeros((3, 3)), np.zeros((3, 3))
     for node, weight in zip(*np.polynomial.legendre.leggauss(4), strict=True):
         slow = _integrate_slow(0.5 * dt * (1.0 + node))
@@ -177,7 +183,7 @@ def compute_process_noise(dt: float) -> Floats:
 
 
 def _stationary_oscillators() -> Floats:
-    """Return the stationary covariance (models, 2, 2) of the oscillators."""
+    """Return the stationary covariances (models, 2, 2) of the oscillators."""
     result = np.zeros((len(DEVIATION_M), 2, 2))
     result[:, 0, 0] = DEVIATION_M**2
     result[:, 1, 1] = (DEVIATION_M * FREQUENCY_RAD_PER_S) ** 2
@@ -185,11 +191,11 @@ def _stationary_oscillators() -> Floats:
 
 
 def solve_riccati(transition: Floats, process_noise: Floats, variance: float) -> Floats:
-    """Return the steady-state error covariance (models, 5, 5) just before each measurement.
+    """Return the steady-state error covariances (models, 5, 5) just before each measurement.
 
     variance: variance of the measurement noise, m^2.
-    Solves the Riccati equation by the doubling algorithm (Chu et al. 2004): each iteration doubles
-    the number of frames.
+    The Riccati equation is solved by the doubling algorithm (Chu et al. 2004), in which each
+    iteration doubles the number of frames.
     """
     rows, identity = transition.transpose(0, 2, 1), np.eye(STATES)
     information = np.broadcast_to(np.outer(OBSERVED, OBSERVED) / variance, rows.shape)
@@ -208,7 +214,7 @@ def _solve_gains(interval: int, noise: int) -> Floats:
     """Return the Kalman gains (START_POINTS, models, 5) of one axis for the points of a track.
 
     interval, noise: indices on the grid of frame intervals and noise variances.
-    The gains are those for the points 2 to START_POINTS, followed by the steady-state gain.
+    The first gains apply to the points 2 to START_POINTS. The last gain is the steady-state gain.
     """
     dt, variance = INTERVAL_RATIO**interval, NOISE_RATIO**noise
     transition, process_noise = compute_transition(dt), compute_process_noise(dt)
@@ -225,7 +231,7 @@ def _solve_gains(interval: int, noise: int) -> Floats:
 
 
 def _compute_gain(covariance: Floats, variance: float) -> Floats:
-    """Return the Kalman gain (models, 5) from the predicted covariance (models, 5, 5).
+    """Return the Kalman gains (models, 5) for predicted covariances (models, 5, 5).
 
     variance: variance of the measurement noise, m^2.
     """
@@ -245,8 +251,8 @@ def find_gains(dt: float, variances: list[float], points: int) -> Floats:
     variances: variance of the measurement noise on each of the three axes, m^2.
     points: number of points in the track, at least two.
 
-    The first call for an interval or a variance solves its Riccati equations, which takes some
-    milliseconds.  Later calls with similar values take microseconds.
+    The first call for an interval or a variance solves the Riccati equations, which takes some
+    milliseconds. Later calls with similar values take microseconds.
     """
     interval = round(
         math.log(min(max(dt, MIN_INTERVAL_S), MAX_INTERVAL_S)) / math.log(INTERVAL_RATIO)
@@ -262,18 +268,19 @@ def _find_transition(steps: int) -> Floats:
 
 @lru_cache(maxsize=512)
 def _find_observation(steps: int) -> Floats:
-    """Return the rows (models, 1, 5) that predict the position from a state, `steps` steps ahead.
+    """Return the row vectors (models, 1, 5) that predict the position from a state.
 
-    A step is TIME_STEP_S.
+    steps: prediction horizon in steps of TIME_STEP_S.
     """
     return (OBSERVED @ _find_transition(steps))[:, None, :]
 
 
 @lru_cache(maxsize=64)
 def _find_rows(horizons: bytes) -> Floats:
-    """Return the rows (n, models * 5) that predict positions at n horizons from weighted states.
+    """Return the matrix (n, models * 5) that predicts positions at n horizons from weighted states.
 
-    horizons: bytes of a float64 array (n,) s, because keys of the cache must be hashable.
+    horizons: bytes of a float64 array (n,) of horizons, s. Bytes are hashable, which the cache
+        requires.
     """
     rows = [OBSERVED @ compute_transition(float(time)) for time in np.frombuffer(horizons)]
     return np.array(rows).reshape(len(rows), -1)
@@ -283,10 +290,11 @@ def _find_rows(horizons: bytes) -> Floats:
 def _find_factors(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
     """Return factors (scored horizons + 1, n, 1) that interpolate predictions to n horizons.
 
-    horizons: bytes of a float64 array (n,) s, because keys of the cache must be hashable.
+    horizons: bytes of a float64 array (n,) of horizons, s. Bytes are hashable, which the cache
+        requires.
     ages_ms: age, ms, for which the weights of each scored horizon were computed.
 
-    The last factor applies to the correction by the filtered position.  It decreases from one at
+    The last factor applies to the correction by the filtered position. It decreases from one at the
     horizon zero to zero at the first age.
     """
     times_ms = 1e3 * np.frombuffer(horizons)
@@ -298,11 +306,12 @@ def _find_factors(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
 
 
 def combine(covariance: Floats) -> Floats:
-    """Return the weights (..., models), with sum 1, that minimise the mean square combined error.
+    """Return the weights (..., models) that minimise the mean square error of the weighted sum.
 
-    covariance: (..., models, models), covariance of the models' prediction errors, in any unit.
-        The errors include measurement noise.  It does not change the result, because it is the same
-        for all models.
+    covariance: covariance (..., models, models) of the models' prediction errors, in any unit.
+        Measurement noise in the errors does not change the result, because it is the same for all
+        models.
+    The sum of the weights is 1.
     """
     count = covariance.shape[-1]
     own = covariance.trace(axis1=-2, axis2=-1) / count
@@ -316,22 +325,23 @@ def combine(covariance: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class BankEstimate(Estimate):
-    """The estimate of the filter bank: states (models, 5, 3) at one time, and adapted weights.
+    """An estimate of the filter bank: states (models, 5, 3) at one time, and adapted weights.
 
-    covariance: (3, 3) m^2, noise of the newest measured point in the world frame.
-    axes: (3, 3), columns are the axes of the states, in the world frame.  The measurement noise is
+    covariance: noise covariance (3, 3), m^2, of the newest measured point in the world frame.
+    axes: axes of the states as columns (3, 3) in the world frame. The measurement noise is
         uncorrelated along these axes.
-    points: number of points since the track began.
+    points: number of points since the start of the track.
     past_ns, past: earlier times and states, oldest first, for the longest scored horizon.
-    error_covariance: (scored horizons, 3, models, models) m, covariance of the models' prediction
-        errors by axis.  Each error was divided by the square root of the errors' size at its time.
-    weights: (scored horizons, 3, models), with sum 1 over the models.
-    recent: (scored horizons, 3, models + 1) m^2, recent mean square errors of each model, then of
-        the combination.
+    error_covariance: covariance (scored horizons, 3, models, models), m, of the models' prediction
+        errors by axis. Every error was divided by the square root of the errors' magnitude at its
+        time.
+    weights: weights (scored horizons, 3, models), whose sum over the models is 1.
+    recent: recent mean square errors (scored horizons, 3, models + 1), m^2, of each model and of
+        the weighted sum.
     scored_ages_ms: ages of the states whose predictions were compared with the newest point.
-    innovation: (3,) m^2, mean square of the combined innovation.
+    innovation: mean square (3,), m^2, of the combined innovation.
     position, variance: filtered position (3,) m along the axes, and its error variance (3,) m^2.
-    velocity_variance: (3,) m^2/s^2, error variance of the velocity along the axes.
+    velocity_variance: error variance (3,), m^2/s^2, of the velocity along the axes.
     """
 
     axes: Floats
@@ -467,7 +477,7 @@ def _forget(dt: float, memory_s: float, memory_points: int) -> float:
 
 
 def predict_by_model(estimate: BankEstimate, horizons_s: Floats) -> Floats:
-    """Return the positions (n, models, 3) that each model predicts at horizons (n,) s."""
+    """Return the positions (n, models, 3), m, that each model predicts at horizons (n,), s."""
     rows = _find_rows(horizons_s.tobytes())
     by_model = np.einsum("nms,msa->nma", rows.reshape(-1, len(MODELS), STATES), estimate.state)
     return np.asarray(by_model @ estimate.axes.T)
@@ -484,12 +494,12 @@ def _prediction_errors(
 
     times_ns, states: times and earlier states, oldest first.
     at_ns, point: time and position (3,) m of the new point, along the axes of the states.
-    innovations: (models, 3) m, errors of the predictions from the newest state.
+    innovations: errors (models, 3), m, of the predictions from the newest state.
 
-    The first result contains the errors (scored horizons, 3, models) m. At the first horizon they
-    are the innovations. At every other horizon they are the errors of the newest state that is at
-    least as old as the horizon, or of the oldest state. The second result contains the ages (ms) of
-    the states that were used.
+    The first result contains the errors (scored horizons, 3, models), m. For the first horizon,
+    they are the innovations. For every other horizon, they are the errors of the newest state that
+    is at least as old as the horizon, or of the oldest state. The second result contains the ages
+    (ms) of the states that were used.
     """
     errors = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS)))
     errors[0] = innovations.T
@@ -507,8 +517,8 @@ def _prediction_errors(
 def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Floats]:
     """Rotate the axes of an estimate if the noise of a new point is correlated between the axes.
 
-    covariance: (3, 3) m^2, noise of the new point.
-    Returns the estimate and the noise variances (3,) m^2 along its axes.
+    covariance: noise covariance (3, 3), m^2, of the new point.
+    Returns the estimate and the noise variances (3,), m^2, along its axes.
     """
     noise = estimate.axes.T @ covariance @ estimate.axes
     variances = np.diagonal(noise)
@@ -541,5 +551,5 @@ TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
     "one_euro": OneEuroTracking,
     "adaptive": AdaptiveBank,
 }
-"""The functions that make the filter of each tracking method from the finger's maximum speed (m/s).
-"""
+"""The functions that create the filter of each tracking method. Their argument is the maximum speed
+of the finger (m/s)."""

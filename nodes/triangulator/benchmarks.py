@@ -1,4 +1,4 @@
-"""Benchmark the marker methods: their time per image and their error over many images."""
+"""Benchmark the methods that refine markers by their computing time and their error."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RAYS = 5
 BLUR_PX = 0.7
 GROUND_LEVEL, MARKER_LEVEL = 70.0, 215.0
 GROUND_REACH_PX = 10.0
-"""The distance from the marker's centre up to which the background has a gradient."""
+"""The distance from the marker's centre up to which the background has a brightness gradient."""
 
 MARKER_CASES = (
     *((radius_px, noise, 0.0, 0.0) for radius_px in (1.6, 3.2, 6.0) for noise in (1.0, 2.0, 4.0)),
@@ -31,9 +31,9 @@ MARKER_CASES = (
     *((radius_px, 1.0, 0.0, 3.0) for radius_px in (1.6, 3.2, 6.0)),
 )
 """The benchmarked cases: radius (px), noise (multiple of the sensor's noise), motion during the
-exposure (px) and background gradient (levels per px).  A marker with a radius of 3 mm has 3.2 px at
-half a metre, 6 px at 0.27 m and 1.6 px at 1 m.  At 1 m/s it moves by 4 px in 4 ms.  A finger that
-is lit from the side has a gradient of 2 or 3 levels per px."""
+exposure (px) and background gradient (levels per px). A radius of 3 mm corresponds to 3.2 px at
+half a metre, 6 px at 0.27 m and 1.6 px at 1 m. A speed of 1 m/s corresponds to a motion of 4 px in
+4 ms. A finger that is lit from the side has a gradient of 2 or 3 levels per px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class DrawnDisc:
 
 
 def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Image:
-    """Add a sensor's photon and read noise to an image, and round it to whole grey levels."""
+    """Add a sensor's photon noise and read noise to an image, and round it to whole grey levels."""
     deviation = np.sqrt(noise.read_levels**2 + levels / noise.photons_per_level)
     seen = levels + deviation * random.standard_normal(levels.shape)
     return np.asarray(np.clip(np.rint(seen), 0, 255), dtype=np.uint8)
@@ -78,8 +78,8 @@ def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Ima
 def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
     """Return the Cramer-Rao bound on the standard deviation (px per axis) of a disc's centre.
 
-    All parameters of the disc are unknown.  The derivatives are central differences.  The rounding
-    of grey levels and the dependence of the noise on the parameters are neglected.
+    All parameters of the disc are treated as unknown. The derivatives are central differences. The
+    rounding of grey levels and the dependence of the noise on the parameters are neglected.
     """
     levels = disc.levels()
     weights = 1.0 / (noise.read_levels**2 + levels / noise.photons_per_level)
@@ -106,7 +106,7 @@ def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
 def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
     """Return cases (see `MARKER_CASES`) for a marker at the centre of the scene's screen.
 
-    The marker is at rest or moves at the speed of the scene's working range.
+    The marker is at rest, or moves at the maximum speed for which the scene is specified.
     """
     left_from_world = StereoGeometry.of(scene.camera).left_from_world
     px_per_m = scene.camera.left.fx_px / float(rigid.apply(left_from_world, np.zeros(3))[2])
@@ -121,8 +121,8 @@ def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
 def _marker_trials(scene: Scene) -> Iterator[Trial]:
     """Yield trials with discs at random subpixel positions that move in random directions.
 
-    The noise of the images is a multiple of the scene's sensor noise, but the fit always assumes
-    the scene's sensor noise.
+    The noise of the images is a multiple of the scene's sensor noise. The fit always assumes the
+    scene's sensor noise.
     """
     scene_cases = _scene_cases(scene)
     sensor = PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level)
@@ -179,7 +179,7 @@ def _marker_trial(
     def error_px(_: list[Marker]) -> Interval:
         """Return the root mean square error (px) per axis.
 
-        If not exactly one marker is found in an image, its error is the size of the image.
+        The error in an image is the image size if no marker or several markers are found.
         """
         found = [markers_in(image) for image in images]
         off = [
@@ -202,7 +202,7 @@ def _marker_trial(
 def _marker_tolerance_px(scene: Scene) -> float:
     """Return the standard deviation (px) of a marker's centre that the scene permits.
 
-    This deviation causes an error of scene.tolerances.fingertip_m at the centre of the screen.
+    At the centre of the screen, this deviation causes an error of scene.tolerances.fingertip_m.
     """
     geometry = StereoGeometry.of(scene.camera)
     left, right = geometry.project(np.zeros(3))

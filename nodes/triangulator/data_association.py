@@ -1,11 +1,11 @@
 """Associate the markers of each image pair with the finger and with clutter.
 
-Clutter is every marker-like spot that is not the finger's marker.  A marker outside the finger's
-gate (the region in which the finger is expected) is clutter.  Clutter is tracked separately, so
-that it is not confused with the finger while the finger is hidden, or after both were merged in the
-images.  The most likely assignment of markers to tracks, by position and brightness, is found as
+Clutter is every marker-like spot that is not the finger's marker. A marker outside the finger's
+gate (the region in which the finger is expected) is clutter. Clutter is tracked separately. It is
+therefore not confused with a finger that was hidden, or that was merged with clutter in the images.
+The most likely assignment of markers to tracks depends on position and brightness. It is found as
 the global nearest neighbour (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
-and Navigation).  If another assignment is about as likely, no fingertip is reported.
+and Navigation). If another assignment is about as likely, no fingertip is reported.
 """
 
 from __future__ import annotations
@@ -26,83 +26,102 @@ from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 TrackStatus = Literal["tentative", "ambiguous", "clutter"]
 """The status of a track that is not the finger's track.
 
-tentative: the marker may be the finger and may start its track.
+tentative: the marker may be the finger, and may start the finger's track.
 ambiguous: the marker may be the finger or clutter, and must not start the finger's track yet.
-clutter: the marker is not the finger.
-"""
+clutter: the marker is not the finger."""
 
 POSITION_SIGMA_M = 0.0005
+"""The constant part of the scale (per axis) of a marker's deviation from motion at constant
+velocity."""
+
 ACCELERATION_SIGMA_M_PER_S2 = 1.0
+"""The acceleration that determines how a marker's deviation from motion at constant velocity
+increases with time."""
+
 STUDENT_T_DOF = 2.0
-"""The scale per axis of a marker's deviation from motion at constant velocity: a constant part, and
-a part by acceleration.  Deviations have Student's t distribution with STUDENT_T_DOF degrees of
-freedom."""
+"""The degrees of freedom of Student's t distribution, by which a marker's deviation from motion at
+constant velocity is modelled."""
 
 MERGE_DISTANCE_M = 0.002
-"""The distance below which two detected markers are considered as the same marker."""
+"""The distance below which two detected markers are treated as the same marker."""
 
 MAX_POSITION_SIGMA_M = 0.1
-"""Upper bound of the predicted position error."""
+"""The upper bound of the predicted position error of a track."""
 
 MIN_APPEARANCE_SIGMA = np.array([0.01, 0.02])
+"""The minimum relative standard deviations of the grey levels of one marker and of its
+surroundings, from image to image."""
+
 INITIAL_APPEARANCE_SIGMA = np.array([0.04, 0.08])
+"""The initial relative standard deviations of the grey levels of a new track's marker and of its
+surroundings."""
+
 POPULATION_APPEARANCE_SIGMA = np.array([0.2, 0.4])
-"""Relative standard deviations of the grey levels of a marker and of its surroundings.  MIN: of one
-marker from image to image.  INITIAL: value of a new track.  POPULATION: between different markers.
-"""
+"""The relative standard deviations of the grey levels between different markers, and between their
+surroundings."""
 
 APPEARANCE_TIME_CONSTANT_S = 0.2
+"""The time constant for averaging the appearance (grey levels) of a marker."""
+
 APPEARANCE_VARIANCE_TIME_CONSTANT_S = 3.0
-"""Time constants of a marker's mean appearance, and of its squared deviations from that mean."""
+"""The time constant for averaging the squared deviations of a marker's appearance from its mean."""
 
 NEW_TRACK_COST = 6.0 * math.log(MAX_POSITION_SIGMA_M) + 2.0 * float(
     np.log(POPULATION_APPEARANCE_SIGMA).sum()
 )
+"""The cost of assigning a marker to a new track (see `_association_cost`)."""
+
 INFEASIBLE_COST = 1e9
-"""The costs of assigning a marker to a new track (see `_association_cost`), and to a track to which
-the marker cannot belong."""
+"""The cost of assigning a marker to a track to which the marker cannot belong."""
 
 AMBIGUITY_MARGIN = 9.0
-"""The cost difference below which two assignments are ambiguous: the square of three standard
+"""The cost difference below which two assignments are ambiguous. It is the square of three standard
 deviations."""
 
 MAX_APPEARANCE_DIST_SQ = 16.0
-"""The maximum squared appearance distance of the same marker, in squared standard deviations."""
+"""The maximum squared appearance distance at which two detections may show the same marker, in
+squared standard deviations."""
 
 VELOCITY_TIME_CONSTANT_S = 0.05
-"""Time constant of the low-pass filter for a clutter track's velocity."""
+"""The time constant of the low-pass filter for a clutter track's velocity."""
 
 CLUTTER_SEARCH_PERIOD_S = 0.1
-"""Period of the search of the full images while the finger is tracked."""
+"""The period of the search of the full images while the finger is tracked."""
 
 LATE_GATE_M = 0.03
-"""The maximum distance between the finger's newest position and its marker in an image pair that
-arrives late."""
+"""The maximum distance between the finger's newest position and its marker in a late image pair."""
 
 STATIONARY_RADIUS_M = 3e-4
+"""The radius within which a stationary marker stays. A finger always moves more."""
+
 STATIONARY_TIME_S = 1.5
-"""The radius and the time that define a stationary marker, which stays within the radius for this
-time.  A finger always moves more."""
+"""The time after which a marker that stays within STATIONARY_RADIUS_M is stationary."""
 
 TRACK_TIMEOUT_S = 1.0
+"""The time without detections after which the track of a moving marker is deleted."""
+
 STATIONARY_TRACK_TIMEOUT_S = 10.0
-"""Time without detections after which a moving or a stationary track is deleted."""
+"""The time without detections after which the track of a stationary marker is deleted."""
 
 MIN_HITS = 3
 TENTATIVE_TRACK_TIMEOUT_S = 0.1
-"""Timeout of a tentative track with fewer than MIN_HITS detections."""
+"""The timeout of a tentative track with fewer than MIN_HITS detections."""
 
 SOLE_CANDIDATE_TIME_S = 1.0
-"""The time after which the only visible marker is assigned to the finger, even if it is ambiguous.
-"""
+"""The time after which the only visible marker is assigned to the finger, even if it is
+ambiguous."""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""The time since the last detection of the finger after which moving clutter may be the finger."""
+"""The time for which the finger must be lost before moving clutter may be selected as the
+finger."""
 
 
 @dataclass(slots=True)
 class Track:
-    """A track of a marker: position (3,) m, velocity (3,) m/s, appearance (2,) and its variance."""
+    """A track of a marker: position (3,) m, velocity (3,) m/s, and appearance (2,) with variance.
+
+    The appearance is the logarithm of the grey levels of the marker and of its surroundings.
+    """
 
     point: Floats
     velocity: Floats
@@ -111,7 +130,10 @@ class Track:
     at_ns: int
 
     def predict(self, at_ns: int) -> tuple[Floats, float]:
-        """Predict the marker's position (3,) m at `at_ns`, and its error scale (m) per axis."""
+        """Predict the marker's position (3,), m, at the time `at_ns`.
+
+        The second result is the scale (m) of the prediction error per axis.
+        """
         since_s = (at_ns - self.at_ns) * 1e-9
         sigma_m = POSITION_SIGMA_M + 0.5 * ACCELERATION_SIGMA_M_PER_S2 * since_s**2
         return self.point + since_s * self.velocity, min(sigma_m, MAX_POSITION_SIGMA_M)
@@ -121,7 +143,7 @@ class Track:
         return float((np.square(appearance - self.appearance) / self.appearance_variance).sum())
 
     def update_appearance(self, appearance: Floats, at_ns: int) -> None:
-        """Update the exponential averages of mean and variance with a new appearance (2,)."""
+        """Update the mean and the variance of the track's appearance with a new appearance (2,)."""
         since_s, residual = (at_ns - self.at_ns) * 1e-9, appearance - self.appearance
         self.appearance = (
             self.appearance - math.expm1(-since_s / APPEARANCE_TIME_CONSTANT_S) * residual
@@ -137,8 +159,8 @@ class Track:
 class ClutterTrack(Track):
     """A track of a marker that is not known to be the finger.
 
-    stationary_point, stationary_since_ns: centre (3,) m of the ball with radius STATIONARY_RADIUS_M
-        that contains the marker, and the time since which the marker has been in the ball.
+    stationary_point, stationary_since_ns: centre (3,) m of a ball with radius STATIONARY_RADIUS_M,
+        and the time since which the marker has been in this ball.
     sole_since_ns: time since which no other marker has been visible.
     hits: number of detections.
     """
@@ -174,7 +196,7 @@ class ClutterTrack(Track):
         return Track.predict(self, at_ns)
 
     def update(self, marker: Candidate, at_ns: int, *, is_sole: bool) -> None:
-        """Update the track with a detection.
+        """Update the track with a detected marker.
 
         is_sole: whether the image pair contains no other marker.
         """
@@ -190,7 +212,7 @@ class ClutterTrack(Track):
             self.sole_since_ns = at_ns
 
     def is_alive(self, at_ns: int) -> bool:
-        """Return whether the track still exists at `at_ns`.
+        """Return whether the track still exists at the time `at_ns`.
 
         A track ends if its last detection is too old. It also ends if its last detection is in the
         future, because the clock was then set back.
@@ -217,7 +239,7 @@ class DataAssociation:
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
         """Select the finger's marker among the detections of an image pair, and update the tracker.
 
-        Return "ok" or the reason why no finger was found, and the triangulated marker.
+        Returns "ok" or the reason why no finger was found, and the triangulated marker.
         """
         if tracker.is_late(at_ns):
             return self._associate_late(at_ns, detection, tracker)
@@ -235,10 +257,11 @@ class DataAssociation:
     def _associate_late(
         self, at_ns: int, detection: StereoDetection, tracker: Tracker
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-        """Select the finger in an image pair that is older than the newest one.
+        """Select the finger in an image pair that is older than the newest image pair.
 
-        The selection uses only the distance from the finger, since past clutter is not stored.
-        Several consecutive late pairs restart the track, because the clock was then set back.
+        The selection uses only the distance from the finger, because past clutter is not stored.
+        After several consecutive late pairs the track restarts, because the clock was then set
+        back.
         """
         markers = detection.markers
         if len(markers) > 1 and self._finger is not None:
@@ -256,7 +279,7 @@ class DataAssociation:
         return result, marker.measured
 
     def is_clutter_search_due(self, at_ns: int) -> bool:
-        """Return whether the full images must be searched for clutter at `at_ns`."""
+        """Return whether the full images must be searched for clutter at the time `at_ns`."""
         return not 0 <= at_ns - self._clutter_searched_ns < 1e9 * CLUTTER_SEARCH_PERIOD_S
 
     def track_clutter(self, at_ns: int, detection: StereoDetection) -> None:
@@ -325,7 +348,7 @@ class DataAssociation:
         return "no_marker" if is_all_clutter else "two_markers"
 
     def _select_candidate(self, at_ns: int) -> ClutterTrack | None:
-        """Return the track that is most likely the lost finger, or None if this is uncertain."""
+        """Return the track that is most likely the lost finger, or None if no track is certain."""
         finger = self._finger
         absence_s = math.inf if finger is None else (at_ns - finger.at_ns) * 1e-9
         candidates: list[tuple[float, ClutterTrack]] = []
@@ -362,8 +385,8 @@ class DataAssociation:
     ) -> list[ClutterTrack | None]:
         """Assign the markers of an image pair to tracks, and update or create the clutter tracks.
 
-        finger: track of the finger, or None if the finger is not tracked.
-        Return the clutter track of each marker, or None for the finger's marker.
+        finger: track of the finger; None if the finger is not tracked.
+        Returns the clutter track of each marker, or None for the finger's marker.
         """
         self.clutter_tracks = [track for track in self.clutter_tracks if track.is_alive(at_ns)]
         if not markers:
@@ -403,8 +426,8 @@ class DataAssociation:
 def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
     """Return the cost of assigning a marker to a track.
 
-    The cost is twice the negative log likelihood of the marker's position and appearance, up to a
-    constant.
+    The cost is twice the negative log likelihood of the marker's position and appearance, except
+    for a constant.
     """
     if one.at_ns == at_ns:  # The track was already updated by this image pair.
         return INFEASIBLE_COST
@@ -420,9 +443,10 @@ def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
 def assign_columns(costs: Floats) -> list[int]:
     """Assign a different column to each row so that the sum of the costs is minimal.
 
-    costs: (n, m), with n <= m.
-    The method is that of shortest augmenting paths (Jonker and Volgenant, 1987). The import of the
-    equivalent function of SciPy would delay the start of the node by a third of a second.
+    costs: cost matrix (n, m) with n <= m.
+    Returns the column of each row. The algorithm finds shortest augmenting paths (Jonker and
+    Volgenant, 1987). The equivalent function of SciPy is not used, because its import would delay
+    the start of the node by a third of a second.
     """
     nearest: list[int] = costs.argmin(axis=1).tolist()
     if len(set(nearest)) == len(nearest):
@@ -454,7 +478,7 @@ def assign_columns(costs: Floats) -> list[int]:
 
 
 def _ambiguous_rows(costs: Floats, columns: Sequence[int], finger: int) -> set[int]:
-    """Return the rows of the markers that may be the finger or clutter.
+    """Return the rows of the markers that may be either the finger or clutter.
 
     costs: cost of assigning each marker (row) to each track (column).
     columns: column of the track that is assigned to each marker.

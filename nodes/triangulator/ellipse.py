@@ -1,18 +1,19 @@
 """Render the image of a blurred ellipse, such as a flat round marker that is seen at an angle.
 
-The ellipse is uniformly bright and blurred by a Gaussian with standard deviation `blur`.  The light
-S at a pixel p (0 to 1) is the integral of the Gaussian over the ellipse's area.  Green's theorem
+The ellipse is uniformly bright and blurred by a Gaussian with standard deviation `blur`. The light
+S at a pixel p (0 to 1) is the integral of the Gaussian over the ellipse's area. Green's theorem
 converts it to an integral along the edge, whose points are q with outward normals n:
 
     S(p) = closed integral of (q - p) . n (1 - exp(-|q - p|^2 / 2 blur^2)) / (2 pi |q - p|^2).
 
-Its derivatives are integrals of the Gaussian along the edge.  They are computed as sums over
+Its derivatives are integrals of the Gaussian along the edge. They are computed as sums over
 equidistant angles t, which converge exponentially, because the integrand is smooth and periodic.
-The result is exact for any ratio of blur and axes.  The faster model of the module `subpixel`, a
-function of the distance from the edge, requires a blur that is small relative to the radius.
+The result is exact for any ratio of blur and axes. The module `subpixel` uses a faster model, a
+function of the distance from the edge. That model requires a blur that is small relative to the
+radius.
 
-The edge is q = centre + A (cos t, sin t), A = [[r + e, f], [f, r - e]].  The semi-axes are r plus
-and minus the length of the elongation (e, f).
+The edge is q = centre + A (cos t, sin t) with A = [[r + e, f], [f, r - e]]. The semi-axes are r
+plus and minus the length of the elongation vector (e, f).
 """
 
 from __future__ import annotations
@@ -25,19 +26,19 @@ from flexsheet.nodes.arrays import Floats
 
 NODE_SPACING = 1.4
 """The maximum distance between integration nodes on the edge, in standard deviations of the blur.
-The error of the computed light is then below 0.001."""
+With this distance, the error of the computed light is below 0.001."""
 
 MIN_NODES, MAX_NODES = 12, 64
-"""The bounds on the number of integration nodes.  The maximum is sufficient for a sharp marker with
+"""The bounds on the number of integration nodes. The maximum is sufficient for a sharp marker with
 a radius of 11 px, and limits the computing time for a large bright spot."""
 
 
 def integrate_ellipse(shapes: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Return the light (n, m) of n ellipses at m pixels, and its derivatives (n, 6, m).
 
-    shapes: (n, 6) px: centre (x, y), mean semi-axis, blur, elongation (e, f).  The derivatives are
-        with respect to these parameters.
-    x, y: (m,) px, coordinates of the pixels.
+    shapes: parameters (n, 6), px: centre (x, y), mean semi-axis, blur, elongation (e, f). The
+        derivatives are with respect to these parameters.
+    x, y: coordinates (m,) of the pixels, px.
     """
     radius, blur, elongation = shapes[:, 2], shapes[:, 3], shapes[:, 4:]
     longest = float((radius + np.hypot(*elongation.T)).max())

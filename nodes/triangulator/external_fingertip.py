@@ -1,4 +1,4 @@
-"""Track fingertip positions that an external program measures."""
+"""Track the fingertip from positions that an external program measures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from flexsheet.nodes.triangulator.tracking import (
 
 
 class ExternalFingertip:
-    """A tracker of fingertip positions that an external program measures.
+    """A tracker for fingertip positions that an external program measures.
 
     noise_m: standard deviation of the positions per axis.
     """
@@ -38,7 +38,7 @@ class ExternalFingertip:
         self._horizons_s = make_horizons_s(limits.prediction_horizon_s)
 
     def update(self, at_ns: int, measured_m: Floats) -> Fingertip:
-        """Add a measured position (3,), world frame, m, and return the tracked fingertip."""
+        """Add a measured position (3,), m, in the world frame, and return the tracked fingertip."""
         low, high = self._volume
         reason: FingertipReason = "outside_volume"
         if ((measured_m >= low) & (measured_m <= high)).all():

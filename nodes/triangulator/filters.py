@@ -16,7 +16,7 @@ from flexsheet.nodes.models.one_euro import OneEuro
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The state of a filter at the time `at_ns`, and its covariance.
+    """The state of a filter at the time `at_ns`, with its covariance.
 
     The tracking method determines the shapes of both arrays.
     """
@@ -30,24 +30,24 @@ class Filter(Protocol):
     """The interface that every tracking method implements.  Estimates are immutable."""
 
     def initialize(self, at_ns: int, measured: Floats, covariance: Floats) -> Estimate:
-        """Make the first estimate from a measured point (3,) m with a covariance (3, 3) m^2."""
+        """Make the first estimate from a measured point (3,), m, with a covariance (3, 3), m^2."""
         ...
 
     def update(
         self, before: Estimate, at_ns: int, measured: Floats, covariance: Floats
     ) -> Estimate:
-        """Return the estimate `before` after an update with a later measured point (3,) m.
+        """Return a new estimate from the estimate `before` and a later measured point (3,), m.
 
-        covariance: (3, 3) m^2 of the measured point.
+        covariance: noise covariance (3, 3), m^2, of the measured point.
         """
         ...
 
     def moments(self, estimate: Estimate) -> tuple[Floats, Floats, Floats]:
-        """Return position (3,) m, velocity (3,) m/s and their joint covariance (6, 6)."""
+        """Return the position (3,) m, the velocity (3,) m/s, and their joint covariance (6, 6)."""
         ...
 
     def predict(self, estimate: Estimate, horizons_s: Floats) -> Floats:
-        """Predict positions (n, 3) at times (n,) s after the estimate."""
+        """Predict the positions (n, 3), m, at times (n,), s, after the estimate."""
         ...
 
 

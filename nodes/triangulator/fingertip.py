@@ -1,8 +1,8 @@
 """Detect the fingertip's marker in a stereo image pair.
 
-Bright blobs are detected in each image and matched to pairs.  The markers of likely pairs are
-refined to subpixel accuracy and triangulated.  A pair that cannot be the marker gets a rejection
-reason.
+Bright blobs are detected in each image and matched to pairs. The markers of likely pairs are
+refined to subpixel accuracy and triangulated. If a pair cannot be the marker, its result contains a
+rejection reason.
 """
 
 from __future__ import annotations
@@ -42,35 +42,35 @@ from flexsheet.nodes.triangulator.triangulation import (
 Origin = tuple[int, int]
 
 SIZE_SIGMA = 0.2
-"""The standard deviation of the logarithm of a blob's radius divided by the radius that a marker
-has at the blob's depth."""
+"""The standard deviation of the logarithm of a size ratio: the radius of a blob divided by the
+radius of a marker at the blob's depth."""
 
 HEIGHT_SIGMA = 0.25
-"""The standard deviation of the logarithm of a marker's brightness in the left view divided by its
-brightness in the right view."""
+"""The standard deviation of the logarithm of a brightness ratio: the brightness of a marker in the
+left view divided by its brightness in the right view."""
 
 MISFIT_SIGMA_PX = 0.5
-"""The standard deviation of the distance between a marker's two rays, projected into the images,
-before the centres are refined."""
+"""The standard deviation of the distance between the rays of a marker's two centres before
+refinement, projected into the images."""
 
 MAX_SIZE_DEVIATION = 0.6
-"""The maximum absolute logarithm of a blob's radius divided by the expected radius.  A blob may
-have 0.55 to 1.8 times the expected radius."""
+"""The maximum absolute logarithm of a blob's radius divided by the expected radius. It permits 0.55
+to 1.8 times the expected radius."""
 
 SIZE_SIGMAS = 3.5
 """The maximum deviation of a refined marker's radius from the expected radius, in standard
-deviations.  A larger deviation shows that the marker is partly occluded, or merged with another
+deviations. A larger deviation indicates that the marker is partly occluded, or merged with another
 bright spot."""
 
 MARKER_SIZE_SIGMA = 0.035
-"""The relative standard deviation of the radii of real markers."""
+"""The relative standard deviation of the radii of manufactured markers."""
 
 STEREO_SIZE_SIGMAS = 4.5
-"""The maximum difference of a marker's radius between both views, in standard deviations.  A larger
-difference shows that the marker is partly occluded in one view."""
+"""The maximum difference of a marker's radius between both views, in standard deviations. A larger
+difference indicates that the marker is partly occluded in one view."""
 
 MAX_MOTION_DIFFERENCE_PX = 2.5
-"""The maximum difference of a marker's motion during the exposure between both views."""
+"""The maximum difference between both views in a marker's motion during the exposure."""
 
 WINDOW_MARGIN_PX = 5
 """The margin of a search window around the region in which the marker is expected."""
@@ -79,22 +79,22 @@ GATE_RADIUS_SIGMAS = 4.0
 """The radius of a gate (see `tracking.Gate`), in standard deviations of the expected position."""
 
 MAX_FLAT_PAIRS = 4
-"""The maximum number of blob pairs that are refined as flat markers.  The pairs with the lowest
-costs are refined."""
+"""The maximum number of blob pairs that are refined as flat markers. The pairs with the lowest
+costs are selected."""
 
 AMBIGUITY_MARGIN = 9.0
-"""The minimum cost difference between the best pair and the second best pair, in squared standard
-deviations.  With a smaller difference, the marker is ambiguous."""
+"""The minimum cost difference between the best and the second best pair, in squared standard
+deviations. With a smaller difference, the marker is ambiguous."""
 
 
 @dataclass(frozen=True, slots=True)
 class DetectorConfig:
-    """The settings of the detection, refinement and triangulation of markers.
+    """The settings for the detection, refinement and triangulation of markers.
 
     blob_filter: criteria for a blob that may be the marker.
-    refine: function of the selected marker method.
+    refine: function that implements the selected refinement method.
     max_reprojection_px: maximum reprojection error of a pair.
-    noise_px: standard deviation of a marker's centre; None uses the estimate of `refine`.
+    noise_px: standard deviation of a marker's centre; None to use the estimate of `refine`.
     marker_radius_m: true radius of the marker.
     max_deviation_m: maximum standard deviation of a triangulated point.
     sensor: noise of the pixels.
@@ -111,14 +111,14 @@ class DetectorConfig:
 
 @dataclass(frozen=True, slots=True)
 class BlobPair:
-    """A pair of blobs in the left and the right image that may show one marker.
+    """A pair of blobs in the left and the right image that may show the same marker.
 
     depth_m: depth in the left camera's frame at which the rays of both blobs meet.
-    gate_fraction: ratio of the distance from the gate's centre to the gate's radius; 0 if there
-        is no gate.
-    cost: sum of the squared deviations of rays, sizes, heights and distance from the gate's centre,
-        in squared standard deviations.
-    rejection_reason: None if the pair may be a marker in the box that the finger can reach.
+    gate_fraction: ratio of the distance from the gate's centre to the gate's radius; 0 without a
+        gate.
+    cost: sum of the squared deviations of rays, sizes, brightness and distance from the gate's
+        centre, in squared standard deviations.
+    rejection_reason: None if the pair may be a marker in the finger's working volume.
     """
 
     left: Blob
@@ -134,8 +134,8 @@ class Candidate:
     """A detected marker that may be the finger's marker.
 
     measured: triangulated position.
-    appearance: (2,) logarithms of the grey level of the marker and of that of its surroundings,
-        averaged over both views.
+    appearance: logarithms (2,) of the grey levels of the marker and of its surroundings, averaged
+        over both views.
     """
 
     measured: TriangulatedPoint
@@ -143,7 +143,7 @@ class Candidate:
 
     @property
     def point(self) -> Floats:
-        """Return the world position (3,), m."""
+        """Return the marker's world position (3,), m."""
         return self.measured.point_world
 
 
@@ -151,7 +151,7 @@ class Candidate:
 class StereoDetection:
     """The markers that were detected in an image pair.
 
-    reason: "ok", or why the finger was not found.
+    reason: "ok", or the reason why the finger was not found.
     measured: triangulated point of the finger's marker or of a rejected marker; None if no two rays
         meet.
     markers: candidates inside the gate, sorted by cost.
@@ -166,7 +166,7 @@ class StereoDetection:
 
 @dataclass(frozen=True, slots=True)
 class DetectionInput:
-    """The arguments of `detect_all`; images and origins are (left, right)."""
+    """The arguments of `detect_all`. Images and origins are pairs (left, right)."""
 
     images: tuple[Image, Image]
     origins: tuple[Origin, Origin]
@@ -190,8 +190,9 @@ def detect_all(
     """Detect the finger's marker and all other markers in an image pair.
 
     left, right: images (height, width).
-    volume: minimum and maximum corner (3,) m of the region that the finger may reach, world frame.
-    gate: region to search.  None searches both images, which must then contain one marker only.
+    volume: minimum and maximum corner (3,) m of the finger's working volume in the world frame.
+    gate: region to search. If it is None, both full images are searched, and they must contain only
+        one marker.
     left_origin_px, right_origin_px: column and row of each image's first pixel on its sensor.
 
     If the finger is not found inside its gate, the full images are searched for other markers.
@@ -219,9 +220,9 @@ def _detect_in(
 
 
 def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
-    """Return the part of each image that shows the gate.
+    """Return the window of each image that shows the gate.
 
-    The result is (None, None) if there is no gate, or if one of the images does not show it.
+    The result is (None, None) if there is no gate, or if the gate is outside one of the images.
     """
     if inputs.gate is None:
         return None, None
@@ -258,7 +259,10 @@ def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window
 def _match_in(
     inputs: DetectionInput, windows: tuple[Window | None, Window | None]
 ) -> StereoDetection:
-    """Detect markers in one window of each image; a window None is the full image."""
+    """Detect markers in one window of each image.
+
+    windows: windows of the left and right image; None for the full image.
+    """
     left, right = (
         detect_blobs(image, inputs.config.blob_filter, window)
         for image, window in zip(inputs.images, windows, strict=True)
@@ -291,8 +295,8 @@ def _match_blobs(
 ) -> list[BlobPair]:
     """Return all pairs of blobs whose rays meet in front of the cameras, with their costs.
 
-    A pair outside the finger's working volume, or with a radius that does not match its depth,
-    gets a rejection reason.
+    A pair receives a rejection reason if it is outside the finger's working volume, or if its
+    radius does not match its depth.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (
@@ -338,7 +342,7 @@ def _match_blobs(
 class RefinedPair:
     """A pair of blobs with refined markers.
 
-    rejection_reason: None for a valid marker.
+    rejection_reason: reason why the pair cannot be the marker; None for a valid marker.
     cost: cost of the blob pair plus the squared deviations of the refined radii, in squared
         standard deviations.
     """
@@ -352,8 +356,8 @@ class RefinedPair:
 def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
     """Select the finger's marker from pairs of blobs that are likely markers.
 
-    Pairs with similar costs are refined.  Those that are not round markers are refined again as
-    flat markers that are seen at an angle.
+    Pairs with similar costs are refined. Pairs that are not round markers are refined again as flat
+    markers that are seen at an angle.
     """
     refined = _refine_and_rank(inputs, likely)
     rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + AMBIGUITY_MARGIN]
@@ -376,7 +380,7 @@ def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetect
 
 
 def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[RefinedPair]:
-    """Refine the markers of blob pairs, and sort them by their cost before the refinement."""
+    """Refine the markers of blob pairs, and sort the pairs by their cost before the refinement."""
     ordered = sorted(pairs, key=lambda pair: pair.cost)
     found = []
     for pair, markers in zip(ordered, _refine_markers(inputs, ordered), strict=True):
@@ -407,11 +411,11 @@ def _check_flat_pair(
 ) -> tuple[Marker, Marker] | None:
     """Check whether two ellipses show one flat marker, and correct their centres for perspective.
 
-    Return both markers with corrected centres, and with the major semi-axis as radius.  Return None
-    if the ellipses do not show one flat marker.
+    Returns both markers with corrected centres, and with the major semi-axis as radius. Returns
+    None if the ellipses do not show one flat marker.
 
-    The mismatch of both shapes is added to the covariance, because an obstacle that covers a strip
-    of the marker changes the semi-axis and the centre by the same amount.
+    An obstacle that covers a strip of the marker changes the semi-axis and the centre by the same
+    amount. The mismatch of both shapes is therefore added to the covariance.
     """
     measured = _triangulate(inputs, markers)
     if measured is None:
@@ -461,8 +465,9 @@ def _unique_candidates(
 ) -> tuple[Candidate, ...]:
     """Return the markers of refined pairs that do not share blobs, sorted by cost.
 
-    Blobs of two markers can form wrong pairs.  A pair is therefore dropped if pairs with lower cost
-    contain both its blobs, or if a pair with much lower cost contains one of its blobs.
+    Blobs of two markers can form wrong pairs. A pair is therefore dropped if both its blobs belong
+    to pairs with lower costs. It is also dropped if one of its blobs belongs to a pair with a much
+    lower cost.
     """
     unique: list[RefinedPair] = []
     for one in sorted(
@@ -491,7 +496,7 @@ def _refine_markers(
 ) -> list[tuple[Marker, Marker]]:
     """Refine the markers of all pairs in one call.
 
-    refine: function to use; None uses the configured method.
+    refine: function that refines the markers; None to use the configured method.
     """
     config = inputs.config
     images = [image for _ in pairs for image in inputs.images]
@@ -504,7 +509,7 @@ def _refine_markers(
 def _rejection_reason(
     inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]
 ) -> FingertipReason | None:
-    """Return why a refined pair cannot be the marker; None if it is a valid marker."""
+    """Return the reason why a refined pair cannot be the marker, or None for a valid marker."""
     for marker in markers:
         if marker.rejection_reason is not None:
             return marker.rejection_reason
@@ -565,11 +570,11 @@ def _triangulate(
 
 
 def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
-    """Estimate the variance (px^2) of a centre that partial occlusion of the marker causes.
+    """Estimate the variance (px^2) of a marker's centre that partial occlusion causes.
 
-    An obstacle that covers a strip of a disc shifts its centre by half the strip's width, and
-    reduces the radius by the same amount.  The variance is therefore the squared difference of the
-    radii in both views, less the variance of the estimated radii.
+    An obstacle that covers a strip of a disc shifts the disc's centre by half the strip's width. It
+    reduces the radius by the same amount. The variance is therefore the squared difference of the
+    radii in both views, minus the variance of the estimated radii.
     """
     one, other = markers
     noise_px = one.radius * math.hypot(one.radius_deviation, other.radius_deviation)
@@ -579,9 +584,9 @@ def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
 def _validate(
     inputs: DetectionInput, measured: TriangulatedPoint | None
 ) -> tuple[FingertipReason, TriangulatedPoint | None]:
-    """Check the reprojection error, standard deviation and volume of a triangulated point.
+    """Check the reprojection error, standard deviation and position of a triangulated point.
 
-    Return "ok" or the reason to reject the point, and the point itself.
+    Returns "ok" or the reason to reject the point, and the point itself.
     """
     config = inputs.config
     if (

@@ -2,10 +2,11 @@
 
 The correction is necessary because perspective shifts the centre of an ellipse.
 
-A disc with radius R and normal n has the image A A^T = R^2 J (I - n n^T) J^T.  A is the matrix of
-the ellipse's edge (module `ellipse`), J the derivative of the pixel with respect to the point.
-Each ellipse allows two normals, mirrored about the line of sight; the other view selects one.  If a
-marker is partly covered, or merged with a bright spot, usually no normal agrees with both views.
+The image of a disc with radius R and normal n satisfies A A^T = R^2 J (I - n n^T) J^T. A is the
+matrix of the ellipse's edge (module `ellipse`), and J is the derivative of the pixel with respect
+to the point. Each ellipse permits two normals, mirrored about the line of sight. The other view
+determines which of them is correct. If a marker is partly covered, or merged with a bright spot,
+usually no normal agrees with both views.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from flexsheet.nodes.arrays import Floats
 class DiscView:
     """A flat disc as seen by one camera.
 
-    camera_from_left: (3, 3) rotation from the left camera's axes to those of this camera.
-    point: (3,) m, centre of the disc in this camera's frame.
-    jacobian: (2, 3) px/m, derivative of the pixel with respect to the point.
-    axes: (2, 2) px, symmetric matrix A of the ellipse's edge; see the module `ellipse`.
+    camera_from_left: rotation (3, 3) from the left camera's axes to those of this camera.
+    point: centre (3,) m of the disc in this camera's frame.
+    jacobian: derivative (2, 3), px/m, of the pixel with respect to the point.
+    axes: symmetric matrix A (2, 2), px, of the ellipse's edge; see the module `ellipse`.
     """
 
     camera_from_left: Floats
@@ -40,10 +41,9 @@ class FlatPose:
     """The orientation of a flat disc, estimated from its images in two cameras.
 
     normal: normal (3,) of the disc in the left camera's axes.
-    mismatch_px: largest difference between a semi-axis of a measured ellipse and the same semi-axis
-        of the computed image.
-    centre_offsets_px: (2, 2), one row per camera: centre of the ellipse minus the image of the
-        disc's centre.  Perspective causes this offset.
+    mismatch_px: maximum difference between the semi-axes of a measured and a computed ellipse.
+    centre_offsets_px: offsets (2, 2), one row per camera, by which perspective shifts the centre of
+        the ellipse from the image of the disc's centre.
     """
 
     normal: Floats
@@ -52,7 +52,7 @@ class FlatPose:
 
 
 def estimate_flat_pose(views: Sequence[DiscView], radius_m: float) -> FlatPose:
-    """Find the disc orientation whose computed images fit the ellipses of two views best."""
+    """Find the orientation of a disc whose computed images best fit the ellipses of two views."""
     found = [list(_possible_normals(view, radius_m)) for view in views]
     normals = [normal for normals in found for normal in normals]
     for one in found[0]:
@@ -83,7 +83,7 @@ def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
 
 
 def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
-    """Return the largest semi-axis difference (px) of measured and computed ellipse.
+    """Return the maximum difference (px) between the semi-axes of measured and computed ellipse.
 
     normal: normal (3,) of the disc in this camera's axes.
     """
@@ -96,10 +96,11 @@ def _mismatch_px(view: DiscView, normal: Floats, radius_m: float) -> float:
 
 
 def _centre_offset_px(view: DiscView, normal: Floats, radius_m: float) -> Floats:
-    """Return the centre of a disc's image minus the image of the disc's centre: (2,), in px.
+    """Return the offset (2,), px, from the image of a disc's centre to the centre of its ellipse.
 
-    normal: (3,) of the disc in the left camera's axes.
-    The dual conic of the disc gives the centre of its image.  The lens distortion is linearised.
+    normal: normal (3,) of the disc in the left camera's axes.
+    The centre of the ellipse is computed from the dual conic of the disc. The lens distortion is
+    linearised.
     """
     in_camera, point = view.camera_from_left @ normal, view.point
     conic = radius_m**2 * (np.eye(3) - np.outer(in_camera, in_camera)) - np.outer(point, point)

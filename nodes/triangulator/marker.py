@@ -1,8 +1,9 @@
 """Detect blobs that may be the fingertip's marker, and refine their centres to subpixel accuracy.
 
-Pixel coordinates have their origin at the centre of the top left pixel, x to the right, y down.  A
-marker is a small bright disc, blurred by its motion during the exposure.  `detect_blobs` finds all
-bright blobs of about its size, then a method refines the likely ones.
+Pixel coordinates have their origin at the centre of the top left pixel, with x to the right and y
+down. A marker is a small bright disc, blurred by its motion during the exposure. `detect_blobs`
+finds all bright blobs that have about the size of a marker. A refinement method then computes the
+centres of the likely blobs.
 """
 
 from __future__ import annotations
@@ -25,31 +26,33 @@ from flexsheet.nodes.triangulator.subpixel import (
 )
 
 Window = tuple[slice, slice]
-"""Rows and columns of a part of an image."""
+"""The rows and columns of a rectangular part of an image."""
 
 NEIGHBOURHOOD_PX = 31
 """The side of the square around a pixel whose mean grey level is the local threshold."""
 
 SURROUND_PX = 3
-"""The width of the border around a blob.  The outermost pixels of the border are the blob's
-surroundings."""
+"""The width of the border around a blob. The outermost pixels of this border determine the grey
+level of the blob's surroundings."""
 
 SURROUND_RANK = 0.75
-"""The quantile of the surrounding pixels' grey levels that is used as their common level.  A high
-quantile is needed if a bright finger is on one side of the marker and the other side is dark."""
+"""The quantile of the surrounding pixels' grey levels that is used as the level of the
+surroundings. A high quantile is necessary if one side of the marker is a bright finger, and the
+other side is dark."""
 
 SKIRT_FRACTION = 0.1
 """The fraction of the marker's height (its grey levels above its surroundings) below which the
 light of a pixel is ignored as noise."""
 
 MAX_REGIONS = 64
-"""The maximum number of bright regions to search.  If an image has more, the smallest regions are
-skipped."""
+"""The maximum number of bright regions that are searched in an image. If an image contains more
+regions, the smallest regions are skipped."""
 
 WHITE_LEVEL = 250
+"""The grey level from which a pixel is white."""
+
 WHITE_FRACTION = 0.2
-"""The criterion for overexposed images: more than WHITE_FRACTION of the pixels have at least the
-grey level WHITE_LEVEL."""
+"""The fraction of white pixels above which an image is overexposed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +61,11 @@ class BlobFilter:
 
     min_contrast: minimum difference of grey levels between a blob's brightest pixel and its
         surroundings.
-    min_area_px, max_area_px: limits on the number of pixels brighter than half the contrast.
+    min_area_px, max_area_px: limits on the number of pixels above half the contrast.
     window_half_px: half the side of the smallest search window around an expected position.
     max_motion_px: maximum motion during an exposure.
-    max_blur: maximum standard deviation of the edge of a marker in focus, as a fraction of the
-        radius.
+    max_blur: maximum standard deviation of the blur of a marker's edge in focus, as a fraction of
+        the radius.
     max_misfit: maximum root mean square residual of a fitted disc, as a fraction of the marker's
         height.
     """
@@ -78,12 +81,12 @@ class BlobFilter:
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """A bright blob that may be a marker; lengths are pixels of the searched image.
+    """A bright blob that may be a marker. Lengths are in pixels of the searched image.
 
     centre: centroid of the blob's light.
-    radius: radius of the disc with the same area as the pixels above half the height.
-    motion: (x, y) displacement during the exposure, estimated from the second moments of the light.
-    spread: smallest second moment of the light, divided by that of a uniform disc of this radius.
+    radius: radius of the disc that has the same area as the pixels above half the height.
+    motion: displacement (x, y) during the exposure, estimated from the second moments of the light.
+    spread: smallest second moment of the light, divided by that of a uniform disc with this radius.
     peak, surround: grey levels of the brightest pixel and of the surroundings.
     window: part of the image that contains the blob and its surroundings.
     """
@@ -114,13 +117,14 @@ MarkerRejection = Literal["merged", "blurred"]
 class Marker:
     """A marker in an image, refined to subpixel accuracy: centre (2,) px, covariance (2, 2) px^2.
 
-    radius: radius of the disc, px, or mean semi-axis of the ellipse.
+    radius: radius of the disc, or mean semi-axis of the ellipse, px.
     radius_deviation: standard deviation of the estimated radius, as a fraction of the radius.
     blur: standard deviation of the edge blur, px.
-    motion: (x, y) px displacement during the exposure; its sign is unknown.
-    elongation: (e, f) px of a flat marker that is seen at an angle; see the module `ellipse`.
+    motion: displacement (x, y) during the exposure, px; its sign is unknown.
+    elongation: vector (e, f), px, for a flat marker that is seen at an angle; see the module
+        `ellipse`.
     height: difference of grey levels between the marker and its surroundings.
-    rejection_reason: None for a valid marker.
+    rejection_reason: reason why the blob is not a marker; None for a valid marker.
     """
 
     centre: Floats
@@ -135,14 +139,16 @@ class Marker:
 
 
 Refine = Callable[[Sequence[Image], Sequence[Blob], BlobFilter, PixelNoise], list[Marker]]
-"""A function that refines blobs to markers.  Blob i belongs to image i."""
+"""A function that refines blobs to markers. The blob with index i belongs to the image with index
+i."""
 
 
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
     """Return the square window around a pixel (x, y), clipped to the image.
 
-    The window extends by half_px pixels on each side.  shape: (height, width) of the image.
-    Return None if the window is outside the image.
+    shape: size (height, width) of the image. half_px: number of pixels by which the window extends
+        on each side.
+    Returns None if the window is outside the image.
     """
     x, y = pixel.tolist()
     if not abs(x) + abs(y) < 1e6:  # also rejects NaN
@@ -164,10 +170,10 @@ def is_overexposed(image: Image, window: Window | None = None) -> bool:
 def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = None) -> list[Blob]:
     """Detect all blobs in an image, or in a window of it, that may be a marker.
 
-    Regions that are brighter than the mean of their neighbourhood are searched.  In each region,
-    the pixels above half the contrast form blobs.  Two thresholds are necessary to find a marker on
-    a bright finger or next to a brighter spot.  Blobs at the image border are dropped, because
-    their centre would be wrong.
+    Regions that are brighter than the mean of their neighbourhood are searched. In each region, the
+    pixels above half the contrast form blobs. Both thresholds are necessary to find a marker on a
+    bright finger or next to a brighter spot. Blobs at the image border are dropped, because their
+    computed centres would be wrong.
     """
     top, left = (0, 0) if window is None else (window[0].start, window[1].start)
     part = image if window is None else image[window]
@@ -190,7 +196,7 @@ def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = 
 
 
 def _count_pixels(outline: cv2.typing.MatLike) -> float:
-    """Return the number of pixels within and on an outline of pixel centres (Pick's theorem)."""
+    """Return the number of pixels inside and on an outline of pixel centres (Pick's theorem)."""
     return cv2.contourArea(outline) + 0.5 * len(outline) + 1.0
 
 
@@ -199,7 +205,7 @@ def _detect_in_box(
 ) -> list[Blob]:
     """Detect the blobs in a box (x, y, width, height) of an image part.
 
-    origin: row and column of the image at which the part begins.
+    origin: row and column at which the part begins in the image.
     """
     rows, columns = _add_border(box)
     cut = part[rows, columns]
@@ -253,7 +259,7 @@ def _make_blob(
 
     cut: pixels of the window.
     area: number of pixels above half the height.
-    origin: row and column of the image at which the part begins.
+    origin: row and column at which the part begins in the image.
     """
     rows, columns = window
     found = _light_moments(cut, surround, peak)
@@ -280,23 +286,27 @@ def _make_blob(
 
 
 def _light_moments(cut: Image, surround: float, peak: float) -> dict[str, float]:
-    """Return the image moments (`cv2.moments`) of the light above the noise threshold (skirt)."""
+    """Return the image moments (`cv2.moments`) of the light above the noise threshold.
+
+    cut: pixels of the blob's window. surround, peak: grey levels of the surroundings and of the
+        brightest pixel.
+    """
     skirt = surround + SKIRT_FRACTION * (peak - surround)
     return cv2.moments(np.maximum(cut - np.float32(skirt), np.float32(0.0)))
 
 
 SHARP_PX = 1.2
-"""The maximum standard deviation of the blur of an edge that is in focus."""
+"""The maximum standard deviation of the edge blur at which a marker is in focus."""
 
 MAX_SPREAD = 1.7
-"""The maximum value of `Blob.spread`.  A blob with a larger spread is not a marker."""
+"""The maximum value of `Blob.spread`. A blob with a larger spread is not a marker."""
 
 
 @dataclass(frozen=True, slots=True)
 class SystematicError:
-    """The systematic errors of a refinement method, in standard deviations per axis.
+    """The systematic errors of a refinement method, as standard deviations per axis.
 
-    still_px: error from the pixel grid and an uneven background.
+    still_px: error by the pixel grid and an uneven background.
     moving: additional error of a moving marker, as a fraction of its motion during the exposure.
     """
 
@@ -304,15 +314,18 @@ class SystematicError:
     moving: float
 
     def covariance(self, motion: tuple[float, float]) -> Floats:
-        """Return the covariance (2, 2), in px^2, of the error for a motion (x, y), in px."""
+        """Return the covariance (2, 2), px^2, of the systematic error for a motion (x, y), px."""
         variance = self.still_px**2 + (self.moving * math.hypot(*motion)) ** 2
         return np.array([[variance, 0.0], [0.0, variance]])
 
 
 BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
+"""The systematic error of the method `moments`. With this value, the errors in simulations divided
+by their predicted standard deviations have unit variance (`tests/test_marker.py`)."""
+
 BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
-"""The systematic errors of the methods.  With these values, the errors in simulations divided by
-their predicted standard deviations have unit variance (`tests/test_marker.py`)."""
+"""The systematic error of the method `subpixel_fit`. With this value, the errors in simulations
+divided by their predicted standard deviations have unit variance (`tests/test_marker.py`)."""
 
 
 def moments(
@@ -366,7 +379,12 @@ def subpixel_fit(
 def _make_marker(
     blob: Blob, fit: DiscFit, motion: tuple[float, float], *, is_blurred: bool, is_merged: bool
 ) -> Marker:
-    """Make a marker from a fit; motion: (x, y) px, which increases the systematic error."""
+    """Make a marker from the result of a fit.
+
+    motion: motion (x, y) during the exposure, px, which increases the systematic error.
+    is_blurred, is_merged: whether to reject the marker as out of focus, or as merged with another
+        spot.
+    """
     rejection_reason: MarkerRejection | None = "blurred" if is_blurred else None
     return Marker(
         centre=fit.centre,
@@ -382,10 +400,13 @@ def _make_marker(
 
 
 MAX_ELLIPSE_MISFIT = 0.035
+"""The maximum root mean square residual of a fitted ellipse, as a fraction of the marker's height
+(its grey levels above its surroundings). It is smaller than the limit for a disc, because an
+ellipse also fits a partly covered disc well."""
+
 MAX_ODD_MISFIT = 0.03
-"""The maximum root mean square residual of a fitted ellipse, and the maximum of its part that is
-odd about the centre, as fractions of the marker's height.  Both are smaller than the limit for a
-disc, because an ellipse fits a partly covered disc well, except for the odd part."""
+"""The maximum of the part of the residuals that is odd about the centre of a fitted ellipse, as a
+fraction of the marker's height. An ellipse does not fit this part of a partly covered disc."""
 
 
 def fit_flat_markers(
@@ -419,5 +440,5 @@ MARKER_METHODS: dict[str, Refine] = {
 }
 
 FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
-"""The refinement of flat markers that belongs to each refinement of round markers.  Methods without
+"""The method that refines flat markers for each method that refines round markers. Methods without
 an entry do not detect flat markers."""

@@ -54,19 +54,20 @@ from flexsheet.nodes.triangulator.triangulation import (
 )
 
 TIMEOUT_PERIODS = 2.5
-"""The minimum timeout of a track, in periods of the camera.  One image pair may then be missing."""
+"""The minimum timeout of a track, in periods of the camera. It permits one missing image pair."""
 
 
 SAME_POINT_M = 0.001
-"""The maximum distance between the positions of one marker in two searches of an image pair."""
+"""The maximum distance between two measured positions of the same marker in one image pair. The
+positions come from two searches of the images."""
 
 
 class Triangulator(Node):
     """A node that detects and tracks the fingertip in stereo image pairs.
 
-    The marker on the finger is tracked. The fingertip is the point of the finger's pad that touches
-    the sheet. The offset between marker and fingertip is constant, since the cameras cannot measure
-    the finger's rotation.
+    The cameras track a marker on the finger. The fingertip is the point of the finger's pad that
+    touches the sheet. The offset between marker and fingertip is assumed to be constant, because
+    the cameras cannot measure the finger's rotation.
     """
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame"})

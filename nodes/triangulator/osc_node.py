@@ -1,4 +1,4 @@
-"""Publish the eyes and the fingertip that a tracking program sends as OSC 1.0 messages by UDP."""
+"""Publish the eyes and the fingertip that a tracking program sends as OSC 1.0 messages over UDP."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from flexsheet.nodes.triangulator.external_fingertip import ExternalFingertip
 from flexsheet.nodes.triangulator.osc_packet import read_packet
 
 MAX_PACKET_BYTES = 2048
-"""The maximum size of a packet, which also limits the nesting of bundles."""
+"""The maximum size of a packet. The limit also bounds the nesting of bundles."""
 
 POSITION, POSE = 3, 7
-"""The number of values in a message with a position, and with a position and a quaternion."""
+"""The numbers of values in a position message, and in a pose message (position and quaternion)."""
 
 Row = tuple[Finite, Finite, Finite, Finite]
 IDENTITY: tuple[Row, Row, Row] = (
@@ -45,7 +45,10 @@ IDENTITY: tuple[Row, Row, Row] = (
 
 
 class OscStream(LimitedModel):
-    """An OSC address whose messages contain positions, and their transform to the world frame."""
+    """An OSC address whose messages contain positions.
+
+    The settings include the transform of these positions to the world frame.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -64,7 +67,7 @@ class OscStream(LimitedModel):
 
 
 class OscInputParameters(NodeParameters):
-    """Parameters of the OSC input."""
+    """The parameters of the OSC input."""
 
     host: str = Field(
         default="127.0.0.1",
@@ -121,10 +124,10 @@ class OscInputParameters(NodeParameters):
 
 
 class OscInput(Node):
-    """A node that publishes the positions of eyes and fingertip that it receives by OSC.
+    """A node that publishes the positions of the eyes and the fingertip that it receives by OSC.
 
     A tracking program sends the positions. If no messages arrive, the node publishes invalid eyes
-    and fingertips. The renderer then uses the eyes of the scene.
+    and fingertips. The renderer then uses the eye positions in the scene.
     """
 
     opens_devices: ClassVar[bool] = True
@@ -234,7 +237,7 @@ class OscInput(Node):
 
     @periodic("watch_hz")
     async def watch(self) -> None:
-        """Reopen the port if it is closed, and publish invalid messages if an input is silent."""
+        """Reopen the port if it is closed, and publish invalid messages for inputs without data."""
         if self.transport is None:
             await self._open()
         else:

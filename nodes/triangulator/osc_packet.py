@@ -7,14 +7,14 @@ from collections.abc import Iterator
 
 BUNDLE = b"#bundle\0"
 HEADER_BYTES = 16
-"""The size of the name and time at the beginning of a bundle."""
+"""The size of the name and the time at the beginning of a bundle."""
 
 FORMATS = {"i": ">i", "f": ">f", "h": ">q", "d": ">d"}
 WITHOUT_DATA = "TFNI"
 
 
 def read_packet(data: bytes) -> Iterator[tuple[str, list[float]]]:
-    """Yield the address and the numbers of each message in a packet, and skip texts.
+    """Yield the address and the numbers of each message in a packet; texts are skipped.
 
     Raises ValueError or struct.error if the bytes are not an OSC packet.
     """

@@ -1,4 +1,4 @@
-"""Parameters of the triangulator node."""
+"""Define the parameters of the triangulator node."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flexsheet.nodes.parameter_marks import CameraCalibrationFile, MarkerCalibra
 
 
 class TriangulatorParameters(NodeParameters):
-    """Parameters of the detection, triangulation and tracking of the marker."""
+    """The parameters for the detection, triangulation and tracking of the marker."""
 
     calibration: CameraCalibrationFile | None = Field(
         default=None,

@@ -1,10 +1,10 @@
 """Compare the positions of projected marks on the sheet with their expected positions.
 
-A mark lies on the ray of its projector pixel, wherever the sheet is.  Its distance from this ray
-therefore shows errors of the projector and the camera.  Its distance from the expected surface of
-the sheet shows errors of the arms and the camera.  Near a finger that pushes the sheet, the surface
-moves with the true finger pad in a known ratio.  The marks there show errors of the pad's measured
-depth.
+A mark lies on the ray of its projector pixel, independently of the sheet's position. Its distance
+from this ray therefore indicates errors of the projector and the camera. Its distance from the
+expected surface of the sheet indicates errors of the arms and the camera. Near a finger that pushes
+the sheet, the surface moves in a known ratio to the true finger pad. The marks there indicate
+errors of the pad's measured depth.
 """
 
 from __future__ import annotations
@@ -20,54 +20,55 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.residuals import ResidualMonitor
 
 RAY_THRESHOLD_M = 7e-4
-"""The maximum distance of the marks from their rays (root mean square).  A calibrated camera causes
-a standard deviation of 0.12 mm per axis, and a calibrated projector 0.03 mm."""
+"""The maximum root mean square distance of the marks from their rays. A calibrated camera causes a
+standard deviation of 0.12 mm per axis, and a calibrated projector 0.03 mm."""
 
 SURFACE_THRESHOLD_M = 1.2e-3
-"""The maximum mean distance of the marks from the sheet's surface: about five standard deviations.
-The camera contributes 0.12 mm.  Each arm contributes 0.2 mm by base and clamp, and 0.2 mm by the
-zero positions of its joints (docs/apparatus.md)."""
+"""The maximum mean distance of the marks from the sheet's surface, which is about five standard
+deviations. The camera contributes 0.12 mm. The base and clamp of each arm contribute 0.2 mm, and
+the zero positions of its joints contribute 0.2 mm (docs/apparatus.md)."""
 
 FINGER_THRESHOLD_M = 2e-3
-"""The maximum error of the finger's depth in the sheet.  The contributions to its standard
-deviation are 0.3 mm by the marker's offset, 0.12 mm by the camera, 0.25 mm by the arms and 0.2 mm
-by noise."""
+"""The maximum error of the finger's depth in the sheet. The marker's offset contributes a standard
+deviation of 0.3 mm, the camera 0.12 mm, the arms 0.25 mm, and noise 0.2 mm."""
 
 LATENCY_THRESHOLD_S = 0.01
-"""The maximum deviation of the display latency from its configured value: ten standard deviations
-of a measurement by photodiode (1 ms)."""
+"""The maximum deviation of the display latency from its configured value. It equals ten standard
+deviations of a measurement by photodiode (1 ms)."""
 
 LATENCY_MEMORY_S = 4.0
-"""The time constant of the mean latency.  It is long because a wrong latency is visible in few
-images: those that are taken while the projector still shows the previous frame."""
+"""The time constant for averaging the latency. It is long because only a few images show a wrong
+latency: the images taken while the projector still shows the previous frame."""
 
 MATCH_RADIUS_M = 0.012
-"""The maximum distance of a detected point from the expected position of a mark."""
+"""The maximum distance between a detected point and the expected position of a mark at which both
+are matched."""
 
 MAX_SPREAD_M = 0.004
-"""The maximum deviation of a mark's offset from the median offset of all marks.  A point with a
-larger deviation is not a mark."""
+"""The maximum difference between the offset of a mark from its expected position and the median
+offset of all marks. A point with a larger difference is not a mark."""
 
 MAX_AGE_NS = 300_000_000
-"""The maximum age of the newest frame at the exposure: with an older one, frames are missing."""
+"""The maximum age of the newest frame at the exposure. If the newest frame is older, frames are
+missing."""
 
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
-"""The maximum speed of the marks at which positions are checked, and the minimum speed at which the
+"""The speed of the marks below which their positions are checked, and the speed above which the
 latency is checked."""
 
 MAX_DRIFT_M = 3e-4
-"""The maximum motion of a mark along the sheet's normal between the frame and the exposure.  With a
-larger motion, heights above the expected surface are not checked."""
+"""The maximum motion of a mark along the sheet's normal between the frame and the exposure. With a
+larger motion, the heights of the marks above the expected surface are not checked."""
 
 MAX_GAIN = 4.0
-"""The maximum standard deviation of the finger's estimated depth as a multiple of that of a mark's
-height.  With a larger gain, which marks far from the finger cause, the depth is not estimated."""
+"""The maximum ratio of the standard deviation of the finger's estimated depth to that of a mark's
+height. Marks that are far from the finger cause a larger ratio. The depth is then not estimated."""
 
 
 class ProjectionCheck:
-    """The self-checks of projector, arms and finger marker that use projected marks.
+    """The self-checks of projector, arms and finger marker by means of projected marks.
 
-    projector: projector of the scene.  Without a projector or marks, nothing is checked.
+    projector: projector of the scene. Without a projector or without marks, nothing is checked.
     """
 
     def __init__(self, projector: Projector | None) -> None:
@@ -86,7 +87,7 @@ class ProjectionCheck:
         self._latency = ResidualMonitor(1, threshold=LATENCY_THRESHOLD_S, memory_s=LATENCY_MEMORY_S)
 
     def on_frame(self, frame: Frame) -> None:
-        """Store the expected positions of the marks in a frame that the projector shows."""
+        """Store the expected positions of the marks in a displayed frame."""
         if frame.light_ns and self._count and len(frame.marks_world_m) == self._count:
             normal = frame.world_from_sheet[:3, 2]
             expected = (frame.light_ns, frame.marks_world_m, frame.marks_finger_ratio, normal)
@@ -94,14 +95,14 @@ class ProjectionCheck:
 
     @property
     def expected_world_m(self) -> Floats:
-        """Return the newest expected world positions (n, 3), in m, of the marks."""
+        """Return the newest expected world positions (n, 3), m, of the marks."""
         return self._frames[-1][1] if self._frames else np.zeros((0, 3))
 
     def on_points(self, points: Sequence[Floats], camera_shift_m: Floats, at_ns: int) -> None:
-        """Compare the bright points (3,) m of an image pair with the expected marks.
+        """Compare the bright points (3,), m, of an image pair with the expected marks.
 
-        camera_shift_m: shift (3,) of the fixed reference marks, which an error of the camera's pose
-            causes.
+        camera_shift_m: displacement (3,) of the fixed reference marks by an error of the camera's
+            pose.
         at_ns: time of the image pair.
         """
         shown = [number for number, frame in enumerate(self._frames) if frame[0] <= at_ns]
@@ -145,9 +146,10 @@ class ProjectionCheck:
             self._latency.add(np.array([late]), at_ns)
 
     def _velocities(self, number: int) -> Floats | None:
-        """Return the velocities (n, 3) of the marks in a frame, m/s; NaN for marks off the sheet.
+        """Return the velocities (n, 3), m/s, of the marks in a frame; NaN for marks off the sheet.
 
-        number: index of the frame in `_frames`.  Returns None if no velocity is known.
+        number: index of the frame in `_frames`.
+        Returns None if no velocity is known.
         """
         if number == 0:
             return None
@@ -159,9 +161,9 @@ class ProjectionCheck:
         return np.asarray(np.where(on_sheet[:, None], (now - before) / step_s, np.nan))
 
     def _add_surface(self, heights_m: Floats, ratios: Floats, at_ns: int) -> None:
-        """Add the heights (n,) m of the marks above the expected surface of the sheet.
+        """Add the heights (n,), m, of the marks above the expected surface of the sheet.
 
-        ratios: (n,) displacements of the marks as fractions of the finger's displacement.
+        ratios: displacements (n,) of the marks as fractions of the finger's displacement.
         """
         if not ratios.any():
             self._surface.add(np.array([heights_m.mean()]), at_ns)
@@ -176,10 +178,10 @@ class ProjectionCheck:
         self._finger.add(np.array([finger_m]), at_ns)
 
     def results(self, *, camera_checked: bool) -> dict[SuspectedCause, SelfCheck]:
-        """Return the results of all checks that have data, by cause.
+        """Return the results of all checks that have enough data, by suspected cause.
 
-        camera_checked: whether the shift of the camera is measured by reference marks. An error of
-        the camera is then distinguished from errors of the projector and the arms.
+        camera_checked: whether the shift of the camera is measured by reference marks. Errors of
+            the camera are then distinguished from errors of the projector and the arms.
         """
         ray, surface = self._ray, self._surface
         found: dict[SuspectedCause, SelfCheck] = {}

@@ -1,8 +1,8 @@
 """Check the stereo camera and the marker by residuals of triangulated points.
 
-Three residuals are monitored.  The reprojection error increases if one camera has moved relative to
-the other camera.  The positions of fixed reference marks change if the whole stereo camera has
-moved.  The position of a finger that rests at a known point changes if the marker has moved on the
+Three residuals are monitored. The reprojection error increases if one camera has moved relative to
+the other camera. The positions of fixed reference marks change if the whole stereo camera has
+moved. The position of a finger that rests at a known point changes if the marker has moved on the
 finger.
 """
 
@@ -22,36 +22,39 @@ from flexsheet.nodes.triangulator.fingertip import StereoDetection
 from flexsheet.nodes.triangulator.projection_check import ProjectionCheck
 
 REPROJECTION_THRESHOLD_PX = 0.2
-"""The maximum mean reprojection error.  The error is 0.024 px after a calibration, and about 0.1 px
-after a drift of the right camera by 0.2 mrad.  A vertical shift of one camera by 1 mm causes 0.5 px
+"""The maximum mean reprojection error. The error is 0.024 px after a calibration, and about 0.1 px
+after a drift of the right camera by 0.2 mrad. A vertical shift of one camera by 1 mm causes 0.5 px
 if the finger is at half a metre."""
 
 MARK_THRESHOLD_M = 6e-4
-"""The maximum shift of the reference marks, five standard deviations.  The standard deviation per
-axis is 0.12 mm after a calibration (docs/apparatus.md)."""
+"""The maximum shift of the reference marks, which equals five standard deviations. After a
+calibration, the standard deviation per axis is 0.12 mm (docs/apparatus.md)."""
 
 MARKER_THRESHOLD_M = 1.5e-3
-"""The maximum distance of a resting finger from the known point, more than four standard
-deviations. The contributions per axis are 0.3 mm by the calibrated marker offset, 0.12 mm by the
-camera and 0.1 mm by noise."""
+"""The maximum distance of a resting finger from the known point, which is more than four standard
+deviations. The calibrated marker offset contributes 0.3 mm per axis, the camera 0.12 mm, and noise
+0.1 mm."""
 
 MARK_RADIUS_M = 0.008
-"""The maximum distance of a detected point from a reference mark with which it is identified."""
+"""The maximum distance between a detected point and a reference mark at which both are matched."""
 
 TOUCH_RADIUS_M = 0.012
-"""The maximum distance from the known point of a finger that is considered to rest there."""
+"""The maximum distance of a finger from the known point at which the finger is assumed to touch
+this point."""
 
 STILL_S = 0.7
+"""The time for which a finger must be at rest before its position is checked."""
+
 STILL_M = 2.5e-4
-"""The criterion for a finger at rest: over the time STILL_S, the standard deviation of its position
-is at most STILL_M.  A finger that hovers moves more."""
+"""The maximum standard deviation of the position of a resting finger. A finger that hovers moves
+more."""
 
 
 class CameraCheck:
     """The self-checks of the stereo camera and of the marker.
 
-    reference_marks: world positions (n, 3) m of fixed marks that look like the finger's marker.
-    touch_point: world position (3,) m of a known point that the finger can touch, or None.
+    reference_marks: world positions (n, 3), m, of fixed marks that look like the finger's marker.
+    touch_point: world position (3,), m, of a known point that the finger can touch, or None.
     projector: projector of the scene, which may project check marks on the sheet, or None.
     """
 
@@ -73,9 +76,9 @@ class CameraCheck:
         self._projection.on_frame(frame)
 
     def on_marks(self, points: Sequence[Floats], at_ns: int) -> None:
-        """Check the fixed marks and the projected marks.
+        """Check the positions of the fixed marks and of the projected marks.
 
-        points: world positions (3,) m of all bright points in an image pair.
+        points: world positions (3,), m, of all bright points in an image pair.
         at_ns: time of the image pair.
         """
         self._check_reference_marks(points, at_ns)
@@ -102,7 +105,7 @@ class CameraCheck:
         """Remove the fixed marks and the projected marks from a detection.
 
         tracked: whether the finger was searched in a gate. Markers inside the gate then remain,
-        because they may be the finger's marker.
+            because they may be the finger's marker.
         """
         marks = np.concatenate([self._marks, self._projection.expected_world_m])
         if not len(marks):
@@ -118,7 +121,10 @@ class CameraCheck:
         return replace(detection, markers=markers, clutter=clutter)
 
     def on_finger(self, point: Floats, reprojection_px: float, at_ns: int) -> None:
-        """Add the position (3,) m of the finger pad and its marker's reprojection error (px)."""
+        """Add a position of the finger pad, and check it if the finger rests at the known point.
+
+        point: world position (3,), m. reprojection_px: reprojection error of the finger's marker.
+        """
         self._reprojection.add(np.array([reprojection_px]), at_ns)
         if self._touch_point is None:
             return
@@ -136,7 +142,7 @@ class CameraCheck:
         self._marker.add(offset - self._camera_shift_m, at_ns)
 
     def results(self) -> tuple[SelfCheck, ...]:
-        """Return the results of all checks that have data."""
+        """Return the results of all checks that have enough data."""
         by_marks = self._projection.results(camera_checked=self._camera.has_data)
         found = []
         if self._reprojection.has_data:

@@ -24,15 +24,15 @@ def compensate_skew(
 ) -> TriangulatedPoint:
     """Correct a triangulated point of a moving finger for the time between both exposures.
 
+    skew_s: time of the right exposure minus the time of the left exposure.
+    velocity: velocity (3,), m/s, of the finger in the world, with its covariance (3, 3).
+
     The corrected point is the finger's position at the mean time of both exposures.
 
-    skew_s: time of the right exposure minus that of the left one.
-    velocity: (3,) m/s of the finger in the world, with its covariance (3, 3).
-
-    To first order, a finger with velocity v is measured with the error M v, M = s (A_r J_r - I/2).
-    Here s is the skew, J_r the Jacobian of the right pixel, and A_r the derivative of the
-    triangulated point with respect to that pixel.  The error is mostly in depth, with the size
-    speed * skew * depth / baseline.  The uncertainty of v is added to the covariance.
+    To first order, a finger with velocity v is measured with the error M v, where M = s (A_r J_r -
+    I/2). Here s is the skew, J_r the Jacobian of the right pixel, and A_r the derivative of the
+    triangulated point with respect to that pixel. The error is mainly in depth, and its size is
+    speed * skew * depth / baseline. The uncertainty of v is added to the covariance.
     """
     world = geometry.world_from_left[:3, :3]
     in_left = geometry.left_from_world[:3, :3] @ measured.point_world
@@ -61,8 +61,8 @@ def compensate_detection_skew(
 ) -> StereoDetection:
     """Correct all detections of an image pair for the time between both exposures.
 
-    skew_s: time of the right exposure minus that of the left exposure.
-    velocity: (3,) m/s of the finger in the world, with its covariance (3, 3).
+    skew_s: time of the right exposure minus the time of the left exposure.
+    velocity: velocity (3,), m/s, of the finger in the world, with its covariance (3, 3).
     """
 
     def corrected(measured: TriangulatedPoint) -> TriangulatedPoint:

@@ -1,23 +1,23 @@
 """Estimate a marker's centre by maximum likelihood: fit a motion-blurred disc to its pixels.
 
-The image of a marker is a uniform disc on a background with a constant gradient, called ground.
-The lens, the pixel's area and the motion during the exposure blur it.  With the distance d of a
-pixel outside the disc's edge, its grey level is
+The image of a marker is a uniform disc on a background with a constant gradient, which is called
+ground. The lens, the pixel's area and the motion during the exposure blur the disc. At the distance
+d outside the disc's edge, a pixel has the grey level
 
     level = ground (1 - S) + marker S,    S = mean over the motion of Phi(-d / blur).
 
 Here ground and marker are grey levels, S is the fraction of the pixel that the disc covers, and Phi
-is the normal cumulative distribution.  A Gauss-Newton method fits all parameters at once, with each
-pixel weighted by its noise.  The covariance of the result is the inverse of the Fisher information,
-the Cramer-Rao bound for images that follow the model.  For other images it is increased by the part
-of the residuals that is odd (antisymmetric) about the centre.
+is the normal cumulative distribution. A Gauss-Newton method fits all parameters at once, with each
+pixel weighted by its noise. The covariance of the result is the inverse of the Fisher information,
+which is the Cramer-Rao bound for images that follow the model. For other images, the covariance is
+increased by the part of the residuals that is odd (antisymmetric) about the centre.
 
-A flat marker that is seen at an angle is an ellipse.  `fit_ellipses` fits its elongation, two
-parameters, in place of the motion; the module `ellipse` gives its exact image.
+A flat marker that is seen at an angle is an ellipse. `fit_ellipses` fits the two parameters of its
+elongation instead of the motion. The module `ellipse` computes its exact image.
 
 The derivatives of the image with respect to the centre and the ground's gradient are odd about the
-centre; all others are even.  A wrong radius, blur, level or motion therefore changes only the
-covariance, not the centre.
+centre. All other derivatives are even. A wrong radius, blur, level or motion therefore changes only
+the covariance, not the centre.
 """
 
 from __future__ import annotations
@@ -37,40 +37,50 @@ X, Y, RADIUS, BLUR, MARKER, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range
 STILL_PARAMETERS = 8
 ELONGATION = slice(8, 10)
 ELLIPSE = [X, Y, RADIUS, BLUR, 8, 9]
-"""Indices of an ellipse's shape parameters; its elongation takes the place of the motion."""
+"""The indices of an ellipse's shape parameters. The elongation has the same indices as the motion
+of a disc."""
 
 ODD = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
-"""1 for each parameter for which the derivative of the image is odd about the disc's centre."""
+"""The symmetry of each parameter: 1 if the derivative of the image is odd about the disc's centre,
+otherwise 0."""
 
 WHITE = 255
 MARGIN_PX = 3.0
+"""The width of the surroundings of a disc at rest that the fit uses. It is large enough to estimate
+the background, and excludes the finger's edge, where the background is not linear."""
+
 MIN_MARGIN_PX = 1.25
+"""The minimum width of the surroundings of a moving disc that the fit uses."""
+
 MARGIN_PER_MOTION = 0.5
-"""The width of the surroundings of a disc that the fit uses.  They are wide enough to estimate the
-ground, but exclude the finger's edge, where the ground is not linear.  For a moving marker, the
-width is reduced by MARGIN_PER_MOTION times the motion, down to MIN_MARGIN_PX."""
+"""The reduction of the width of a disc's surroundings, as a fraction of the disc's motion during
+the exposure."""
 
 PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
-"""The inverse variances of the parameters' starting values.  They affect only parameters about
-which the pixels contain no information, such as the level of a saturated marker."""
+"""The inverse variances of the parameters' starting values. They only affect parameters about which
+the pixels contain no information, such as the level of a saturated marker."""
 
 MIN_SHAPE = np.array([0.5, 0.3])
+"""The lower bounds (px) on the radius and the blur of a fitted disc."""
+
 MAX_SHAPE = np.array([40.0, 8.0])
-"""Bounds (px) on radius and blur."""
+"""The upper bounds (px) on the radius and the blur of a fitted disc."""
 
 MAX_ELONGATION = 0.6
+"""The maximum ratio of an ellipse's elongation to its radius. At this ratio, the minor axis is a
+quarter of the major axis."""
+
 START_ELONGATION = 0.45
-"""The maximum ratios of an ellipse's elongation to its radius in the fit and in the starting value.
-With the first ratio, the minor axis is a quarter of the major axis."""
+"""The maximum ratio of an ellipse's elongation to its radius in the starting values of the fit."""
 
 ELLIPSE_BLUR_PX = 0.8
-"""The starting value of the blur of an ellipse.  The spread of a blob cannot provide this value,
+"""The starting value for the blur of an ellipse. The spread of a blob cannot provide this value,
 because the spread also depends on the elongation."""
 
 MOTION_STEP_PX = 1.8
-"""Maximum distance between the positions over which a moving disc is averaged."""
+"""The maximum distance between the positions over which the image of a moving disc is averaged."""
 
 MIN_MOTION_PX = 2.0
 """The minimum motion that is fitted.  A shorter motion cannot be distinguished from blur."""
@@ -79,25 +89,28 @@ PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 
 ITERATIONS = 8
 CONVERGED_STEP_PX = np.array([0.02, 0.02, 0.05, 0.05])
-"""The fit has converged if its last steps of centre (x, y), radius and blur are below these values.
-The remaining error is about the squared step divided by the blur: less than 0.001 px."""
+"""The last steps of centre (x, y), radius and blur below which a fit has converged. The remaining
+error is about the squared step divided by the blur, which is less than 0.001 px."""
 
 CONVERGED_ELONGATION_PX = 0.05
-"""The fit of an ellipse has converged if its last step of the elongation is below this value."""
+"""The last step of the elongation below which the fit of an ellipse has converged."""
 
 MAX_STEP_PX = 0.7
+"""The maximum change of a shape parameter in one step of the fit."""
+
 MAX_SHIFT_PX = 2.0
-"""The maximum change of a shape parameter in one step, and of the centre in the whole fit."""
+"""The maximum distance of a fitted centre from its starting value."""
 
 MIN_VARIANCE_RATIO = 0.7
-"""Minimum ratio of the noise variance estimated from the residuals to that of the sensor model."""
+"""The minimum ratio of the noise variance that is estimated from the residuals to the noise
+variance of the sensor model."""
 
 
 @dataclass(frozen=True, slots=True)
 class PixelNoise:
     """The noise of an image sensor.
 
-    A grey level L has the variance read_levels^2 + L / photons_per_level.
+    The variance of a grey level L is read_levels^2 + L / photons_per_level.
     """
 
     read_levels: float = 1.5
@@ -121,15 +134,16 @@ class DiscStart:
 
 @dataclass(frozen=True, slots=True)
 class DiscFit:
-    """A disc or ellipse that was fitted to an image.
+    """The result of fitting a disc or an ellipse to an image.
 
-    centre: (2,) px with covariance (2, 2) px^2.
-    radius, blur, motion: px; motion is (x, y).  The radius of an ellipse is the mean semi-axis.
-    elongation: (e, f) px of an ellipse; see the module `ellipse`.
+    centre: centre (2,), px, with its covariance (2, 2), px^2.
+    radius, blur, motion: radius, blur and motion (x, y), px. The radius of an ellipse is the mean
+        semi-axis.
+    elongation: elongation (e, f), px, of an ellipse; see the module `ellipse`.
     height: difference of the grey levels of marker and ground.
     misfit: root mean square residual in excess of the noise, as a fraction of the height.
     odd_misfit: misfit of the part of the residuals that is odd (antisymmetric) about the centre.
-    converged: whether the fit converged to a disc that is brighter than the ground.
+    converged: whether the fit has converged to a disc that is brighter than the ground.
     """
 
     centre: Floats
@@ -153,8 +167,9 @@ def fit_discs(
 ) -> list[DiscFit]:
     """Fit one disc in each image (height, width).
 
-    Pixels outside the image and outside the disc's surroundings are excluded.  A saturated (white)
-    pixel is used only in iterations in which the model is darker than it.
+    starts: starting values, one per image. noise: noise of the image sensor.
+    Pixels outside the image and outside the disc's surroundings are excluded. A saturated (white)
+    pixel is used only in iterations in which the model is darker than the pixel.
     """
     if not starts:
         return []
@@ -175,7 +190,7 @@ def fit_ellipses(
 ) -> list[DiscFit]:
     """Fit one ellipse without motion blur in each image (height, width).
 
-    starts: starting values of moving discs.  Each ellipse starts with the second moments of its
+    starts: starting values of moving discs. Each ellipse starts with the second moments of its
         disc.
     The ellipses are fitted one after the other, because the computing time increases with the third
     power of the largest ellipse's size.
@@ -217,12 +232,12 @@ def _fit(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> list[DiscF
 class DiscSolution:
     """The result of the Gauss-Newton iteration for n discs in cut-outs of s x s pixels.
 
-    found: (n, parameters) after the last step.
-    residuals: (n, s s), image minus model before the last step.
-    weights: (n, s s), inverse noise variances of the pixels, zero for excluded pixels.
-    information: (n, parameters, parameters), Fisher information plus prior.
-    gains: (n, parameters), reduction of the weighted squared residuals by the last step of each
-        parameter, to first order.
+    found: parameters (n, parameters) after the last step.
+    residuals: differences (n, s s) between image and model before the last step.
+    weights: inverse noise variances (n, s s) of the pixels; zero for excluded pixels.
+    information: Fisher information plus prior (n, parameters, parameters).
+    gains: first-order reduction (n, parameters) of the weighted squared residuals by the last step
+        of each parameter.
     """
 
     found: Floats
@@ -236,7 +251,7 @@ class DiscSolution:
 def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolution:
     """Find the most likely parameters of n discs or ellipses by the Gauss-Newton method.
 
-    start: (n, parameters) starting values.
+    start: starting values (n, parameters).
     """
     prior_weights = PRIOR_WEIGHTS[: start.shape[1]]
     prior = np.diag(prior_weights)
@@ -268,10 +283,10 @@ def _solve(cutouts: DiscCutouts, start: Floats, render: RenderDiscs) -> DiscSolu
 def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]]:
     """Return four numbers about the residuals of each fit.
 
-    They are the weighted sum of squared residuals, the number of pixels, the sum of weights, and a
-    variance ratio.  The ratio is the variance of the odd part of the residuals divided by that of
-    the sensor noise.  The odd part is the difference between pixels that are mirrored about the
-    centre.  Only this part affects the fitted centre.
+    The numbers are the weighted sum of squared residuals, the number of pixels, the sum of weights,
+    and a variance ratio. The ratio is the variance of the odd part of the residuals divided by the
+    variance of the sensor noise. The odd part is the difference between pixels that are mirrored
+    about the centre. Only this part affects the fitted centre.
     """
     residuals, weights, gains = solved.residuals, solved.weights, solved.gains
     squares = np.einsum("ni,ni,ni->n", residuals, residuals, weights) - gains.sum(axis=1)
@@ -296,11 +311,11 @@ def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]
 class DiscCutouts:
     """Cut-outs (s x s pixels) of n images around the starting centres of discs.
 
-    corners: column and row of each cut-out's first pixel, the origin of its coordinates.
+    corners: column and row of each cut-out's first pixel, which is the origin of its coordinates.
     offsets: starting centres in these coordinates.
-    levels, weights: (n, s s), grey levels of the pixels, and inverses of their noise variances.
+    levels, weights: grey levels (n, s s) of the pixels, and inverses of their noise variances.
     x, y: coordinates of the pixels, (1, 1, s) and (1, s, 1).
-    white: (n, s s), whether a pixel is saturated; None if no pixel is.
+    white: whether a pixel is saturated, (n, s s); None if no pixel is saturated.
     """
 
     corners: list[tuple[int, int]]
@@ -315,7 +330,7 @@ class DiscCutouts:
 def _cut_out_discs(
     images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> DiscCutouts:
-    """Cut out the pixels around each disc; pixels outside the image get the weight zero."""
+    """Cut out the pixels around each disc; the weights of pixels outside the image are zero."""
     lengths = [math.hypot(*one.motion) for one in starts]
     reaches = [
         one.radius + max(MARGIN_PX - MARGIN_PER_MOTION * length, MIN_MARGIN_PX)
@@ -368,9 +383,10 @@ def _cut_out_discs(
 
 
 def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Render discs; return grey levels (n, s s) and their derivatives (n, parameters, s s).
+    """Return the grey levels (n, s s) of discs, and derivatives (n, parameters, s s).
 
-    found: (n, parameters) of the discs.  x, y: coordinates of pixels, (1, 1, s) and (1, s, 1).
+    found: parameters (n, parameters) of the discs. x, y: coordinates of the pixels, (1, 1, s) and
+        (1, s, 1).
 
     A moving (motion-blurred) disc is averaged over k positions, in arrays (n, k, s, s).
     """
@@ -416,9 +432,10 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
 
 
 def _render_ellipse(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Render ellipses; return grey levels (n, s s) and derivatives (n, parameters, s s).
+    """Return the grey levels (n, s s) of ellipses, and derivatives (n, parameters, s s).
 
-    found: (n, parameters) of the ellipses.  x, y: coordinates of pixels, (1, 1, s) and (1, s, 1).
+    found: parameters (n, parameters) of the ellipses. x, y: coordinates of the pixels, (1, 1, s)
+        and (1, s, 1).
     """
     x, y = (each.ravel() for each in np.broadcast_arrays(x[0], y[0]))
     coverage, by_shape = integrate_ellipse(found[:, ELLIPSE], x, y)
@@ -447,7 +464,10 @@ def _elongation(start: DiscStart) -> tuple[float, float]:
 
 
 def _bound_elongation(found: Floats) -> None:
-    """Limit the elongations of ellipses (n, parameters) to MAX_ELONGATION, in place."""
+    """Limit the elongations of ellipses to MAX_ELONGATION, in place.
+
+    found: parameters (n, parameters) of the ellipses.
+    """
     elongation = found[:, ELONGATION]
     length = np.maximum(np.hypot(*elongation.T), 1e-12)
     elongation *= np.minimum(MAX_ELONGATION * found[:, RADIUS] / length, 1.0)[:, None]
@@ -462,9 +482,9 @@ def _make_fit(
     is_ellipse: bool,
     converged: bool,
 ) -> DiscFit:
-    """Make the result of one fit; increase its covariance if the residuals exceed the noise.
+    """Make the result of one fit, and increase its covariance if the residuals exceed the noise.
 
-    found: fitted parameters.  corner: column and row of the cut-out's first pixel.
+    found: fitted parameters. corner: column and row of the cut-out's first pixel.
     fitness: one element of the result of `_fit_residuals`.
     """
     squares, pixels, weight, ratio = fitness

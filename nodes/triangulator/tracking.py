@@ -1,7 +1,7 @@
 """Decide which measured points belong to the finger's track, and when a track starts or is lost.
 
-A track is the sequence of accepted points.  A filter (module `filters` or `adaptive`) estimates the
-motion from them.  The gate is the region in which the next point is expected.
+A track is the sequence of accepted points. A filter (module `filters` or `adaptive`) estimates the
+motion from these points. The gate is the region in which the next point is expected.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
 
 GateResult = Literal["ok", "too_fast", "unconfirmed"]
-"""The result of adding a measured point to a tracker.
+"""The possible results of adding a measured point to a tracker.
 
 ok: the point was added to the track.
 too_fast: the point is farther away than a finger can move.
-unconfirmed: the point may start a new track, or it arrived late.
-"""
+unconfirmed: the point may start a new track, or the point arrived late."""
 
 PREDICTION_STEP_S = 0.01
-"""The time between the points of the predicted path: a tenth of the period of a tremor of 10 Hz."""
+"""The time between two points of the predicted path. It is a tenth of the period of a tremor with
+10 Hz."""
 
 GATE_SIGMAS = 5.0
-"""The margin of the gate for measurement and prediction errors, in standard deviations."""
+"""The margin of the gate for measurement errors and prediction errors, in standard deviations."""
 
 
 def make_horizons_s(longest_s: float) -> Floats:
@@ -39,7 +39,7 @@ def make_horizons_s(longest_s: float) -> Floats:
 class TrackingSettings:
     """The settings of a tracker.
 
-    max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger's motion.  Points outside these
+    max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger's motion. Points outside these
         limits are rejected.
     track_timeout_s: maximum time without a point before the track is lost.
     confirm_frames: number of consecutive consistent points that start or replace a track.
@@ -55,14 +55,18 @@ class TrackingSettings:
 
 @dataclass(frozen=True, slots=True)
 class PositionMeasurement:
-    """A measured marker position (3,) m at the time `at_ns`, with its covariance (3, 3) m^2."""
+    """A measured marker position (3,), m, at the time `at_ns`, with its covariance (3, 3), m^2."""
 
     at_ns: int
     measured: Floats
     covariance: Floats
 
     def can_reach(self, later: PositionMeasurement, max_speed: float) -> bool:
-        """Return whether a finger can move from this point to a later one, allowing for noise."""
+        """Return whether a finger can move from this point to a later point.
+
+        max_speed: maximum speed of the finger, m/s.
+        The noise of both points is taken into account.
+        """
         distance = float(np.linalg.norm(later.measured - self.measured))
         noise = float(np.sqrt(np.trace(self.covariance) + np.trace(later.covariance)))
         return distance <= max_speed * (later.at_ns - self.at_ns) * 1e-9 + GATE_SIGMAS * noise
@@ -70,22 +74,25 @@ class PositionMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """A ball around the predicted point (3,) m in which the finger's marker is expected."""
+    """A ball around the predicted point (3,), m, in which the finger's marker is expected."""
 
     point: Floats
     radius_m: float
 
     def contains(self, measurement: PositionMeasurement) -> bool:
-        """Return whether a measured point can be the finger's marker, allowing for its noise."""
+        """Return whether a measured point can be the finger's marker.
+
+        The noise of the point increases the size of the gate.
+        """
         noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
         return float(np.linalg.norm(measurement.measured - self.point)) <= self.radius_m + noise_m
 
 
 @dataclass(frozen=True, slots=True)
 class TrackPrediction:
-    """The predicted state of the tracked point at one time, and its predicted path (n, 3) m.
+    """The predicted state of the tracked point at one time, and its predicted path (n, 3), m.
 
-    covariance: (6, 6), joint covariance of position (3,) m and velocity (3,) m/s.
+    covariance: joint covariance (6, 6) of position (3,), m, and velocity (3,), m/s.
     """
 
     position: Floats
@@ -109,15 +116,15 @@ class Tracker:
 
     @property
     def estimate(self) -> Estimate | None:
-        """Return the newest estimate, even if the track is lost; None before the first point."""
+        """Return the newest estimate, also if the track is lost; None before the first point."""
         return self._history[-1][1] if self._history else None
 
     def is_late(self, at_ns: int) -> bool:
-        """Return whether the time `at_ns` of a point is at or before the time of the estimate."""
+        """Return whether a point at the time `at_ns` is not newer than the estimate."""
         return self.estimate is not None and at_ns <= self.estimate.at_ns
 
     def state(self, at_ns: int) -> FingertipState:
-        """Return the state of the track at `at_ns`, which must be at or after its newest point."""
+        """Return the state of the track at `at_ns`, which must not be before its newest point."""
         if not self._is_alive(at_ns):
             return "acquiring" if self._tentative_track else "lost"
         assert self.estimate is not None
@@ -126,7 +133,7 @@ class Tracker:
     def gate(self, at_ns: int) -> Gate | None:
         """Return the gate at a time after the newest point of the track.
 
-        Return None if the finger is not tracked, or if `at_ns` is not after the newest point.
+        Returns None if the finger is not tracked, or if `at_ns` is not after the newest point.
         """
         if not self._is_alive(at_ns) or self.is_late(at_ns):
             return None
@@ -147,10 +154,10 @@ class Tracker:
         )
 
     def predict_at(self, at_ns: int, horizons_s: Floats) -> TrackPrediction:
-        """Predict position, velocity and path at a time at or after the newest point.
+        """Predict position, velocity and path at the time `at_ns`, not before the newest point.
 
-        horizons_s: (n,) times of the path's points after `at_ns`; the first time must be 0.
-        If the track is lost, the predicted path is the last position.
+        horizons_s: times (n,) of the path's points after `at_ns`; the first time must be 0.
+        If the track is lost, all points of the predicted path are the last position.
         """
         estimate = self.estimate
         if estimate is None:
@@ -167,7 +174,7 @@ class Tracker:
         return TrackPrediction(ahead[0], velocity, covariance, ahead)
 
     def velocity_at(self, at_ns: int) -> tuple[Floats, Floats]:
-        """Return the velocity (3,) m/s and its covariance (3, 3) m^2/s^2 at `at_ns`.
+        """Return the velocity (3,), m/s, and its covariance (3, 3), m^2/s^2, at the time `at_ns`.
 
         If the finger is not tracked, the velocity is zero.
         """
@@ -177,9 +184,9 @@ class Tracker:
         return velocity, covariance[3:, 3:]
 
     def update(self, at_ns: int, measured: Floats, covariance: Floats) -> GateResult:
-        """Add a measured point (3,) m to the track if it is inside the gate.
+        """Add a measured point (3,), m, to the track if the point is inside the gate.
 
-        covariance: (3, 3) m^2 of the point's noise.
+        covariance: noise covariance (3, 3), m^2, of the point.
         """
         measurement = PositionMeasurement(at_ns, measured, covariance)
         if self.is_late(at_ns):
@@ -216,9 +223,10 @@ class Tracker:
     def _extend_tentative_track(
         self, measurement: PositionMeasurement, unconfirmed_result: GateResult
     ) -> GateResult:
-        """Add a point to the tentative track, which replaces the track when it is long enough.
+        """Add a point to the tentative track.
 
-        unconfirmed_result: result to return while the tentative track is too short.
+        When the tentative track is long enough, it replaces the track.
+        unconfirmed_result: result while the tentative track is too short.
         """
         self._tentative_track = self._consistent_run(self._tentative_track, measurement)
         if len(self._tentative_track) < self.settings.confirm_frames:
@@ -248,11 +256,11 @@ class Tracker:
         return "ok"
 
     def _insert_late(self, measurement: PositionMeasurement) -> GateResult:
-        """Insert a late point into the history, and filter the later points again.
+        """Insert a late point into the history, and filter all later points again.
 
-        Several consecutive late points restart the track, because the clock was then set back.  A
-        late point is dropped if it is older than the history, a duplicate or outside the gate.  It
-        is also dropped if no point is missing at its time.
+        After several consecutive late points the track restarts, because the clock was then set
+        back. A late point is dropped if it is older than the history, a duplicate or outside the
+        gate. It is also dropped if the history is complete at its time.
         """
         self._late = self._consistent_run(self._late, measurement)
         if len(self._late) >= self.settings.confirm_frames:

@@ -16,32 +16,32 @@ from flexsheet.nodes.triangulator.filters import Estimate, Filter
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 
 TruePath = Callable[[float], Floats]
-"""A function that returns the true fingertip (3,) m in the world at a given time (s)."""
+"""A function that returns the true fingertip position (3,), m, in the world at a given time (s)."""
 
 MARKER_NOISE_PX = 0.01
-"""The standard deviation of a marker's centre by the subpixel fit at a distance of half a metre
-(`flexsheet chart marker`)."""
+"""The standard deviation of a marker's centre at a distance of half a metre. It was measured for
+the subpixel fit by `flexsheet chart marker`."""
 
 HORIZON_MS = "horizon_ms"
-"""The key of a case's prediction horizon."""
+"""The key for the prediction horizon of a benchmark case."""
 
 HORIZONS_S = (0.0, 0.02, 0.05)
-"""The prediction horizons after the exposure: no prediction, until the frame is displayed, and
-until the arms have moved."""
+"""The prediction horizons after the exposure. They correspond to no prediction, to the display of
+the frame, and to the motion of the arms."""
 
 WARM_UP_S = 0.4
 SPEED_STEP_S = 0.02
 SPEED_MARGIN = 1.5
-"""The maximum ratio of a path's speed to the scene's speed for which the path belongs to the scene.
-It permits tremor and acceleration."""
+"""The ratio of a path's speed to the scene's speed up to which the path is in the scene's range. It
+allows for tremor and acceleration."""
 WITHOUT_VELOCITY = ("none",)
-"""The methods that do not estimate a velocity.  They may be used for a resting finger, and for a
+"""The methods that do not estimate a velocity. They are suitable for a resting finger, and for a
 moving finger only without prediction."""
 
 
 @dataclass(frozen=True, slots=True)
 class TruePathCase:
-    """A true path of a finger that starts at time 0.
+    """A true path of a finger, which starts at the time 0.
 
     resting: whether the finger has no motion except tremor.
     """
@@ -52,7 +52,7 @@ class TruePathCase:
 
     @property
     def speed_m_per_s(self) -> float:
-        """Return the 0.9 quantile (m/s) of the finger's speed."""
+        """Return the 0.9 quantile of the finger's speed, m/s."""
         times = np.arange(WARM_UP_S, self.duration_s, SPEED_STEP_S)
         points = np.array([self.path(float(time)) for time in times])
         distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -61,11 +61,12 @@ class TruePathCase:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredPath:
-    """The simulated measurements of a path.
+    """The simulated measurements of a path at n times.
 
-    times_ns: (n,).  points: (n, 3) m.  covariances: (n, 3, 3) m^2.
+    times_ns: times (n,). points: measured points (n, 3), m. covariances: covariances (n, 3, 3),
+        m^2.
 
-    truth: for each prediction horizon, the true points (n, 3) m at the predicted times.
+    truth: true points (n, 3), m, at the predicted times, for each prediction horizon.
     """
 
     times_ns: NDArray[np.int64]
@@ -77,7 +78,10 @@ class MeasuredPath:
 def measure_path(
     scene: Scene, motion: TruePathCase, *, seed: int, noise_px: float = MARKER_NOISE_PX
 ) -> MeasuredPath:
-    """Simulate the measurement of a path by the scene's stereo camera, with noisy markers."""
+    """Simulate the measurement of a finger's path by the scene's stereo camera.
+
+    seed: seed of the random noise. noise_px: standard deviation of a marker's centre.
+    """
     geometry, random = StereoGeometry.of(scene.camera), np.random.default_rng(seed)
     times = np.arange(0.0, motion.duration_s, 1.0 / scene.camera.rate_hz)
     covariance_px = noise_px**2 * np.eye(2)
@@ -104,7 +108,7 @@ def measure_path(
 
 
 def predict_path(filter_: Filter, seen: MeasuredPath, horizon_s: float) -> Floats:
-    """Run a filter over n measurements, and return a prediction (n, 3) m after each of them.
+    """Run a filter over n measurements, and return a prediction (n, 3), m, after each measurement.
 
     horizon_s: time from a measurement to the predicted position.
     """
@@ -126,7 +130,7 @@ def make_tracking_family(
 ) -> Family:
     """Define the benchmark of the tracking methods.
 
-    motions: function that returns the true paths by name, for a scene.
+    motions: function that returns the true paths of a scene by name.
     noise_px: standard deviation of a marker's centre.
     """
 

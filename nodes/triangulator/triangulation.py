@@ -1,8 +1,8 @@
 """Triangulate a marker from two images, and compute the covariance of its position.
 
-A triangulation method takes undistorted normalized coordinates (n, 2) of both views and the
-transform `right_from_left`. It returns points (n, 3), in m, in the left camera's frame. For
-parallel rays these contain infinite or NaN elements, which the caller must reject.
+A triangulation method receives undistorted normalized coordinates (n, 2) of both views and the
+transform `right_from_left`. It returns points (n, 3), m, in the left camera's frame. For parallel
+rays, the points contain infinite or NaN elements, which the caller must reject.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from flexsheet.nodes.models import camera, rigid
 
 NEWTON_STEPS = 12
 MIN_DISTORTION_SLOPE = 0.05
-"""The minimum determinant of the distortion's Jacobian.  Near zero, the lens model is not
-invertible, because it maps two rays to one pixel."""
+"""The minimum determinant of the distortion's Jacobian. If the determinant is near zero, the lens
+model is not invertible, because two rays have the same pixel."""
 
 MIN_SINE = 1e-6
-"""The minimum sine of the angle between two rays.  With a smaller sine they count as parallel."""
+"""The minimum sine of the angle between two rays. With a smaller sine, the rays are treated as
+parallel."""
 
 MAX_DISTANCE_M = 1e4
-"""The maximum depth of a point.  The rays to more distant points are parallel within rounding
+"""The maximum depth of a point. The rays to more distant points are parallel within rounding
 errors."""
 
 
 @dataclass(frozen=True, slots=True)
 class StereoGeometry:
-    """The geometry of a stereo rig: camera matrices 3x3, distortions (5,), transforms 4x4."""
+    """The geometry of a stereo camera: camera matrices 3x3, distortions (5,), transforms 4x4."""
 
     device: str
     width_px: int
@@ -50,10 +51,11 @@ class StereoGeometry:
     def of(
         scene_camera: StereoCamera, calibration: StereoCalibration | None = None
     ) -> StereoGeometry:
-        """Make the geometry of the scene's stereo rig.
+        """Make the geometry of the scene's stereo camera.
 
-        calibration: source of the optics; None: the scene.  The pose of the rig is always that of
-        the scene.  Raises CalibrationMismatchError if the calibration belongs to another camera.
+        calibration: source of the lens parameters; None to use the values of the scene. The pose of
+            the stereo camera always comes from the scene.
+        Raises CalibrationMismatchError if the calibration belongs to another camera.
         """
         optics: StereoCamera | StereoCalibration = scene_camera
         if calibration is not None:
@@ -72,7 +74,10 @@ class StereoGeometry:
         )
 
     def project(self, points_world: Floats) -> tuple[Floats, Floats]:
-        """Project world points (..., 3), in front of both cameras, to pixels (..., 2)."""
+        """Project world points (..., 3), m, to pixels (..., 2) of both views.
+
+        The points must be in front of both cameras.
+        """
         in_left = rigid.apply(self.left_from_world, points_world)
         in_right = rigid.apply(self.right_from_left, in_left)
         return (
@@ -81,7 +86,7 @@ class StereoGeometry:
         )
 
     def normalize(self, left_px: Floats, right_px: Floats) -> tuple[Floats, Floats]:
-        """Convert pixels of both views to undistorted normalized coordinates (..., 2)."""
+        """Convert pixels (..., 2) of both views to undistorted normalized coordinates (..., 2)."""
         return (
             camera.normalize(left_px, self.matrices[0], self.distortions[0]),
             camera.normalize(right_px, self.matrices[1], self.distortions[1]),
@@ -100,7 +105,10 @@ class ImageMismatchError(FlexsheetError, ValueError):
 
 
 def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
-    """Raise ImageMismatchError unless the images, full or cropped, can come from this rig."""
+    """Check whether images can come from this stereo camera; if not, raise ImageMismatchError.
+
+    pair: full or cropped images.
+    """
     if pair.device != geometry.device:
         raise ImageMismatchError(
             f'the images come from the device "{pair.device}", but the camera of the scene is '
@@ -119,12 +127,12 @@ def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ClosestApproach:
-    """A solver for the closest approach of two camera rays.
-
-    The geometry is stored as Python numbers, which are faster than small arrays.
+    """A solver for the closest points of two camera rays.
 
     rotation_rows: rows of the rotation from the right to the left camera's axes.
     origin: position of the right camera in the left camera's frame, m.
+    The geometry is stored as Python numbers, because computing with them is faster than with small
+    arrays.
     """
 
     rotation_rows: tuple[tuple[float, float, float], ...]
@@ -141,10 +149,10 @@ class ClosestApproach:
     def between(
         self, left: tuple[float, float], right: tuple[float, float]
     ) -> tuple[Floats, float] | None:
-        """Return midpoint (3,), in m, and length (m) of the shortest segment between two rays.
+        """Return the midpoint (3,), m, and the length (m) of the shortest segment between two rays.
 
         left, right: undistorted normalized coordinates (x, y) of the rays.
-        Return None if the rays are parallel, or if the segment is behind a camera.
+        Returns None if the rays are parallel, or if the segment is behind a camera.
         """
         (ax, ay), (ox, oy, oz) = left, self.origin
         bx, by, bz = (row[0] * right[0] + row[1] * right[1] + row[2] for row in self.rotation_rows)
@@ -163,8 +171,10 @@ class ClosestApproach:
 
 
 def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
-    """Triangulate by the direct linear transform, a homogeneous linear least-squares problem.
+    """Triangulate points by the direct linear transform (homogeneous linear least squares).
 
+    left, right: undistorted normalized coordinates (n, 2). right_from_left: transform (4, 4).
+    Returns points (n, 3), m, in the left camera's frame.
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., section 12.2.
     """
     projections = (np.eye(3, 4), right_from_left[:3])
@@ -179,9 +189,10 @@ def dlt(left: Floats, right: Floats, right_from_left: Floats) -> Floats:
 def project_with_jacobian(
     point: Floats, matrix: Floats, distortion: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the pixel (2,) of a point (3,) m in a camera's frame, and its Jacobian (2, 3) px/m.
+    """Return the pixel (2,) of a point (3,), m, in the camera's frame, and its Jacobian.
 
-    The computation uses Python numbers, which are ten times faster than arrays with two elements.
+    The Jacobian is (2, 3), px/m. The computation uses Python numbers, which are ten times as fast
+    as arrays with two elements.
     """
     px, py, pz = point.tolist()
     fx, fy, cx, cy = _intrinsics(matrix)
@@ -198,9 +209,10 @@ def project_with_jacobian(
 def undistort_pixel(
     pixel: Floats, matrix: Floats, distortion: Floats
 ) -> tuple[float, float] | None:
-    """Return undistorted normalized coordinates of one pixel (2,), by Newton's method.
+    """Return the undistorted normalized coordinates of one pixel (2,), by Newton's method.
 
-    Return None if the pixel is not finite or outside the invertible range of the distortion.
+    Returns None if the pixel is not finite, or outside the range in which the lens model is
+    invertible.
     """
     fx, fy, cx, cy = _intrinsics(matrix)
     k = distortion.tolist()
@@ -249,10 +261,11 @@ def _distort(
 
 @dataclass(frozen=True, slots=True)
 class TriangulatedPoint:
-    """A triangulated marker: position (3,) m, covariance (3, 3) m^2, rms reprojection error (px).
+    """A triangulated marker: position (3,), m, covariance (3, 3), m^2, and reprojection error (px).
 
-    The covariance follows to first order from the covariances of the centres in both images.  For
-    nearly parallel rays it increases with the fourth power of the depth.
+    The reprojection error is a root mean square. The covariance is computed to first order from the
+    covariances of the centres in both images. For nearly parallel rays, it increases with the
+    fourth power of the depth.
     """
 
     point_world: Floats
@@ -273,15 +286,16 @@ def measure(
     covariance: Floats,
     right_covariance: Floats | None = None,
 ) -> TriangulatedPoint | None:
-    """Triangulate a marker from its pixels (2,) in both views, with covariances (2, 2) px^2.
+    """Triangulate a marker from its pixels (2,) in both views.
 
-    covariance: covariance of the left pixel.  right_covariance: covariance of the right pixel;
-    None: equal to that of the left pixel.
+    covariance: covariance (2, 2), px^2, of the left pixel.
+    right_covariance: covariance (2, 2), px^2, of the right pixel; None if equal to that of the left
+        pixel.
 
-    Return None if the point is not in front of both cameras, or if a pixel is not finite or outside
-    the range of the lens model.  Both views have equal weights.  The covariances are therefore
-    propagated by (J^T J)^-1 J^T, with the Jacobian J of the four pixel coordinates with respect to
-    the point.
+    Both views have equal weights. The covariances are therefore propagated by (J^T J)^-1 J^T, with
+    the Jacobian J of the four pixel coordinates with respect to the point.
+    Returns None if the point is not in front of both cameras, or if a pixel is invalid for the lens
+    model.
     """
     left = undistort_pixel(left_px, geometry.matrices[0], geometry.distortions[0])
     right = undistort_pixel(right_px, geometry.matrices[1], geometry.distortions[1])
