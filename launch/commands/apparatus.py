@@ -47,7 +47,10 @@ def sample(
     scene: SceneOption = CYLINDER,
     as_json: JsonOption = False,
 ) -> None:
-    """Sample an apparatus randomly within the tolerances of the hardware; write it to a file."""
+    """Sample a random apparatus within the tolerances of the hardware, and write it to a file.
+
+    An apparatus is a set of true parameters of simulated hardware.
+    """
     from flexsheet.launch.plans.apparatus import format_apparatus
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.files import write_file
@@ -80,7 +83,7 @@ def show(
     scene: SceneOption = CYLINDER,
     as_json: JsonOption = False,
 ) -> None:
-    """Check an apparatus file, and list its differences from the scene.
+    """Check an apparatus, and list how its parameters differ from the scene.
 
     The exit code is 2 if the file has unknown keys or impossible values, or belongs to another
     scene.

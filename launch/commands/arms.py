@@ -43,7 +43,10 @@ ReasonOption = Annotated[str, typer.Option("--reason", help="Reason, which is sh
 
 @app.command(epilog=examples("flexsheet arms status", "flexsheet arms status --json"))
 def status(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Print the state of both arms; exit code 1 if an arm does not report."""
+    """Print the state of both arms.
+
+    The exit code is 1 if an arm does not report its state.
+    """
     raise typer.Exit(run_interruptible(_command(run, None, lambda arms: len(arms) == 2, as_json)))
 
 
@@ -65,7 +68,7 @@ def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
 
 @app.command(epilog=examples("flexsheet arms disable --reason 'end of the session'"))
 def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Stop both arms and slacken the sheet, until `flexsheet arms enable`."""
+    """Stop both arms and slacken the sheet until you run `flexsheet arms enable`."""
     from flexsheet.messages.types import Arming
 
     message = Arming(ready=False, reason=reason)
@@ -82,8 +85,8 @@ def stop(
 ) -> None:
     """Engage the software e-stop of the arms, which stays engaged until it is reset.
 
-    It does not replace the hard-wired e-stop. Without --run, the arms of all graphs of this user on
-    this computer are stopped.
+    This command does not replace the hard-wired e-stop. Without --run, it stops the arms of all
+    graphs of this user on this computer.
 
     The exit code is 0 if a launcher or an arm bridge confirms the stop, or if both arms report it.
     """
@@ -100,9 +103,9 @@ def stop(
 async def _confirm_stop(
     run_directory: Path | None, reason: str, attempts: list[StopAttempt], as_json: bool
 ) -> int:
-    """Print the result of the stop attempts and the state of the arms; return the exit code.
+    """Print the results of the stop attempts and the states of the arms; return the exit code.
 
-    If no launcher has confirmed the stop, it is also published on the topic estop.
+    If no launcher has confirmed a stop, also publish an e-stop on the topic `estop`.
     """
     from flexsheet.launch.running.stopping import StopOutcome, StopPath
     from flexsheet.messages.types import EStop
@@ -157,7 +160,7 @@ def reset(
 
 
 def _describe_reset(plan: ResolvedGraph) -> str:
-    """Return a text that states when each arm moves after a reset, as its bridge defines."""
+    """Return a text that states under which condition each arm moves after a reset."""
     from flexsheet.launch.plans.plan_model import ArmingMode
 
     arming = {
@@ -178,7 +181,10 @@ def _describe_reset(plan: ResolvedGraph) -> str:
 
 
 class _Arms:
-    """An asynchronous context manager that receives states of arms and publishes commands."""
+    """A connection to a running graph that receives the states of the arms and publishes commands.
+
+    Use it as an asynchronous context manager.
+    """
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
@@ -211,7 +217,7 @@ class _Arms:
         self.states[state.side], self._received_s[state.side] = state, self._loop.time()
 
     async def publish(self, topic: str, message: Message) -> None:
-        """Wait until readers have connected, then publish a message once."""
+        """Wait until subscribers have connected, then publish a message once."""
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
 
         self._writer = GraphWriter(self._plan, self._run, [topic])
@@ -219,7 +225,10 @@ class _Arms:
         self._writer.publish(topic, message)
 
     async def publish_stop(self, estop: EStop) -> StopAttempt:
-        """Publish an e-stop immediately; the topic is latched, so late readers receive it too."""
+        """Publish an e-stop without waiting for subscribers; return the result and its duration.
+
+        The topic is latched, so subscribers that connect later also receive the e-stop.
+        """
         from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
         from flexsheet.messages.bus import BusError
@@ -235,7 +244,7 @@ class _Arms:
         return StopAttempt(StopPath.TOPIC, "estop", outcome, 1e3 * (self._loop.time() - begun_s))
 
     async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
-        """Wait until recent arm states satisfy `done`; return False on a timeout."""
+        """Wait until `done` returns True for the recent arm states; return False on a timeout."""
         for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
             now_s = self._loop.time()
             if done(
@@ -258,8 +267,8 @@ async def _command(
 ) -> int:
     """Publish a command to both arms, wait for its effect, and print the states of the arms.
 
-    command: topic and message; if None, nothing is published. done: function that decides from the
-    states whether the wait is over. Returns the exit code.
+    command: topic and message; None publishes nothing. done: function that receives the arm states
+    and returns True when the command has had its effect. Returns the exit code.
     """
     from flexsheet.launch.running.tools import tools_host
 

@@ -1,4 +1,4 @@
-"""`flexsheet bag`: record, play, recover, export, verify and report on bags."""
+"""`flexsheet bag`: record, play, recover, export and verify bags, and write reports on them."""
 
 from __future__ import annotations
 
@@ -104,7 +104,10 @@ def record(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Record topics of the running graph until Ctrl-C; default: all topics marked as logged."""
+    """Record topics of the running graph until Ctrl-C.
+
+    By default, all topics that are marked as logged are recorded.
+    """
     running = running_graph(run)
     target = output or bag or Path("runs") / f"{datetime.now():%Y%m%d-%H%M%S}.mcap"
     if target.exists():
@@ -219,7 +222,7 @@ def recover(
     output: Annotated[Path | None, output_file("Recovered bag to write.", "BAG")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the readable messages of a truncated or damaged bag to a new bag."""
+    """Copy the readable messages of a truncated or damaged bag to a new bag."""
     from flexsheet.messages.bag import recover as recover_bag
 
     output = _require_output(output or target)
@@ -327,8 +330,8 @@ def verify(
     """Run a node twice on its recorded inputs, and compare the outputs.
 
     The exit code is 1 if the two runs differ, if the node fails, or if it cannot be replayed. The
-    exit code is 3 if the runs are equal but differ from the recorded outputs, for example because
-    the node reads the system clock.
+    exit code is 3 if the two runs are equal but differ from the recorded outputs. This happens, for
+    example, if the node reads the system clock.
     """
     from flexsheet.launch.bags.replay import verify as verify_node
 
@@ -362,10 +365,10 @@ def report(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write an HTML report on a recording: faults, charts, tables and images.
+    """Write an HTML report on a recording, with faults, charts, tables and images.
 
     The page needs no network connection. With --json, the command prints the values, and writes a
-    page only if --output is given. It reads a truncated bag as far as possible.
+    page only if --output is given. If the bag is truncated, the report covers its readable part.
     """
     from flexsheet.launch.bags.report.write import default_output
     from flexsheet.launch.bags.report.write import report as report_on
@@ -401,9 +404,10 @@ def plot(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Plot fields of recorded topics against time; with --json, print their values instead.
+    """Plot fields of recorded topics against time.
 
-    With --json, an image is written only if --output is given.
+    With --json, the command prints the values instead, and writes an image only if --output is
+    given.
     """
     from flexsheet.launch.bags.plot import draw_fields, read_fields
 
@@ -419,7 +423,7 @@ def plot(
 
 
 def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
-    """Print the number of exported messages by topic or channel, and the unreadable topics."""
+    """Print the number of exported messages by topic or channel, and list the unreadable topics."""
     if result.unreadable:
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED
@@ -479,7 +483,7 @@ def _print_verification(result: Verification) -> None:
 
 
 def _describe_result(result: Verification) -> str:
-    """Describe the result of `bag verify`, with the likely cause of a difference."""
+    """Return a text about the result of `bag verify` and the likely cause of a difference."""
     if result.errors:
         return "the node failed; see its last error above"
     if not result.same_bytes:
@@ -513,7 +517,7 @@ async def _record(
     running: tuple[ResolvedGraph, Run],
     seconds: float | None,
 ) -> int:
-    """Run a recorder in this process that records topics of the running graph; return 0."""
+    """Record topics of the running graph in this process, and return the exit code 0."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
     from flexsheet.launch.running.runs import local_sources, ring_file
     from flexsheet.launch.running.tools import tools_host
@@ -569,7 +573,10 @@ async def _record(
 
 
 async def _show_remaining(label: str, duration_s: float | None) -> None:
-    """Show a progress bar for a recording of limited duration; None: no limit and no bar."""
+    """Show a progress bar for a recording of limited duration.
+
+    Show nothing if `duration_s` is None, which means that the duration has no limit.
+    """
     if duration_s is None:
         return
     loop = asyncio.get_running_loop()
@@ -582,7 +589,11 @@ async def _show_remaining(label: str, duration_s: float | None) -> None:
 
 @dataclass(frozen=True, slots=True)
 class PlayRequest:
-    """Options of `bag play`: bag, topics, speed as a factor, and start position."""
+    """The options of `bag play`.
+
+    rate: playback speed relative to the recording. start_s: time in the bag at which playback
+    starts.
+    """
 
     bag: Path
     topics: tuple[str, ...]

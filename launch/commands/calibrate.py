@@ -1,7 +1,7 @@
 """`flexsheet calibrate`: calibrate a stereo camera with images of a calibration board.
 
-The module also contains the commands that check such calibrations, and functions that the commands
-of other calibrations use.
+The module also contains the commands that check these calibrations, and functions that other
+calibration commands use.
 """
 
 from __future__ import annotations
@@ -301,10 +301,11 @@ def cross_check(
     ] = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Cross-validate a calibration: measure image pairs that it did not use.
+    """Cross-validate a calibration with image pairs that were not used to compute it.
 
     The command calibrates repeatedly, each time without some of the image pairs, and measures the
-    board in these. It also prints the errors of a calibration by OpenCV's functions alone.
+    board in these pairs. It also prints the errors of a calibration that uses OpenCV's functions
+    only.
     """
     from flexsheet.launch.calibration import check
 
@@ -350,7 +351,7 @@ def print_board(
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
 ) -> None:
-    """Write an image of a calibration board, to be printed at true size.
+    """Write an image of a calibration board for printing at true size.
 
     The board is a chessboard; with --marker-mm, it is a ChArUco board.
     """
@@ -413,7 +414,8 @@ def _parse_board(text: str, square_mm: float, marker_mm: float | None, dictionar
 def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float | None:
     """Return the distance (m) at which the uncertainty is reported; None if it is not known.
 
-    The default is the distance of the left camera from the centre of the screen in the scene.
+    If `distance_mm` is None, this is the distance from the left camera to the centre of the screen
+    in the scene.
     """
     if distance_mm is not None:
         return 1e-3 * distance_mm
@@ -424,7 +426,7 @@ def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float
 
 @contextmanager
 def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
-    """Yield the YAML tree of a scene file, and write the tree to `copy` after the caller's changes.
+    """Yield the YAML tree of a scene file; when the context ends, write the changed tree to `copy`.
 
     Comments and layout are preserved. Raises BadInputError if the changed scene is invalid.
     """
@@ -439,7 +441,7 @@ def edit_scene(scene_file: Path, copy: Path) -> Iterator[Any]:
 def load_optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
     """Load a stereo calibration and check that it fits the scene's camera.
 
-    Return None if there is no path.
+    Returns None if `path` is None.
     """
     from flexsheet.messages.calibration import load_calibration, refuse_other_camera
     from flexsheet.messages.calibration_file import CalibrationMismatchError
@@ -463,10 +465,10 @@ def require_twin(apparatus: str | None, *, simulated: bool) -> None:
 def load_true_devices(
     text: str | None, scene: Scene, scene_file: Path | None = None
 ) -> Apparatus | None:
-    """Load the apparatus of a simulated calibration; return None if `text` is None.
+    """Load the apparatus (true parameters) of the simulated hardware; return None if `text` is
+    None.
 
-    The parameters of the apparatus refer to the world frame of the stereo camera, as all
-    calibrations do.
+    The returned parameters refer to the world frame of the stereo camera, as all calibrations do.
     """
     from flexsheet.launch.plans.apparatus import load_apparatus
     from flexsheet.nodes.twin.truth import align_world_to_camera
@@ -477,13 +479,13 @@ def load_true_devices(
 
 
 def round_digits(value: float) -> float:
-    """Round a calibrated value for a file to 1e-9 m, rad or px, and replace -0.0 by 0.0."""
+    """Round a calibrated value (m, rad or px) to nine decimal places, and replace -0.0 by 0.0."""
     return round(float(value), 9) + 0.0
 
 
 @contextmanager
 def _progress(label: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Show a progress bar on stderr; yield its update function (done, total, text)."""
+    """Show a progress bar on stderr, and yield its update function (done, total, text)."""
     from rich.progress import Progress
 
     with Progress(console=words.console, transient=True) as bar:

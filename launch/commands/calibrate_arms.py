@@ -70,7 +70,7 @@ SIDES: tuple[Side, Side] = ("left", "right")
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to `flexsheet calibrate`."""
+    """Add the commands that calibrate the arms to `flexsheet calibrate`."""
     app.command(
         "arms",
         epilog=examples(
@@ -133,7 +133,8 @@ def arms(
     """Measure the poses of the arm bases in the world frame of the stereo camera.
 
     Mount the board rigidly on the flange of an arm, and record 15 to 20 poses at rest with
-    different flange orientations (docs/arms.md). Give a folder for each arm, or --twin.
+    different flange orientations (docs/arms.md). Give the recorded folder of each arm, or use
+    --twin to simulate the arms.
     """
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.arms_calibration import save_arms_calibration
@@ -267,12 +268,11 @@ async def record_poses(
     places: int,
     run: Path | None,
 ) -> int:
-    """Pass images and arm states of the running graph to a recorder that collects poses.
+    """Pass images and arm states of the running graph to a recorder until it has enough poses.
 
-    The function returns when the recorder has enough poses.
-
-    on_arm: called with each state of the topics `arms` and the time (s) of its arrival. size: of
-    the images, px.
+    on_arm: function that is called with each message of the topics `arms` and its arrival time (s).
+    size: required width and height of the images, px. places: number of poses. Returns the exit
+    code.
     """
     import asyncio
     import time
@@ -329,7 +329,7 @@ def simulate_folder(
     places: int,
     seed: int,
 ) -> Path:
-    """Write the simulated poses of one arm to a new folder, and return its path."""
+    """Write simulated poses and board images of one arm to a new folder, and return its path."""
     from flexsheet.launch.calibration.arm_poses import simulate_poses
 
     poses = folder / side
@@ -429,7 +429,10 @@ def _write_copy(scene_file: Path, measured: ArmsCalibration, copy: Path) -> None
 def _true_errors(
     scene: Scene, side: Side, fit: BaseFit, apparatus: Apparatus | None, seed: int
 ) -> dict[str, float]:
-    """Return the errors of the flange of a simulated arm at the world origin, without backlash."""
+    """Return the true errors (m, rad) of the flange pose of a simulated, calibrated arm.
+
+    The joints are at the arm's start position; backlash is not included.
+    """
     import numpy as np
 
     from flexsheet.launch.calibration.arm_poses import SimulatedArm
@@ -545,7 +548,8 @@ def _format_pose(base: ArmBase) -> str:
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """Return distance (m) and angle (rad) between the base poses of scene and calibration."""
+    """Return the distance (m) and angle (rad) between an arm's base poses in scene and
+    calibration."""
     import numpy as np
 
     from flexsheet.nodes.models.rigid import pose_matrix, vector_from_rotation

@@ -1,4 +1,4 @@
-"""Define the commands that calibrate the poses of the sheet's edges on the arms."""
+"""`flexsheet calibrate edges`: calibrate the poses of the sheet's edges relative to the arms."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to `flexsheet calibrate`."""
+    """Add the commands that calibrate the sheet's edges to `flexsheet calibrate`."""
     app.command(
         "edges",
         epilog=examples(
@@ -72,10 +72,10 @@ def edges(
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure where the arms hold the sheet, from marks on the clamps that the camera sees.
+    """Measure where the arms hold the sheet, from camera images of marks on the clamps.
 
-    For each arm, the command fits the pose of the base, the pose of the edge on the flange, the
-    joint offsets and the compliance of the flange, and writes them into a copy of the scene.
+    For both arms, the command fits the poses of the base and of the sheet's edge on the flange. It
+    also fits joint offsets and flange compliance, and writes all results into a copy of the scene.
     """
     from flexsheet.launch.calibration.edge_fit import EdgeFitError, fit_edges
     from flexsheet.launch.calibration.edge_marks import read_edge_marks, simulate_edge_marks
@@ -160,9 +160,9 @@ def edges_capture(
 ) -> None:
     """Record marks on both clamps for `calibrate edges`, from the running graph.
 
-    Fix three bright marks on each clamp: at its centre and 45 % of its length above and below. Move
-    the sheet to poses that differ in position, rotation and stretch. The command records a
-    pose when both arms are at rest. Ctrl-C ends the recording.
+    Fix three bright marks on each clamp: one at its centre, and two at 45 % of its length above and
+    below the centre. Move the sheet to poses that differ in position, rotation and stretch. The
+    command records a pose when both arms are at rest. Ctrl-C ends the recording.
     """
     from flexsheet.launch.calibration.edge_marks import EdgeMarkRecorder
     from flexsheet.launch.plans.plan import load_scene

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to `flexsheet calibrate`."""
+    """Add the command `marker` to `flexsheet calibrate`."""
     app.command(
         "marker",
         epilog=examples(
@@ -70,10 +70,10 @@ def marker(
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Determine the marker's position relative to the pad of the finger, which touches the sheet.
+    """Determine the position of the marker relative to the finger pad, which touches the sheet.
 
-    The finger touches known points. The touches are rows of a CSV file (--rows, --scene) or are
-    simulated (--twin).
+    The finger touches points of known position. The touches are rows of a CSV file (--rows,
+    --scene) or are simulated (--twin).
     """
     from flexsheet.launch.calibration.touches import read_touches, simulate_touches
     from flexsheet.launch.plans.plan import load_scene
@@ -109,9 +109,11 @@ def marker(
 
 
 def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerCalibration:
-    """Fit the position of the marker to touches, and return the calibration.
+    """Fit the position of the marker on the finger to touches of known points.
 
-    Raises CommandError if the touches do not determine the position."""
+    source: text that names the origin of the data in the calibration. Raises CommandError if the
+    touches do not determine the position.
+    """
     from flexsheet.launch.calibration.marker_fit import MarkerFitError, fit_marker
     from flexsheet.messages.marker_calibration import MarkerCalibration
 

@@ -45,7 +45,7 @@ VOLUME_HALF_M = 0.1
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to `flexsheet calibrate`."""
+    """Add the command `projector` to `flexsheet calibrate`."""
     app.command(
         "projector",
         epilog=examples(
@@ -114,7 +114,8 @@ def projector(
     """Calibrate pose and lens of the projector, and write the result into a scene.
 
     The data are stereo images of Gray-code patterns on the sheet in three or more poses
-    (--pictures), four corners that were set manually (--corners), or simulated images (--twin).
+    (--pictures) or four corners that were set manually (--corners). With --twin, the images are
+    simulated.
     """
     from flexsheet.launch.calibration import gray_code
     from flexsheet.launch.calibration.projector import (
@@ -201,10 +202,10 @@ def read_views(folder: Path, count: int) -> Iterator[Views]:
 def simulate_views(
     scene: Scene, true: Projector, apparatus: Apparatus | None, poses: int, seed: int
 ) -> Iterator[Views]:
-    """Yield, for each pose of the sheet, the simulated left and right images of all patterns.
+    """Yield the simulated left and right images of all Gray-code patterns, for each sheet pose.
 
-    true: simulated projector. apparatus: other true devices, whose arms hold the sheet; None: the
-    sheet is flat, at the commanded poses.
+    true: simulated projector. apparatus: true parameters of the other simulated devices, whose arms
+    hold the sheet. If it is None, the sheet is flat and exactly at the commanded poses.
     """
     from rich.progress import track
 
@@ -229,7 +230,8 @@ def simulate_views(
 
 
 def load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
-    """Return the camera of the scene; a calibration replaces its lenses and its baseline."""
+    """Return the stereo camera of the scene, with the lenses and baseline of a calibration if
+    given."""
     optics = load_optics(calibration, scene)
     if optics is None:
         return scene.camera
@@ -261,7 +263,7 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
 
 
 def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
-    """Write a copy of a scene file with another projector, and preserve comments and layout."""
+    """Write a copy of a scene file with another projector; preserve comments and layout."""
     with edit_scene(scene_file, copy) as tree:
         lens, pose = tree["projector"]["lens"], tree["projector"]["world_from_projector"]
         for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
@@ -334,7 +336,11 @@ def _print_result(
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """Return the true image errors (mm) at the eye before and after a simulated calibration."""
+    """Return the mean and maximum image errors (mm) that the eye sees, before and after
+    calibration.
+
+    fitted: calibrated projector. true: simulated projector.
+    """
     from flexsheet.nodes.twin.projector import errors_at_eye, sheet_poses
 
     eye, planes = scene.eyes.centre_world_m, sheet_poses(7)

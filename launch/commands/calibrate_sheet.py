@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to `flexsheet calibrate`."""
+    """Add the command `sheet` to `flexsheet calibrate`."""
     app.command(
         "sheet",
         epilog=examples(
@@ -99,7 +99,7 @@ def sheet(
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Fit the force model of a sheet to forces of a finger that pushes it.
+    """Fit the force model of a sheet to the forces on a finger that pushes the sheet.
 
     The command fits the product of Young's modulus and thickness, the width without tension, and a
     cubic term of the force. The pushes are rows of a CSV file (--rows, --scene), come from a
@@ -165,9 +165,9 @@ def make_calibration(
     with_table: bool,
     with_prior: bool = False,
 ) -> SheetCalibration:
-    """Fit the force model of the sheet to pushes, and return it as a calibration.
+    """Fit the force model of the sheet to measured pushes, and return the calibration.
 
-    lines: line number of each push in its file. with_prior: see `fit_sheet_model`. Raises
+    lines: line number of each push in its file. with_prior: as in `fit_sheet_model`. Raises
     SheetModelFitError if the pushes do not determine the parameters.
     """
     from functools import partial
@@ -261,7 +261,11 @@ def _read_bag(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
 def simulate_pushes(
     scene: Scene, apparatus: Apparatus | None, *, places: bool, noise_n: float, seed: int
 ) -> list[MeasuredPush]:
-    """Simulate pushes like `simulate_rows`, and show a progress bar."""
+    """Simulate measured pushes on the sheet of a scene, and show a progress bar.
+
+    places: push the whole sheet instead of only its centre. noise_n: standard deviation of the
+    force noise, N.
+    """
     from rich.progress import Progress
 
     from flexsheet.launch.calibration.sheet_rows import simulate_rows

@@ -26,13 +26,17 @@ if TYPE_CHECKING:
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 POSES_PER_PAIR = 3
-"""The number of simulated board poses per requested image pair; not every pose is accepted."""
+"""The number of simulated board poses per requested image pair.
+
+It is greater than one because some poses are rejected.
+"""
 
 
 def read_device_views(source: str, scene: Scene) -> Iterator[Views]:
-    """Yield grey image pairs of a camera.  `source` is a YAML text as for camera nodes.
+    """Yield grey image pairs of a real camera.
 
-    Raises CommandError if the source is invalid or the device fails.
+    source: YAML text, as in the parameter `source` of a camera node. Raises CommandError if the
+    source is invalid or the device fails.
     """
     from pydantic import TypeAdapter, ValidationError
     from ruamel.yaml.error import YAMLError
@@ -76,9 +80,9 @@ def _read_views(described: AnySource, source: str, scene: Scene) -> Iterator[Vie
 def simulate_views(
     scene: Scene, board: Board, apparatus: Apparatus | None = None, *, pairs: int, seed: int
 ) -> Iterator[Views]:
-    """Yield simulated image pairs of a chessboard at sampled poses, one pair per pose.
+    """Yield simulated image pairs of a calibration board, one pair for each random pose.
 
-    The images are those of the scene's camera with the errors of the apparatus, if there is one.
+    The images are those of the scene's camera. If an apparatus is given, they include its errors.
     Raises CommandError if the board cannot be rendered.
     """
     from flexsheet.nodes.twin.board import TwinBoard
@@ -94,8 +98,8 @@ def simulate_views(
 def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
     """Write the image pairs that `capture` accepts to a new folder: left01.png, right01.png, ...
 
-    Stops when the board poses cover all required cases, after the last pair, or at Ctrl-C; prints
-    the missing cases. Returns the number of pairs, which is at least one.
+    The function stops when the accepted board poses meet all requirements, when `views` ends, or at
+    Ctrl-C. It prints the requirements that are not met. Returns the number of pairs, at least one.
     """
     if folder.exists():
         raise CommandError(f"--pictures {folder}: the folder exists; name a new folder")
@@ -130,9 +134,9 @@ def write_pairs(views: Iterator[Views], capture: Capture, folder: Path) -> int:
 
 @contextmanager
 def _show_coverage(capture: Capture) -> Iterator[Any]:
-    """Show the coverage; yield its update function (hint, accepted).
+    """Show the coverage of board poses in the terminal; yield its update function (hint, accepted).
 
-    If stderr is not a terminal, one line is printed per accepted pair.
+    If stderr is not a terminal, one line is printed for each accepted pair.
     """
     if not words.is_terminal:
 
@@ -150,7 +154,10 @@ def _show_coverage(capture: Capture) -> Iterator[Any]:
 
 
 def coverage_view(capture: Capture, hint: str) -> RenderableType:
-    """Return tables of actual and required numbers of pairs by image cell, tilt and distance."""
+    """Return tables of the actual and required numbers of image pairs by cell, tilt and distance.
+
+    A cell is a part of the camera image.
+    """
     from rich.columns import Columns
     from rich.console import Group
     from rich.table import Table

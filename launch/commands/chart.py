@@ -1,4 +1,4 @@
-"""`flexsheet chart`: measure computing time and accuracy of the methods in a method family."""
+"""`flexsheet chart`: measure the computing time and accuracy of alternative methods."""
 
 from __future__ import annotations
 
@@ -108,11 +108,11 @@ def chart(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure computing time and error of the methods in a method family; draw a chart.
+    """Measure the computing time and error of the methods in a method family, and draw a chart.
 
     For each method, the command prints the maximum of the median times and of the errors over all
-    cases in the method's range. "front" marks a method if no other method is both faster and more
-    accurate. `system` measures whole graphs instead. To continue an interrupted measurement of
+    cases that the method supports. "front" marks a method if no other method is both faster and
+    more accurate. `system` measures whole graphs instead. To continue an interrupted measurement of
     `system`, repeat the command with the same --output.
     """
     logs_on_stderr()

@@ -21,9 +21,11 @@ def measure_system(
     configurations: Sequence[str],
     as_json: bool,
 ) -> None:
-    """Measure configurations of the system and draw a chart of the results.
+    """Measure latency, load and errors of graph configurations, and draw a chart of the results.
 
-    If the output folder contains an earlier measurement, continue it.
+    If the output folder contains an earlier measurement, continue that measurement. blocks: number
+    of repetitions. seconds: duration of each stroke. apparatuses: number of samples of inaccurate
+    hardware.
     """
     import json
 

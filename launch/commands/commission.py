@@ -1,4 +1,4 @@
-"""`flexsheet commission`: calibrate all devices of a laboratory in sequence, and verify them."""
+"""`flexsheet commission`: calibrate and verify all devices of a laboratory in sequence."""
 
 from __future__ import annotations
 
@@ -137,11 +137,11 @@ def commission(
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate camera, arms, sheet, projector, marker and eyes in sequence; verify the result.
+    """Calibrate camera, arms, sheet, projector, marker and eyes in sequence, and verify the result.
 
     The command does not repeat finished steps. With --apparatus, all devices are simulated.
-    Otherwise the command stops with exit code 1 at a step whose data are missing, and states how to
-    capture the data.
+    Otherwise, if the data of a step are missing, the command states how to capture them and stops
+    with exit code 1.
     """
     from flexsheet.launch.calibration.commission import MissingDataError, StepName
     from flexsheet.launch.commands.calibrate import FOUR_BITS, _parse_board
@@ -208,9 +208,10 @@ def _parse_step(option: str, text: str) -> StepName:
 
 
 def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
-    """Parse the values STEP=TEXT of an option; return the texts by step.
+    """Parse the values STEP=TEXT of a command-line option; return the texts by step.
 
-    Raises CommandError for an unknown step or an empty text."""
+    Raises CommandError for an unknown step or an empty text.
+    """
     pairs = {}
     for one in given or ():
         name, _, text = one.partition("=")
@@ -223,7 +224,7 @@ def _parse_pairs(option: str, given: list[str] | None) -> dict[StepName, str]:
 
 
 def summarize(lab: Commissioning) -> dict[str, Any]:
-    """Return the result of `commission --json`."""
+    """Return the state of a commissioning as the JSON output of `flexsheet commission --json`."""
     from flexsheet.launch.calibration.commission import APPARATUS_FILE, REPORT_FILE, StepName
 
     steps = []

@@ -1,8 +1,8 @@
 """Run the steps of `flexsheet commission`, with simulated devices or with captured data.
 
-The steps use the functions of the commands `flexsheet calibrate`. An apparatus holds the true
-parameters of simulated devices. The steps use only what these devices measure: images, joint
-angles, the forces of a gauge, and the finger's radius.
+The steps use the functions of the commands `flexsheet calibrate`. With simulated devices, the steps
+use only the measurements of these devices: images, joint angles, the forces of a gauge, and the
+finger's radius. The steps do not read the true parameters (apparatus).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 STEREO, ARMS, SHEET, MARKER = "stereo.yaml", "arms.yaml", "sheet.yaml", "marker.yaml"
 BOARD = Board(kind="chessboard", columns=9, rows=6, square_m=0.025)
 FLANGE_BOARD = Board(kind="chessboard", columns=7, rows=5, square_m=0.015)
-"""Calibration boards of simulated laboratories, for the camera and for the flanges."""
+"""The calibration board on the flanges of simulated laboratories."""
 
 CALLIPER_M = 3e-4
 """The standard deviation of the simulated measurement of the finger's radius, in metres."""
@@ -68,7 +68,7 @@ GAUGE_N = 0.005
 WEIGHING_RATIO = 0.004
 """The relative standard deviation of the measured mass per area of a simulated sheet.
 
-The errors of the scale (0.2 g) and of the ruler (0.5 mm) cause it.
+It is caused by the errors of the scale (0.2 g) and of the ruler (0.5 mm).
 """
 
 INSTRUCTIONS: dict[StepName, str] = {
@@ -99,7 +99,7 @@ REPEAT: dict[str, StepName] = {
     "marker_offset": StepName.MARKER,
     "sheet_stiffness": StepName.SHEET,
 }
-"""The step to repeat, by the calibration error that the self-checks of the nodes suspect."""
+"""The commissioning step to repeat for each calibration error that a node's self-check reports."""
 
 
 def open_laboratory(
@@ -109,9 +109,10 @@ def open_laboratory(
     apparatus: str | None = None,
     **options: Any,
 ) -> tuple[Commissioning, Laboratory]:
-    """Open the folder of a commissioning, and its devices; options: fields of `Laboratory`.
+    """Open the folder of a commissioning; return its state and its devices.
 
-    For simulated devices, their true parameters are written to an apparatus file in the folder.
+    For simulated devices, the true parameters are written to an apparatus file in the folder.
+    apparatus: apparatus file or seed; None for real devices. options: fields of `Laboratory`.
     """
     plan = load_graph(launch_file)
     if plan.scene_file is None:
@@ -131,11 +132,10 @@ class Laboratory:
     """The devices of one laboratory: simulated devices, or files with the data of real devices.
 
     apparatus: true parameters of simulated devices, in the world frame of the camera; None for real
-    devices. data: file or folder with the captured data of each step. finger_radius_m: measured
-    radius for real devices. sheet_kg_per_m2: measured mass per area of a real sheet. seconds:
-    duration of the verification. simulated_time: verify simulated
-    devices without a running graph. pairs, arm_poses, sheet_poses: numbers of simulated
-    observations.
+    devices. data: file or folder with the captured data, by step. finger_radius_m: measured radius
+    of the fingertip, for real devices. sheet_kg_per_m2: measured mass per area of a real sheet.
+    seconds: duration of the verification. simulated_time: verify simulated devices without a
+    running graph. pairs, arm_poses, sheet_poses: numbers of simulated observations.
     """
 
     apparatus: Apparatus | None
@@ -153,7 +153,7 @@ class Laboratory:
 
     @property
     def steps(self) -> dict[StepName, Step]:
-        """Return the function that runs each step."""
+        """Return the functions that run the steps, by step name."""
         return {
             StepName.CAMERA: self.calibrate_camera,
             StepName.ARMS: self.calibrate_arms,
@@ -176,7 +176,8 @@ class Laboratory:
 
     @contextmanager
     def _folder(self, step: StepName) -> Iterator[Path]:
-        """Yield the folder with the data of a step; for simulated devices, an empty folder."""
+        """Yield the folder with the captured data of a step, or a temporary folder for simulated
+        data."""
         if self.apparatus is None:
             yield self._find_data(step)
             return
@@ -535,10 +536,11 @@ class Laboratory:
     def _measure_display_latency(
         self, scene: Scene, graph: ResolvedGraph, stamp: MeasuredLag | None, added_s: float
     ) -> MeasuredLag:
-        """Measure the time from the swap of a frame to the middle of its display.
+        """Measure the display latency: the time from the swap of a frame to the middle of its
+        display.
 
-        stamp: stamp offset, from which the times in the data deviate; None: unknown. added_s: part
-        of it that the data contain.
+        stamp: measured offset of the camera's timestamps; None if it is unknown. added_s:
+        correction of this offset that the timestamps in the data already contain, s.
         """
         from flexsheet.launch.calibration.delays import MeasuredLag
         from flexsheet.launch.calibration.display_latency import (
@@ -566,7 +568,10 @@ class Laboratory:
         )
 
     def verify(self, lab: Commissioning) -> StepResult:
-        """Measure the errors of the calibrated system in a stroke, and at rest if simulated."""
+        """Measure the errors of the calibrated system during a stroke.
+
+        For simulated devices, the errors at rest are also measured.
+        """
         from flexsheet.launch.calibration.prediction import predict_errors
 
         scene = load_scene(lab.scene_copy)
@@ -593,7 +598,8 @@ class Laboratory:
 
 
 def collect_knowledge(lab: Commissioning) -> Knowledge:
-    """Collect calibrations and covariances of the finished steps, to predict errors from them."""
+    """Collect the calibrations and covariances of the finished steps for the prediction of
+    errors."""
     from flexsheet.launch.calibration.prediction import (
         EYE_STD_M,
         SHEET_MASS_STD_RATIO,
@@ -625,11 +631,11 @@ def collect_knowledge(lab: Commissioning) -> Knowledge:
 def run_verification(
     lab: Commissioning, seconds: float, seed: int, *, simulated_time: bool
 ) -> dict[str, Any]:
-    """Run a stroke in a simulated laboratory, and evaluate its true errors without a graph.
+    """Run a stroke in a simulated laboratory, and return the true errors of the display.
 
-    The errors are evaluated at rest, and those of fingertip and sheet also at the working speed.
-    simulated_time: run the stroke without a graph and without self-checks, and omit the errors
-    before calibration.
+    The result contains errors of the stroke, errors at rest, and errors of fingertip and sheet at
+    the working speed. seconds: duration of the stroke. simulated_time: run the stroke without a
+    graph, and omit the self-checks and the errors before calibration.
     """
     from flexsheet.launch.experiments.maps import draw_cross_errors
     from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
@@ -690,7 +696,10 @@ def _find_images(folder: Path, side: str) -> list[Path]:
 
 
 def _pose_values(key: str, matrix: Any) -> dict[str, Any]:
-    """Return the values of a pose (4, 4) in a scene by their dotted paths."""
+    """Return position and angles of a pose (4, 4), by their dotted paths in a scene file.
+
+    key: dotted path of the pose.
+    """
     return {
         f"{key}.position_m": [calibrate.round_digits(one) for one in matrix[:3, 3]],
         f"{key}.rpy_rad": [
@@ -717,13 +726,13 @@ def describe_sheet(
     width_m: float,
     mass_kg_per_m2: float | None = None,
 ) -> dict[str, float]:
-    """Return the values of a measured sheet for the scene, by dotted path.
+    """Return the scene values of a measured sheet, by their dotted paths.
 
     modulus_thickness_n_per_m: product of Young's modulus and thickness. width_m: width without
-    tension. mass_kg_per_m2: mass per area, which determines the density at the scene's thickness;
-    None keeps the scene's density. The step `edges` measured how far the tension displaces the
-    flanges. The measured sheet has another tension, so the compliances are scaled to keep
-    this displacement at mean stretch.
+    tension. mass_kg_per_m2: mass per area, from which the density is computed; None omits the
+    density. The flange compliances are scaled by the ratio of the tensions of the scene's sheet and
+    the measured sheet. Therefore the tension displaces the flanges as far as the step `edges`
+    measured.
     """
     sheet = scene.sheet
     modulus_pa = modulus_thickness_n_per_m / sheet.thickness_m

@@ -1,4 +1,4 @@
-"""Shell completion of names on the command line.
+"""Complete names on the command line in the user's shell.
 
 If no name matches, the shell completes file names. Modules are imported only when they are needed,
 because each completion is a separate process.
@@ -29,7 +29,8 @@ def node_types(incomplete: str) -> list[str]:
 
 
 def hosts(context: typer.Context, incomplete: str) -> list[str]:
-    """Return matching host names of the launch file that is named on the command line."""
+    """Return the host names that start with `incomplete`, from the launch file on the command
+    line."""
     from flexsheet.launch.plans.documents import BadInputError
     from flexsheet.launch.plans.plan import load_graph
 
@@ -42,35 +43,36 @@ def hosts(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def tuned_families(incomplete: str) -> list[str]:
-    """Return matching names of the method families of `flexsheet tune`."""
+    """Return the names of method families of `flexsheet tune` that start with `incomplete`."""
     from flexsheet.launch.methods.tune import TUNABLES
 
     return _filter((one.name for one in TUNABLES), incomplete)
 
 
 def gestures(incomplete: str) -> list[str]:
-    """Return matching names of gestures; if there are none, matching CSV files."""
+    """Return the gesture names that start with `incomplete`, or paths of CSV files if none
+    matches."""
     from flexsheet.launch.experiments.gestures import GESTURES
 
     return _filter(GESTURES, incomplete) or files(".csv")(incomplete)
 
 
 def runs(incomplete: str) -> list[str]:
-    """Return matching run directories of running graphs."""
+    """Return the run directories of running graphs that start with `incomplete`."""
     from flexsheet.launch.running.runs import list_live_runs
 
     return _filter((str(run.directory) for run in list_live_runs()), incomplete)
 
 
 def families(incomplete: str) -> list[str]:
-    """Return matching names of the method families of `flexsheet chart`."""
+    """Return the names of method families of `flexsheet chart` that start with `incomplete`."""
     from flexsheet.launch.methods.charts import FAMILIES
 
     return _filter([*FAMILIES, "system"], incomplete)
 
 
 def files(*suffixes: str) -> Callable[[str], list[str]]:
-    """Return a function that completes paths of files with these suffixes, and of folders."""
+    """Return a function that completes paths of folders and of files with the given suffixes."""
 
     def complete(incomplete: str) -> list[str]:
         folder, _, start = incomplete.rpartition("/")
@@ -92,17 +94,18 @@ yaml_files = files(".yaml", ".yml")
 
 
 def launch_files(incomplete: str) -> list[str]:
-    """Return matching names of shipped launch files, and matching YAML files."""
+    """Return the names of shipped launch files and the paths of YAML files that match
+    `incomplete`."""
     return _filter(list_shipped(LAUNCH_FILES), incomplete) + yaml_files(incomplete)
 
 
 def scenes(incomplete: str) -> list[str]:
-    """Return matching names of shipped scenes, and matching YAML files."""
+    """Return the names of shipped scenes and the paths of YAML files that match `incomplete`."""
     return _filter(list_shipped(SCENES), incomplete) + yaml_files(incomplete)
 
 
 def nodes(incomplete: str) -> list[str]:
-    """Return matching names of nodes of the running graph, and of node types."""
+    """Return the names of running nodes and of node types that start with `incomplete`."""
     from flexsheet.launch.commands.graph import NoGraphError, running_graph
 
     try:
@@ -113,7 +116,8 @@ def nodes(incomplete: str) -> list[str]:
 
 
 def node_parameters(incomplete: str) -> list[str]:
-    """Return matching parameters of the running graph, in the form NODE.PARAMETER."""
+    """Return the parameters of the running graph, as NODE.PARAMETER, that start with
+    `incomplete`."""
     from flexsheet.launch.commands.graph import NoGraphError, running_graph
 
     try:

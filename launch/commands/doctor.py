@@ -1,4 +1,4 @@
-"""`flexsheet doctor`: check this computer, the hosts of a graph, and the reach of the arms."""
+"""`flexsheet doctor`: check this computer, the hosts of a graph, and the range of the arms."""
 
 from __future__ import annotations
 
@@ -41,9 +41,10 @@ def doctor(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check this computer; exit code 1 if a check fails.
+    """Check that this computer can run flexsheet.
 
-    If a graph of several computers is running, all of them are checked.
+    If a graph of several computers is running, all of them are checked. The exit code is 1 if a
+    check fails.
     """
     if context.invoked_subcommand is not None:
         return
@@ -88,10 +89,11 @@ def check_scene(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that both arms reach the whole working range of a scene; exit code 1 if they do not.
+    """Check that both arms reach the whole working range of a scene.
 
     The command checks samples of all tilts and push depths in the range, at the minimum and the
-    maximum stretch of the sheet. It prints the maximum finger speed that the arms can follow.
+    maximum stretch of the sheet. It prints the maximum finger speed that the arms can follow. The
+    exit code is 1 if the arms cannot reach a sample.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
@@ -119,7 +121,8 @@ def check_scene(
 
 
 def _describe_branch(branch: dict[str, Any]) -> str:
-    """Describe a branch (joint solution) by its names, or by its joint angles if it has none."""
+    """Return a text that describes a joint solution, by its names or by its joint angles in
+    degrees."""
     if "seed_rad" not in branch:
         return ", ".join(branch.values())
     degrees = (f"{math.degrees(angle):.0f}" for angle in branch["seed_rad"])

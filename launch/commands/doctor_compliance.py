@@ -1,4 +1,4 @@
-"""`flexsheet doctor compliance`: check whether the sheet can feel as soft as a scene's object."""
+"""`flexsheet doctor compliance`: check that the sheet can feel as soft as the virtual object."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from flexsheet.launch.commands.output import (
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to `flexsheet doctor`."""
+    """Add the command `compliance` to `flexsheet doctor`."""
     app.command(
         "compliance",
         epilog=examples("flexsheet doctor compliance launch/scenes/cylinder.yaml"),
@@ -46,11 +46,11 @@ def compliance(
     ] = 60.0,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that the sheet can feel as soft as the virtual object; exit code 1 if it cannot.
+    """Check that the sheet can feel as soft as the virtual object of a scene.
 
     The command compares the force of the object with the rendered force, for pushes at the centre
     up to the maximum depth of the scene. It also checks that hand and sheet cannot oscillate at the
-    given delay.
+    given delay. The exit code is 1 if a check fails.
     """
     from flexsheet.launch.health.compliance import compliance_result, compute_front_curve
     from flexsheet.launch.plans.plan import load_scene

@@ -1,4 +1,4 @@
-"""`flexsheet doctor hosts`: check all hosts of a launch file, with a remedy for each fault."""
+"""`flexsheet doctor hosts`: check all hosts of a launch file, and print remedies for the faults."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TIMEOUT_S = 4.0
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to `flexsheet doctor`."""
+    """Add the command `hosts` to `flexsheet doctor`."""
     app.command(
         "hosts",
         epilog=examples(
@@ -67,9 +67,10 @@ def hosts(
     ] = TIMEOUT_S,
     as_json: JsonOption = False,
 ) -> None:
-    """Check all hosts (computers) of a launch file; exit code 1 if a check fails.
+    """Check all hosts (computers) of a launch file.
 
-    If the graph is not running, only this computer and the network are checked.
+    If the graph is not running, only this computer and the network are checked. The exit code is 1
+    if a check fails.
     """
     plan, run = _find_graph(launch_file)
     here = find_host(plan, run, host)
@@ -87,7 +88,7 @@ def hosts(
 
 
 def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
-    """Check the hosts of the running graph, if any, for `flexsheet doctor`.
+    """Check the hosts of the running graph; return an empty list if no graph is running.
 
     For a graph on one host, only the findings of the nodes' self-checks are returned.
     """
@@ -105,7 +106,10 @@ def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
 
 
 def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
-    """Return the resolved launch file and its run on this computer; the run is None without one."""
+    """Return the resolved launch file and its run on this computer, or None if it is not running.
+
+    If `launch_file` is None, the newest running graph is used.
+    """
     from flexsheet.launch.plans.plan import load_graph
 
     if launch_file is None:
@@ -120,7 +124,10 @@ def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
 
 
 def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> str:
-    """Return this computer's host name in the graph.  Raises CommandError if it is ambiguous."""
+    """Return the name of this computer among the hosts of a graph.
+
+    requested: name given by the user, or None. Raises CommandError if the name is ambiguous.
+    """
     from flexsheet.launch.health.doctor_hosts import list_own_addresses
     from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan_model import MAIN
@@ -147,7 +154,10 @@ def find_host(plan: ResolvedGraph, run: Run | None, requested: str | None) -> st
 async def check_hosts(
     plan: ResolvedGraph, here: str, run: Run | None, timeout_s: float
 ) -> list[HostFinding]:
-    """Check this computer and probe all hosts over the network; return all findings."""
+    """Check this computer, and test the connections to all hosts of a graph; return all findings.
+
+    here: host name of this computer.
+    """
     import tempfile
 
     from flexsheet.launch.health.doctor_hosts import (
@@ -177,7 +187,7 @@ async def check_hosts(
 
 
 def print_findings(findings: list[HostFinding]) -> None:
-    """Print a table with one line per finding; only the first line of a host shows its name."""
+    """Print a table with one line per finding; each host name is printed only once."""
     rows = []
     before = ""
     for one in findings:

@@ -1,4 +1,4 @@
-"""`flexsheet experiment`: run the experiments of Furukawa et al. 2007 ("the paper") on a graph."""
+"""`flexsheet experiment`: run the experiments of Furukawa et al. 2007 on a graph."""
 
 from __future__ import annotations
 
@@ -67,7 +67,11 @@ MapOption = Annotated[
 
 
 def make_result_folder(output: Path | None, name: str) -> Path:
-    """Create the folder for an experiment's bag and results: `output`, or a new folder in runs/."""
+    """Create and return a folder for an experiment's bag and results.
+
+    The folder is `output`; if `output` is None, it is a new folder in runs/ whose name contains
+    `name`.
+    """
     from flexsheet.launch.experiments.run import new_folder
 
     if output is None:
@@ -134,10 +138,10 @@ def stroke(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate a finger that strokes a cylinder over 60 degrees; measure the sheet's pose errors.
+    """Simulate a finger that strokes a cylinder over 60 degrees, and measure the sheet's errors.
 
-    This is the experiment of Furukawa et al. 2007, section V and Table I. If several strokes or
-    variants were interrupted, repeat the command with the same --output to continue.
+    This is the experiment of Furukawa et al. 2007, section V and Table I. To continue a command
+    with several strokes or variants that was interrupted, repeat it with the same --output.
     """
     given = with_scene(settings, scene)
     if radii and scene is not None:
@@ -301,10 +305,10 @@ def compliance(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compare the force on the finger with that of the virtual object at several push depths.
+    """Compare the force on the finger with the force of the virtual object at several push depths.
 
-    The experiment first waits for the table of the soft body. If the table is not in the cache, its
-    computation takes about a minute.
+    The experiment first waits for the precomputed table of the soft body. If the table is not in
+    the cache, its computation takes about a minute.
     """
     from flexsheet.launch.experiments import compliance as experiment
     from flexsheet.launch.experiments.pictures import draw_compliance
@@ -371,7 +375,10 @@ def _measure_images(
     as_json: bool,
     with_table: bool = False,
 ) -> None:
-    """Run the experiment; with_table: wait first until the soft body's table is computed."""
+    """Run an image experiment in a graph, record it in a bag, and print the image errors.
+
+    with_table: before the experiment, wait until the table of the soft body is computed.
+    """
     from flexsheet.launch.experiments import image
     from flexsheet.launch.experiments.maps import draw_error_maps
     from flexsheet.launch.experiments.run import (
@@ -436,7 +443,10 @@ def gestures(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the accuracy of fingertip tracking in strokes, taps, reaches, stops and turns."""
+    """Measure the accuracy of fingertip tracking during simulated human gestures.
+
+    The gestures are strokes, taps, reaches, stops and turns.
+    """
     from flexsheet.launch.experiments import gestures as experiment
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments.run import run_experiment
@@ -478,9 +488,9 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
 
 
 def print_followed(results: list[dict[str, Any]]) -> None:
-    """Print how well the sheet followed the finger during contact: one line per fingertip path.
+    """Print the errors with which the sheet followed the finger, one line per fingertip path.
 
-    Δd and Δθ are the distance and the angle between the true sheet and the true finger.
+    Δd and Δθ are the distance and the angle between the true sheet and the true finger in contact.
     """
 
     def shown(values: dict[str, float] | None) -> list[str]:
@@ -501,7 +511,7 @@ def print_followed(results: list[dict[str, Any]]) -> None:
 
 
 def print_strokes(results: list[dict[str, Any]]) -> None:
-    """Print the measured errors beside Table I of the paper, as mean and standard deviation."""
+    """Print the mean and standard deviation of the stroke errors beside Table I of the paper."""
     from flexsheet.launch.experiments.stroke import PAPER_TABLE_1
 
     columns = ["moving time"]
@@ -520,7 +530,8 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 
 
 def _print_stroke_table(table: dict[str, Any]) -> None:
-    """Print one line per variant, with mean errors over all strokes and 95 % intervals."""
+    """Print one line per variant, with the mean errors over all strokes and their 95 %
+    intervals."""
 
     def shown(found: dict[str, Any] | None) -> str:
         if found is None:
@@ -582,9 +593,9 @@ def stability(
 ) -> None:
     """Simulate whether a hand in contact with the sheet starts to oscillate.
 
-    The stiffness of the object, the impedance of the hand, the delay and its jitter are varied,
-    with and without the planner's bounds. The simulated critical gain is compared with the
-    predicted one.
+    The stiffness of the object, the impedance of the hand, the delay and its jitter are varied. The
+    simulations run with and without the planner's limits on the rendered stiffness. The command
+    compares the simulated critical gain with the predicted one.
     """
     import json
 
@@ -652,7 +663,8 @@ def _report_gestures(
     *,
     as_json: bool,
 ) -> None:
-    """Write the result and the picture of `experiment stability --gestures`, and print them."""
+    """Write the result and the figure of `experiment stability --gestures`, and print the
+    results."""
     import json
 
     from flexsheet.launch.experiments.pictures import draw_hand_gestures

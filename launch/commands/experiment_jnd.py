@@ -1,4 +1,5 @@
-"""`flexsheet experiment jnd`: measure which difference of stiffness a participant notices."""
+"""`flexsheet experiment jnd`: measure the smallest stiffness difference that a participant
+feels."""
 
 from __future__ import annotations
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to `flexsheet experiment`."""
+    """Add the command `jnd` to `flexsheet experiment`."""
     app.command(
         epilog=examples(
             "flexsheet experiment jnd --participant k7x2 --output runs/jnd",
@@ -97,8 +98,8 @@ def jnd(
     """Measure a participant's Weber fraction of stiffness with pairs of soft objects.
 
     The participant says which object of each pair is stiffer, and an adaptive staircase chooses the
-    next pair. Each answer is immediately written to CODE.csv. An interrupted session continues if
-    the command is run again with the same --output.
+    next pair. The command writes every answer to CODE.csv immediately. To continue an interrupted
+    session, run the command again with the same --output.
     """
     from flexsheet.launch.experiments.jnd import SessionPlan
     from flexsheet.launch.experiments.run import require_scene
@@ -226,7 +227,10 @@ def _write_result(row: dict[str, Any], folder: Path) -> None:
 
 
 def _summarize(rows: list[dict[str, Any]], reference_pa: float) -> dict[str, Any]:
-    """Return the results of `experiment jnd --json`."""
+    """Return the results of the trials `rows` for `flexsheet experiment jnd --json`.
+
+    reference_pa: Young's modulus of the reference object.
+    """
     import numpy as np
 
     from flexsheet.launch.experiments.jnd import CRITERION

@@ -1,7 +1,8 @@
-"""`flexsheet experiment robustness`, `sensitivity` and `follow`.
+"""`flexsheet experiment robustness`, `sensitivity` and `follow`: run series of simulations.
 
-The first two simulate hardware whose true parameters (the apparatus) differ from the scene, which
-is what the nodes assume. The last follows a recorded finger.
+The first two commands simulate hardware whose true parameters (the apparatus) differ from the
+scene, which contains the parameters that the nodes assume. The command `follow` simulates a finger
+on a recorded path.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from flexsheet.launch.commands.output import (
 
 
 def register(app: typer.Typer) -> None:
-    """Add the commands to `flexsheet experiment`."""
+    """Add the commands `robustness`, `sensitivity` and `follow` to `flexsheet experiment`."""
     app.command(
         epilog=examples(
             "flexsheet experiment robustness --seeds 0-9 --output runs/draws",
@@ -93,7 +94,7 @@ def robustness(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure errors of sheet, fingertip, image and force with randomly inaccurate hardware.
+    """Measure the errors of sheet, fingertip, image and force with randomly inaccurate hardware.
 
     For each seed, the true parameters of the simulated hardware are sampled within tolerances. A
     separate process runs a graph with one stroke. The errors of image and force are computed at
@@ -143,7 +144,10 @@ def robustness(
 
 
 def _print_predictions(found: dict[str, Any]) -> None:
-    """Print how often the errors that the reports predict agree with the true errors."""
+    """Print how often the predicted errors and the true errors agree about the tolerances.
+
+    The table has one row for all reports and one row per metric.
+    """
     cases = ("good_and_within", "good_but_exceeded", "doubted_but_within", "doubted_and_exceeded")
     every = {"all": {**found["confusion"], "stated_over_true": {"median": None}}}
     print_table(
@@ -176,7 +180,7 @@ def sensitivity(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the errors that each inaccurate hardware parameter causes alone.
+    """Measure the errors that each hardware parameter causes if only this parameter is inaccurate.
 
     Each parameter deviates by 1 and 3 standard deviations in both directions. Delays and tremor
     are evaluated by strokes in simulated time, all others with the sheet at rest. To continue an
@@ -264,7 +268,7 @@ def follow(
     output: ResultFolderOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure how well the sheet follows a recorded finger, and compare with a lower bound.
+    """Measure the sheet's error while it follows a recorded finger, and compute a lower bound.
 
     The bound is the minimum mean error that arms with the given limits can reach if the whole
     recording is known in advance.

@@ -1,6 +1,6 @@
 """`flexsheet explain`: print the meaning and the remedy of an error or of a node's note.
 
-A note is a short text in a node's status.
+A note is a short text in a node's status that describes a problem of the node.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ PACKAGES = ("messages", "nodes", "launch")
 MAX_ENTRIES = 3
 MIN_WORD_LETTERS = 3
 MIN_SHARED_WORDS = 2
-"""The minimum number of common words of a text and an explanation that matches inexactly."""
+"""The minimum number of words that a text and its explanation share in an inexact match."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
     """An explanation of one kind of error or note.
 
-    name: name of the error class, or empty. phrase: text that all notes of this kind contain, or
-    empty.
+    code: error code, or text of a note. name: name of the error class, or an empty text. phrase:
+    text that all notes of this kind contain, or an empty text.
     """
 
     code: str
@@ -52,7 +52,8 @@ class Entry:
 
 @cache
 def entries() -> tuple[Entry, ...]:
-    """Return explanations of all errors, of nodes' notes, and of reasons that the console shows."""
+    """Return the explanations of all errors, of the nodes' notes, and of texts that the console
+    shows."""
     from flexsheet.messages.notes import (
         FINGERTIP_REMEDIES,
         SELF_CHECK_FINDINGS,
@@ -97,10 +98,10 @@ def _meaning(kind: type[FlexsheetError]) -> str:
 
 
 def find_entries(text: str) -> list[Entry]:
-    """Return the explanations of a code, a class name or an error text; the best match is first.
+    """Return the explanations of a code, a class name or an error text, with the best match first.
 
-    An error text matches entries whose class name or phrase it contains. If there are none, it
-    matches entries with at least MIN_SHARED_WORDS common words; rare words have more weight.
+    An error text matches explanations whose class name or phrase it contains. If there are none, it
+    matches explanations with at least MIN_SHARED_WORDS common words, weighted by their rarity.
     """
     code = text.replace(" ", "_")  # the console shows the codes of fingertips with spaces
     if exact := [one for one in entries() if text in (one.code, one.name) or one.code == code]:
@@ -139,7 +140,7 @@ def explain(
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Print the meaning and the remedy of an error or note; docs/errors.md lists all of them."""
+    """Print the meaning and the remedy of an error or a note; docs/errors.md lists all errors."""
     found = [
         {"code": one.code, "meaning": one.meaning, "remedy": one.remedy}
         for one in find_entries(message)[:MAX_ENTRIES]

@@ -16,7 +16,7 @@ app = make_app()
 
 
 class FileKind(StrEnum):
-    """A kind of data file in the package."""
+    """The kinds of data files in the package."""
 
     LAUNCH = "launch"
     SCENE = "scene"
@@ -34,7 +34,7 @@ PATTERNS = {
     FileKind.SYSTEMD: "systemd/*",
     FileKind.DOCKER: "../docker/[!.]*",
 }
-"""The file pattern (glob) of each kind, relative to the folder of the launch files."""
+"""The file pattern (glob) of each kind of file, relative to the folder of the launch files."""
 
 
 @app.command(epilog=examples("flexsheet files", "flexsheet files docker --json"))
@@ -54,6 +54,6 @@ def files(
 
 
 def list_files(kind: FileKind) -> list[Path]:
-    """Return the paths of the package's files of one kind, sorted."""
+    """Return the sorted paths of the package's data files of one kind."""
     found = LAUNCH_FILES.glob(PATTERNS[kind])
     return sorted(path.resolve() for path in found if path.is_file())

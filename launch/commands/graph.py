@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class NoGraphError(CommandError):
-    """Error: no graph is running on this computer."""
+    """Raised if no graph is running on this computer."""
 
     code = "no-graph"
     remedy = "Start a graph with `flexsheet launch FILE`, or name the directory of its run (--run)."
@@ -27,9 +27,10 @@ class NoGraphError(CommandError):
 
 
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
-    """Return the graph and the run of a run directory; None: those of the newest running graph.
+    """Return the resolved graph and the run of a run directory.
 
-    Raises CommandError if the directory contains no plan, and NoGraphError if no graph is running.
+    If `directory` is None, the newest running graph is used. Raises CommandError if the directory
+    contains no plan, and NoGraphError if no graph is running.
     """
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run, list_live_runs
@@ -58,7 +59,10 @@ async def receive_until(
     done: Callable[[], bool],
     timeout_s: float,
 ) -> bool:
-    """Pass messages to the handler of their topic until `done()`; return False on a timeout."""
+    """Pass received messages to handlers until `done` returns True; return False on a timeout.
+
+    handlers: function that receives the messages of each topic, by topic name.
+    """
     from flexsheet.launch.running.tools import make_subscriber
 
     satisfied = asyncio.Event()

@@ -23,10 +23,10 @@ app = make_app("Manage the key pairs by which hosts authenticate each other.")
 
 
 class KeyCommand(TyperCommand):
-    """A command that accepts a key that starts with "-" as its last argument."""
+    """A command whose last argument may be a key that starts with "-"."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert "--" in front of a key that starts with "-"; it would be parsed as an option."""
+        """Insert "--" before a key that starts with "-", so that it is not parsed as an option."""
         keys = [one for one in args if one.startswith("-") and len(one) == KEY_LENGTH]
         if keys and "--" not in args:
             args = [one for one in args if one not in keys] + ["--", *keys]
@@ -84,7 +84,10 @@ def show(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the public keys stored on this computer; exit code 1 if a key cannot be read."""
+    """Print the public keys stored on this computer.
+
+    The exit code is 1 if a key cannot be read.
+    """
     from flexsheet.launch.running.keys import directory, secret_file
     from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
 

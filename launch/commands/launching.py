@@ -99,10 +99,11 @@ def launch(
 ) -> None:
     """Start the nodes of a launch file and supervise them until Ctrl-C.
 
-    With --json, the command prints one line about the run when all nodes are ready. With --json
-    and --dry-run, it prints the resolved graph.
+    With --json, the command prints one line about the run when all nodes are ready. With --json and
+    --dry-run, it prints the resolved graph.
 
-    Exit codes: 0 stopped on request, 1 a node failed, 2 the input is invalid.
+    The exit code is 0 if the graph was stopped on request, 1 if a node failed, and 2 if the input
+    is invalid.
     """
     from flexsheet.launch.plans.plan import load_graph
 
@@ -139,14 +140,17 @@ def launch(
 
 
 def page_url(console: ResolvedNode) -> str:
-    """Return the address of the page of a console with a fixed port."""
+    """Return the URL of a console's page; the console node must have a fixed port."""
     address = console.parameters["address"]
     host = f"[{address}]" if ":" in address else address
     return f"http://{host}:{console.parameters['page_port']}/"
 
 
 def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
-    """Return run directory, plan hash and node names of a graph, for the JSON output."""
+    """Return run directory, plan hash and node names of a graph, for JSON output.
+
+    host: host whose nodes are listed; None for all hosts.
+    """
     nodes = [node.name for node in plan.nodes_on(host)]
     omitted = {one.name: one.reason for one in plan.omitted if host in (None, one.host)}
     return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes, "omitted": omitted}
@@ -162,7 +166,10 @@ def warn_of_loop_risk(plan: ResolvedGraph) -> None:
 
 
 def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
-    """On the planner's host, start `warn_of_loop_risk` in a thread, which takes half a second."""
+    """Start a check of the hand-sheet stability in a thread, if the planner runs on `host`.
+
+    The check takes half a second, and prints a warning if sheet and hand may oscillate.
+    """
     if any(
         issubclass(node_class(node.type), node_class("planner")) for node in plan.nodes_on(host)
     ):
@@ -170,7 +177,7 @@ def start_loop_check(plan: ResolvedGraph, host: str | None) -> None:
 
 
 def print_omitted(plan: ResolvedGraph, host: str | None) -> None:
-    """Print the nodes of the launch file that the graph omits, and the reason for each.
+    """Print the nodes of the launch file that the graph omits, and the reason for each omission.
 
     host: host whose nodes are printed; None for all hosts.
     """
@@ -191,10 +198,10 @@ async def run_graph(
 ) -> int:
     """Run a graph until a signal arrives, and return the exit code.
 
-    The second signal reports the nodes that have not exited, and the third kills them.
+    The second signal logs the nodes that have not exited, and the third signal kills these nodes.
 
-    duration_s: time after all nodes are ready when the graph is stopped; None for no limit.
-    without: names of nodes that are not started.
+    duration_s: time after which the graph is stopped, measured from the moment when all nodes are
+    ready; None for no limit. without: names of nodes that are not started.
     """
     from flexsheet.launch.running.supervisor import RunningGraph
 
@@ -228,7 +235,11 @@ async def _run_until(
     duration_s: float | None,
     when_ready: Callable[[Run], None],
 ) -> int:
-    """Run the graph until `stop_requested`, or until `duration_s` after all nodes are ready."""
+    """Run a graph until `stop_requested` is set or its duration has passed; return the exit code.
+
+    duration_s: maximum time after all nodes are ready; None for no limit. when_ready: function that
+    is called when all nodes are ready.
+    """
     from flexsheet.launch.running.supervisor import NodeFailedError
     from flexsheet.launch.running.systemd import beat_watchdog, notify_systemd
 
@@ -274,7 +285,10 @@ def _print_log_line(node: str, line: str) -> None:
 
 
 def format_log_line(line: str) -> tuple[str, str]:
-    """Return the colour style and the readable text of a log line, which may be JSON."""
+    """Return the colour style and the readable text of a log line.
+
+    If the line is a JSON record, the text consists of its event, other fields and stack trace.
+    """
     style, text = "", line
     if line.startswith("{"):
         try:
@@ -294,7 +308,7 @@ def format_log_line(line: str) -> tuple[str, str]:
 
 
 def _format_settings(node: ResolvedNode) -> str:
-    """Return "name=value" for each parameter of a node that differs from its default."""
+    """Return "name=value" for all parameters of a node that differ from their defaults."""
     from pydantic_core import to_jsonable_python
 
     from flexsheet.nodes import node_class

@@ -37,7 +37,7 @@ def man(as_json: JsonOption = False) -> None:
 
 
 def list_commands(group: Any = None, prefix: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield the name and the object of all commands, except hidden aliases."""
+    """Yield the full name and the object of all commands, except hidden aliases."""
     from typer.main import get_command
 
     from flexsheet.launch.cli import app as all_commands
@@ -56,7 +56,7 @@ def list_commands(group: Any = None, prefix: tuple[str, ...] = ()) -> Iterator[t
 
 
 def render() -> str:
-    """Return the manual page of all commands in roff format (the macros of man(7))."""
+    """Return the manual page of all commands in roff format, with the macros of man(7)."""
     from importlib.metadata import version
 
     lines = [
@@ -104,7 +104,10 @@ def _format_command(name: str, command: Any) -> Iterator[str]:
 
 
 def _escape(text: str) -> str:
-    """Escape backslashes, hyphens, and dots or apostrophes at the start of a line for roff."""
+    """Escape the characters of a text that have a special meaning in roff.
+
+    These are backslashes, hyphens, and dots or apostrophes at the start of a line.
+    """
     plain = re.sub(r"\[/?(?:bold|dim|italic)?\]", "", text)
     escaped = plain.replace("\\", r"\e").replace("-", r"\-")
     return rf"\&{escaped}" if escaped[:1] in (".", "'") else escaped

@@ -60,7 +60,7 @@ def info(
 ) -> None:
     """Print the ports, timers and parameters of a node or of a node type.
 
-    For a node of the running graph, topics and parameter values are printed too.
+    For a node of the running graph, the connected topics and the parameter values are also printed.
     """
     from flexsheet.nodes import UnknownNodeError, node_class
     from flexsheet.nodes.node import find_parameters_type, find_ports, find_timers

@@ -1,7 +1,7 @@
 """Declare the command-line arguments and options that several commands share.
 
-The help shows the value of an option by a placeholder in capital letters, such as FILE.
-`name_values` adds it to options that declare none.
+The help shows the value of an option as a placeholder in capital letters, such as FILE. The
+function `name_values` sets the placeholder of options that declare none.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from flexsheet.launch.commands import complete
 from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file
 
 DEMO, CYLINDER = Path("demo"), Path("cylinder")
-"""The names of the launch file and of the scene that commands use by default."""
+"""The names of the default launch file and of the default scene of the commands."""
 
 FORMER_NAMES = {
     "also": "include",
@@ -35,24 +35,33 @@ FORMER_NAMES = {
     "service": "systemd",
     "stand-down": "disable",
 }
-"""The current name of each renamed option and command, by its former name.
+"""The current names of renamed options and commands, by former name.
 
-Former names still work, but the help does not show them.
+The former names still work, but the help does not show them.
 """
 
 
 def make_app(text: str | None = None) -> typer.Typer:
-    """Make the typer app of a command, or of a group of commands with the help `text`."""
+    """Create the typer app of a command without a group, or of a command group with a help text.
+
+    text: help of the group; None for a single command.
+    """
     return typer.Typer(add_completion=False, no_args_is_help=text is not None, help=text)
 
 
 def find_launch_file(given: Path | None) -> Path | None:
-    """Return the path of a launch file; the argument is a path or a name in the package."""
+    """Return the path of a launch file; None if `given` is None.
+
+    given: path, or name of a launch file in the package.
+    """
     return None if given is None else find_file(given, LAUNCH_FILES)
 
 
 def find_scene(given: Path | None) -> Path | None:
-    """Return the path of a scene file; the argument is a path or a name in the package."""
+    """Return the path of a scene file; None if `given` is None.
+
+    given: path, or name of a scene in the package.
+    """
     return None if given is None else find_file(given, SCENES)
 
 
@@ -217,17 +226,20 @@ SeedOption = Annotated[
 
 
 def output_file(text: str, metavar: str = "FILE") -> Any:
-    """Return the declaration of an option -o/--output, with `text` as its help."""
+    """Return the declaration of the option -o/--output.
+
+    text: help of the option. metavar: placeholder for its value.
+    """
     return typer.Option("-o", "--output", metavar=metavar, help=text)
 
 
 def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:
-    """Return the setting that corresponds to --scene, followed by the values of --set."""
+    """Return the values of the option --set, preceded by the setting for the option --scene."""
     return [*([] if scene is None else [f"scene={scene}"]), *(settings or ())]
 
 
 def split_names(given: list[str] | None) -> list[str]:
-    """Return the values of a repeated option, also from its former form "A,B".
+    """Return the values of a repeated option, also if they are given as "A,B" (the former format).
 
     Raises BadParameter if the option is given but contains no name.
     """
@@ -241,7 +253,10 @@ _VALUE_NAMES = {"str": "TEXT", "int": "N", "float": "NUMBER", "Path": "FILE", "l
 
 
 def name_values(command: Any) -> None:
-    """Set the placeholder that the help shows for the value of an option; flags have no value."""
+    """Set the placeholders that the help shows for the values of a command's options.
+
+    Options without a value (flags) get no placeholder.
+    """
     help_option = command.get_help_option(SimpleNamespace(help_option_names=["-h", "--help"]))
     for parameter in (*command.params, help_option):
         if getattr(parameter, "is_flag", False):

@@ -1,4 +1,4 @@
-"""Print data of commands on stdout and messages for the user on stderr; define exit codes."""
+"""Print command results on stdout and messages for the user on stderr, and define exit codes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ FAILED, BAD_INPUT, OTHER_THAN_LIVE = 1, 2, 3
 
 
 class CommandError(FlexsheetError):
-    """Error that ends a command with an exit code, for instance a wrong option."""
+    """Raised to end a command with an error text and an exit code, for instance for a wrong
+    option."""
 
     code = "command"
     remedy = "Correct the option or file that the error names."
@@ -33,7 +34,7 @@ class CommandError(FlexsheetError):
 
 
 def check_folder(option: str, file: Path) -> None:
-    """Raise CommandError if the folder for an output file does not exist.
+    """Raise CommandError if the parent folder of an output file does not exist.
 
     option: command-line option that names the file, for the error text.
     """
@@ -44,8 +45,8 @@ def check_folder(option: str, file: Path) -> None:
 class Words:
     """A printer of messages for the user on stderr.
 
-    Colours and status lines are used only in terminals; NO_COLOR disables colours. The module rich
-    is imported with the first message, so that commands start fast.
+    Colours and status lines are used only in terminals; the environment variable NO_COLOR disables
+    colours. The module rich is imported with the first message, so that commands start fast.
     """
 
     @cached_property
@@ -66,7 +67,7 @@ class Words:
         self.console.print(text, markup=markup, style=style)
 
     def status(self, text: str) -> Status:
-        """Return a context manager that shows a status line, if stderr is a terminal."""
+        """Return a context manager that shows a status line if stderr is a terminal."""
         return self.console.status(text)
 
 
@@ -76,12 +77,13 @@ EXAMPLES = "[bold]Examples[/]"
 
 
 def examples(*lines: str) -> str:
-    """Format example calls for the epilog of a command's help."""
+    """Format example command lines for the end (epilog) of a command's help."""
     return "\n".join([EXAMPLES, *(line.replace("[", r"\[") for line in lines)])
 
 
 def examples_in(epilog: str | None) -> list[str]:
-    """Return the example calls in a help epilog that `examples` has formatted."""
+    """Return the example command lines in a help epilog that the function `examples` has
+    formatted."""
     heading, *lines = (epilog or "").split("\n")
     return [line.replace(r"\[", "[") for line in lines] if heading == EXAMPLES else []
 
@@ -121,7 +123,7 @@ def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
 
 
 def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace each inner mapping by its values, and join the names, such as "interval_ms p50"."""
+    """Replace nested mappings by their values, with joined names such as "interval_ms p50"."""
     flat: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, Mapping):
@@ -164,7 +166,7 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
 def progress_words() -> Iterator[Callable[[str], None]]:
     """Yield a function that shows a progress message with the elapsed time on stderr.
 
-    Without a terminal it prints one line per message.
+    If stderr is not a terminal, the function prints one line per message.
     """
     if not words.is_terminal:
         yield words.print
@@ -179,7 +181,10 @@ def progress_words() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
-    """Show a progress bar on stderr, in terminals only; yield its update function (done, total)."""
+    """Show a progress bar on stderr, and yield its update function (done, total).
+
+    If stderr is not a terminal, nothing is shown.
+    """
     if not words.is_terminal:
         yield lambda done, total: None
         return
@@ -204,10 +209,10 @@ def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
 
 
 def logs_on_stderr() -> None:
-    """Write warnings and errors that are logged during a command to stderr.
+    """Write log records of a command with level warning or higher to stderr.
 
-    The default is stdout, which is reserved for the command's data. Call this function before any
-    logger is created.
+    By default they go to stdout, which is reserved for the results of the command. Call this
+    function before any logger is created.
     """
     import logging
 

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 app = make_app("List, get and set parameters of the running graph.")
 
 STATUS_TIMEOUT_S = 3.0
-"""The maximum time to wait for statuses, in seconds.
+"""The maximum time to wait for the statuses of nodes, in seconds.
 
 A status contains the changed parameters of a node and is published once a second.
 """
@@ -58,7 +58,7 @@ def list_parameters(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the parameters of the running graph, and whether they can be changed while it runs."""
+    """List the parameters of the running graph, and state which can be changed while it runs."""
     plan, found = running_graph(run)
     nodes = [_find_node(plan, node)] if node else list(plan.nodes.values())
     changed = _read_changes(plan, found, {one.name for one in nodes if _live(one)})
@@ -168,7 +168,10 @@ def _live(node: ResolvedNode) -> frozenset[str]:
 
 
 def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, dict[str, Any]]:
-    """Return the parameters that were changed since the start: values by name, by node."""
+    """Return the parameters that have changed since the start of the graph.
+
+    The result contains a dictionary of values by parameter name for each of the nodes.
+    """
     found: dict[str, dict[str, Any]] = {}
     if nodes:
         run_interruptible(_await_statuses(plan, run, lambda: nodes <= found.keys(), found))
@@ -178,7 +181,10 @@ def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, d
 async def _await_statuses(
     plan: ResolvedGraph, run: Run, done: Callable[[], bool], found: dict[str, dict[str, Any]]
 ) -> int:
-    """Collect changed parameters from node statuses until `done()`; return 1 on a timeout."""
+    """Store the changed parameters from node statuses in `found` until `done` returns True.
+
+    found: changed values by node and parameter name. Returns 0, or 1 on a timeout.
+    """
 
     def add(status: Status) -> None:
         found[status.node] = json.loads(status.changed_parameters)
@@ -187,7 +193,8 @@ async def _await_statuses(
 
 
 async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) -> int:
-    """Publish a parameter change, and wait until the node's status confirms it."""
+    """Publish a parameter change, wait until the node's status confirms it, and return the exit
+    code."""
     from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
     from flexsheet.messages.types import ParameterChange
 

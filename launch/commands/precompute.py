@@ -1,4 +1,7 @@
-"""`flexsheet precompute`: compute the tables that a graph reads from a cache, before it starts."""
+"""`flexsheet precompute`: compute the tables of a scene and store them in a cache.
+
+A graph then reads the tables from the cache, and starts faster.
+"""
 
 from __future__ import annotations
 
@@ -45,10 +48,10 @@ def precompute(
     scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the deflection shapes of a scene's sheet, unless the cache contains them.
+    """Compute the deflection shapes of a scene's sheet, unless the cache already contains them.
 
     The renderer draws a pushed sheet with these shapes. If the scene sets `sheet_force: table`, the
-    force table is computed too, which takes about two minutes. Experiments and the demo compute
+    force table is also computed, which takes about two minutes. Experiments and the demo compute
     missing shapes automatically.
     """
     from flexsheet.launch.plans.plan import load_scene

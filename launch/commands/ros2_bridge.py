@@ -23,7 +23,7 @@ app = make_app()
 
 
 class ExternalTopic(StrEnum):
-    """A topic that ROS nodes may publish for flexsheet."""
+    """The topics that ROS nodes may publish for flexsheet."""
 
     EYE = "eye"
     FINGERTIP = "fingertip"

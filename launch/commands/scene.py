@@ -22,7 +22,7 @@ app = make_app("Export the apparatus of a scene to other tools.")
 
 
 class ModelFormat(StrEnum):
-    """A file format of an exported model of the apparatus."""
+    """The file formats of an exported model of the apparatus."""
 
     URDF = "urdf"
     GLTF = "gltf"
@@ -62,10 +62,10 @@ def export(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write arms, clamps, camera, projector and screen as a URDF or glTF model.
+    """Write a URDF or glTF model of the arms, clamps, camera, projector and screen.
 
-    The joints are named left_joint_1 to left_joint_6 and right_joint_1 to right_joint_6, and can be
-    moved in a viewer. The model contains geometry and joint limits, but no masses or torques.
+    The joints are named left_joint_1 to left_joint_6 and right_joint_1 to right_joint_6. They can
+    be moved in a viewer. The model contains geometry and joint limits, but no masses or torques.
     """
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.launch.viewing.apparatus_model import make_model, solve_rest_joints

@@ -64,10 +64,10 @@ NodeArgument = Annotated[
 
 @status_app.command(epilog=examples("flexsheet status", "flexsheet status --json"))
 def status(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Show the nodes of the running graph with message rates, lost messages and notes.
+    """Show the nodes of the running graph with their message rates, lost messages and notes.
 
-    The command also prints the problems that the self-checks of the nodes suspect. The exit code
-    is 1 if there is such a problem, or if a node does not report its status.
+    The command also prints the problems that the self-checks of the nodes suspect. The exit code is
+    1 if there is such a problem, or if a node does not report its status.
     """
     plan, found = running_graph(run)
     statuses: dict[str, Status] = {}
@@ -110,7 +110,10 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
 async def _collect_statuses(
     plan: ResolvedGraph, run: Run, statuses: dict[str, Status], hosts: dict[str, HostStatus]
 ) -> int:
-    """Collect the statuses of all nodes and hosts until STATUS_TIMEOUT_S has passed."""
+    """Collect the statuses of all nodes and hosts for at most STATUS_TIMEOUT_S.
+
+    The function adds them to `statuses` and `hosts`. Returns the exit code.
+    """
     handlers: dict[str, Callable[[Any], None]] = {
         "status": lambda message: statuses.update({message.node: message}),
         "host": lambda message: hosts.update({message.host: message}),
@@ -124,7 +127,8 @@ async def _collect_statuses(
 
 
 def _describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
-    """Return the status of a node as a table row; values are None if the node does not report."""
+    """Return a table row with the status of a node; its values are None if the node does not
+    report."""
     row: dict[str, Any] = {"node": node.name, "host": node.host, "state": "silent"}
     if status is None:
         none: dict[str, Any] = {
@@ -149,7 +153,10 @@ def _describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
 
 
 def describe_output(port: dict[str, Any]) -> str:
-    """Return the topic of an output, with its rate if the topic is published periodically."""
+    """Return the topic of an output port, followed by its rate if the topic is periodic.
+
+    port: statistics of the port in a node's status.
+    """
     from flexsheet.messages.topics import find_topic
 
     topic = find_topic(port["topic"])
@@ -211,7 +218,11 @@ def logs(
 
 
 def _newest_run(directory: Path | None) -> Run:
-    """Return the run in a directory; None: the newest running graph, or else the newest run."""
+    """Return the run in a directory.
+
+    If `directory` is None, return the newest running graph, or the newest run if no graph is
+    running.
+    """
     from flexsheet.launch.running.runs import Run, list_live_runs, list_runs
 
     if directory is not None:
@@ -225,7 +236,7 @@ def _newest_run(directory: Path | None) -> Run:
 
 
 def _further_lines(text: Any, run: Run) -> Iterator[str]:
-    """Yield the lines that are added to a log file until its run ends."""
+    """Yield the lines that are added to an open log file until its run ends."""
     part = ""
     while True:
         alive = run.is_alive()
@@ -246,9 +257,10 @@ def stop(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Stop the running graph, as Ctrl-C in its terminal does; exit code 1 if it does not end.
+    """Stop the running graph in the same way as Ctrl-C in its terminal.
 
-    In an emergency, use the hard-wired emergency stop, and then `flexsheet arms stop`.
+    The exit code is 1 if the graph does not end. In an emergency, use the hard-wired emergency
+    stop, and then `flexsheet arms stop`.
     """
     from flexsheet.launch.running.runs import list_live_runs
 
@@ -298,9 +310,9 @@ def run_node(
 ) -> None:
     """Run one node of a launch file in this terminal until Ctrl-C.
 
-    The node joins the running graph, which must be started without it:
-    `flexsheet launch LAUNCH_FILE --without NODE`. With --launch, a new graph with only this node is
-    started.
+    The node joins the running graph, which must have been started without the node: `flexsheet
+    launch LAUNCH_FILE --without NODE`. With --launch, the command instead starts a new graph that
+    contains only this node.
     """
     from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan import load_graph

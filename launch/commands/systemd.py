@@ -46,7 +46,7 @@ def install(
 ) -> None:
     """Install the systemd unit flexsheet@.service, its environment file, and kernel TCP settings.
 
-    The command does not start the service, but prints the commands that start it.
+    The command does not start the service, but prints the commands with which you can start it.
     """
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.systemd import STATE_FOLDER, list_bags, make_files

@@ -42,10 +42,10 @@ WindowOption = Annotated[
     typer.Option("--duration", metavar="SECONDS", help="Duration of the measurement, s.", min=0.1),
 ]
 REPORT_DELAY_S = 3.0
-"""The time without a message after which the command reports that none has arrived, in seconds."""
+"""The time without a message, in seconds, after which the command reports that none has arrived."""
 
 SHORT_ARRAY = 36
-"""The maximum number of elements of an array that is printed in full."""
+"""The maximum number of elements of an array that is printed completely."""
 
 
 @app.command(
@@ -140,7 +140,10 @@ def echo(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the messages of a topic as they arrive; --json prints one document per line."""
+    """Print the messages of a topic as they arrive.
+
+    With --json, each message is a JSON document on its own line.
+    """
     found = _find_topic(topic)
     limit = 1 if once else count
 
@@ -188,7 +191,7 @@ def delay(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the age of a topic's data when it arrives at this command.
+    """Measure the age of a topic's data when a message arrives at this command.
 
     The age is the time since the source timestamp, for instance since the exposure of an image. The
     command ignores messages with timestamps of another computer, because it does not know the
@@ -267,7 +270,7 @@ def make_silence_error(topic: str, duration_s: float) -> CommandError:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """A message that arrives during a measurement.
+    """A message that has arrived during a measurement.
 
     received_ns: time of arrival on the clock of this computer.
     """
@@ -278,7 +281,11 @@ class Arrival:
 
 
 def _by_writer(arrivals: Sequence[Any], header: Callable[[Any], Header]) -> list[list[Any]]:
-    """Group messages by writer and its starts; a restart resets the sequence numbers."""
+    """Group messages by writer and by start of the writer.
+
+    A writer that restarts begins a new group, because its sequence numbers restart. header:
+    function that returns the header of a message.
+    """
     groups: dict[tuple[str, int], list[Any]] = {}
     for one in arrivals:
         groups.setdefault((header(one).writer, header(one).epoch), []).append(one)
@@ -286,7 +293,10 @@ def _by_writer(arrivals: Sequence[Any], header: Callable[[Any], Header]) -> list
 
 
 def measure_rates(headers: Sequence[Header]) -> list[dict[str, Any]]:
-    """Return the rate, the received and lost messages, and the publication intervals per writer."""
+    """Return the message rate, lost messages and publication intervals (ms) of all writers.
+
+    The result has one row per writer.
+    """
     import numpy as np
 
     rows = []
@@ -309,7 +319,8 @@ def measure_rates(headers: Sequence[Header]) -> list[dict[str, Any]]:
 
 
 def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return the bandwidth and the message sizes of each writer."""
+    """Return the bandwidth (bytes per second) and the message sizes of all writers, one row
+    each."""
     rows = []
     for own in _by_writer(arrivals, lambda one: one.header):
         sizes = [one.size_bytes for one in own]
@@ -328,7 +339,7 @@ def measure_bandwidths(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
 
 
 def measure_delays(arrivals: Sequence[Arrival]) -> list[dict[str, Any]]:
-    """Return statistics of the data age (ms) at arrival for each writer."""
+    """Return statistics of the age (ms) of the data at arrival, one row per writer."""
     rows = []
     for own in _by_writer(arrivals, lambda one: one.header):
         ages_ms = [1e-6 * (one.received_ns - one.header.source_ns) for one in own]
@@ -356,7 +367,10 @@ def _summarize(values: list[float]) -> dict[str, float] | None:
 
 
 def to_plain(value: Any, *, full: bool) -> Any:
-    """Convert a message or field to JSON types; unless `full`, summarize long arrays."""
+    """Convert a message or field to JSON types.
+
+    full: return long arrays completely instead of a summary.
+    """
     import numpy as np
     from pydantic import BaseModel
 
@@ -467,7 +481,10 @@ async def _read(
 
 
 def _measure(topic: str, run: Path | None, duration_s: float) -> list[Arrival]:
-    """Record the messages that arrive on a topic; raise CommandError if there are none."""
+    """Record the messages that arrive on a topic during a given time.
+
+    Raises CommandError if no message arrives.
+    """
     arrivals: list[Arrival] = []
     run_interruptible(_collect(_find_topic(topic), run, arrivals, duration_s))
     if not arrivals:
@@ -498,7 +515,11 @@ async def _collect(
 def make_listener(
     topic: Topic, run_directory: Path | None, handler: Handler, *, raw: bool = False
 ) -> Subscriber:
-    """Return a subscriber to a topic of the running graph.  Raises CommandError."""
+    """Create a subscriber to a topic of the running graph.
+
+    raw: pass undecoded messages to the handler. Raises CommandError if no node of the graph
+    publishes the topic.
+    """
     from flexsheet.launch.running.tools import make_subscriber
 
     plan, run = running_graph(run_directory)

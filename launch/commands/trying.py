@@ -1,4 +1,4 @@
-"""`flexsheet try`: simulate the display on this computer, and operate it in the browser."""
+"""`flexsheet try`: simulate the display on this computer, and operate it in a web browser."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ def try_it(
     duration: DurationOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Simulate the display, and touch a virtual object with the mouse in the browser.
+    """Simulate the display, and touch a virtual object with the mouse in a web browser.
 
     The command starts the demo graph with a console, prints the address of the console page, and
-    runs until Ctrl-C. To open the page on another computer, first run there:
-    ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER
+    runs until Ctrl-C. To open the page on another computer, first run there: ssh -L
+    8080:127.0.0.1:8080 THIS_COMPUTER
     """
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.precompute import precompute_graph

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
-"""The exit code if no method of a method family meets the tolerance, so the best one is chosen."""
+"""The exit code if no method of a method family meets the tolerance of the scene."""
 
 
 app = make_app()
@@ -81,7 +81,7 @@ def tune(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Choose the fastest methods that meet the tolerances of a scene; write them into the scene.
+    """Choose the fastest methods that meet the tolerances of a scene, and write them to the scene.
 
     The command measures each method family on this computer over the working range of the scene,
     which takes seconds to minutes. It then predicts the errors of combined methods, and tests the

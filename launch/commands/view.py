@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 app = make_app()
 
 NICENESS = 10
-"""Niceness of the server, so that the nodes of the graph have priority."""
+"""The niceness of the server, which gives the nodes of the graph a higher priority."""
 
 
 @app.command(
