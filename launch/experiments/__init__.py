@@ -1,6 +1,7 @@
-"""Define the errors of experiments, which run a graph and evaluate the recorded bag.
+"""Run experiments on a graph, and evaluate the recorded bags.
 
-Some of them repeat experiments of Furukawa et al. 2007.
+Some experiments repeat experiments of Furukawa et al. 2007. This module defines the exceptions that
+experiments raise.
 """
 
 from __future__ import annotations
@@ -15,21 +16,22 @@ Entry = TypeVar("Entry")
 
 
 class ExperimentError(FlexsheetError, RuntimeError):
-    """Raised if an experiment failed, or a bag does not contain the data of the experiment."""
+    """Raised if an experiment fails, or if a bag does not contain the data of the experiment."""
 
     code = "experiment"
     remedy = "Try `launch/demo.yaml` first. A bag must be a recording of the same experiment."
 
 
 class ExperimentInterruptedError(ExperimentError):
-    """Raised if SIGINT or SIGTERM ended an experiment; its nodes are stopped."""
+    """Raised after SIGINT or SIGTERM has interrupted an experiment and its nodes have been
+    stopped."""
 
     code = "experiment-interrupted"
     remedy = "Start the experiment again; a sweep continues with the trials that are missing."
 
 
 def select_names(names: Sequence[str], known: Collection[str], kind: str) -> list[str]:
-    """Check names and remove duplicates; without names, return all known names.
+    """Check names and remove duplicates; if there are no names, return all known names.
 
     kind: noun for the names in the error text. Raises ExperimentError for an unknown name.
     """
@@ -40,9 +42,10 @@ def select_names(names: Sequence[str], known: Collection[str], kind: str) -> lis
 
 
 def find_recorded(entries: Mapping[str, Entry], kind: str, label: str) -> Entry:
-    """Return the entry of a bag with a label. Raises ExperimentError if it is missing.
+    """Return the entry with the given label.
 
-    kind: noun for the entry in the error text.
+    entries: entries of a bag by label. kind: noun for the entry in the error text. Raises
+    ExperimentError if there is no such entry.
     """
     if label not in entries:
         labels = ", ".join(entries) or "none"

@@ -4,7 +4,7 @@ The finger pushes at a few positions and rests at several depths. Then it moves 
 stopping. The felt force is computed by the simulator's membrane model, from the true edges of the
 sheet and the true fingertip. The wanted force is read from the published force curve, at the
 finger's true depth. Errors are relative to the stored solution of an independent solver
-(`force_reference`), or to the wanted force where the file contains no solution.
+(`force_reference`), or to the wanted force if there is no stored solution.
 """
 
 from __future__ import annotations
@@ -49,36 +49,49 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 POSITIONS_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
-"""The pushed positions (m): distance along the object, and arc length around it from its front."""
+"""The positions at which the finger pushes, in metres.
+
+The first value is the distance along the object, the second one the arc length around the object
+from its front.
+"""
 
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.007, 0.010, 0.013, 0.016)
-"""The depths at which the finger rests, up to the scene's push depth, which is always one of them.
+"""The depths at which the finger rests, in metres.
+
+Only depths below the scene's push depth are used; the push depth is always added.
 """
 
 HOVER_M = 0.03
 APPROACH_S = 1.2
 PUSH_M_PER_S = 0.05
 HOLD_S, EVALUATED_S = 1.0, 0.3
-"""The duration of a rest, and duration of its last part, in which the force is evaluated."""
+"""The duration of a rest, and the duration of its last part, in which the force is evaluated."""
 
 MEASURED_S = 0.6
-"""The duration of the last part of each rest in which forces measured by a gauge are averaged."""
+"""The duration of the last part of each rest in which the forces of a gauge are averaged."""
 
 REST_SAMPLES = 3
 MOVING_STEP_S = 0.06
 
 HISTORY_STEP_S = 0.01
-"""The time step in which the force history of the rubber is computed; the finger moves 0.5 mm in
-it."""
+"""The time step in which the force history of the rubber is computed.
+
+The finger moves 0.5 mm in a time step.
+"""
 HISTORY_DEPTHS = 9
 HISTORY_CELLS = 16
-"""The number of depths, and membrane elements per side, of the elastic force curve for the history.
+"""The number of membrane elements per side for the elastic force curve of the force history.
+
+HISTORY_DEPTHS is the number of depths of the curve.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class RestInterval:
-    """An evaluated interval of a rest at a depth, s from the start of the finger path."""
+    """The time interval of a rest at a depth in which the force is evaluated.
+
+    begin_s, end_s: times from the start of the finger path.
+    """
 
     depth_m: float
     begin_s: float
@@ -90,8 +103,8 @@ class Press:
     """The finger path of one push.
 
     place: name of the pushed position. place_m: distance along the object and arc length around it
-    from its front. surface, normal: point (3,) and normal (3,) of the undeformed object there,
-    world frame. holds: evaluated rests; empty if the finger does not rest.
+    from its front. surface, normal: point (3,) and normal (3,) of the undeformed object at this
+    position, in the world frame. holds: evaluated rests; empty if the finger does not rest.
     """
 
     path: FingerPath
@@ -103,7 +116,7 @@ class Press:
 
 
 def make_presses(scene: Scene) -> list[Press]:
-    """Make all pushes of the experiment for a scene."""
+    """Return the finger paths of all pushes of the experiment in a scene."""
     deepest_m = scene.working_range.push_depth_m
     depths = np.append([depth for depth in DEPTHS_M if depth < deepest_m], deepest_m)
     resting = [_make_resting_press(scene, along, around, depths) for along, around in POSITIONS_M]
@@ -138,7 +151,10 @@ def _make_press(
     motion: Floats,
     holds: tuple[RestInterval, ...],
 ) -> Press:
-    """Make a push from times (s) and heights above the surface (m), given as motion (n, 2)."""
+    """Make a push at a position from times and heights of the finger.
+
+    motion: (n, 2), times (s) and heights above the surface (m). place, place_m, holds: see `Press`.
+    """
     surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M
     path = FingerPath(
@@ -152,7 +168,7 @@ def _make_press(
 
 
 def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
-    """Make the procedure of the experiment: push at each position, then move in and out.
+    """Make the procedure that pushes at all positions of the experiment.
 
     method: least accurate table of the soft body that is accepted. Before the first push, the
     procedure waits until the soft body uses such a table.
@@ -171,10 +187,10 @@ def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_t
 class ComplianceRecording:
     """The data of a compliance experiment, read from a bag.
 
-    windows_ns: (start, end) of each finger path, by label. edges: true flange poses of both arms
-    as rows (16,). curves: object force against depth, (m, 2) each, published at `curve_times_ns`.
-    methods: the soft body's method that computed each curve.
-    forces: times (ns) and values (N) of the valid measured contact forces (k, 2).
+    windows_ns: start and end of each finger path, by label. edges: true flange poses of both arms,
+    flattened to rows (16,). curves: object force against depth, arrays (m, 2), which were published
+    at `curve_times_ns`. methods: the soft body's method that computed each curve. forces: times
+    (ns) and values (N) of the valid measured contact forces (k, 2).
     """
 
     scene: Scene
@@ -189,7 +205,10 @@ class ComplianceRecording:
 
 
 def read_bag(bag: Path) -> ComplianceRecording:
-    """Read the data of a bag. Raises ExperimentError if the scene or the force curve is missing."""
+    """Read the data of a compliance experiment from a bag.
+
+    Raises ExperimentError if the scene or the force curve is missing.
+    """
     scene: Scene | None = None
     apparatus: Apparatus | None = None
     finger: list[tuple[int, Floats]] = []
@@ -238,11 +257,11 @@ def read_bag(bag: Path) -> ComplianceRecording:
 
 @dataclass(frozen=True, slots=True)
 class ForceSample:
-    """The forces at one time.
+    """The forces on the finger at one time.
 
-    depth_m: true finger depth. wanted_n: published force of the object. felt_n: force of the
-    sheet. normal_offset_m: depth of the sheet's centre below the undeformed surface. method: method
-    of the soft body. reference: force of the object from an independent solver, or None.
+    depth_m: true finger depth. wanted_n: published force of the object. felt_n: force of the sheet.
+    normal_offset_m: depth of the sheet's centre below the undeformed surface. method: method of the
+    soft body. reference: force of the object from an independent solver, or None.
     """
 
     depth_m: float
@@ -254,19 +273,17 @@ class ForceSample:
 
     @property
     def error_ratio(self) -> float:
-        """Return the error of the felt force relative to the expected force.
+        """Return the relative error of the felt force.
 
-        The divisor is the expected force, but at least FORCE_JND_FLOOR_N.
+        The error is relative to the reference force, or to the wanted force if there is no
+        reference. The divisor is at least FORCE_JND_FLOOR_N.
         """
         expected_n = self.wanted_n if self.reference is None else self.reference.force_n
         return _relative_error(self.felt_n, expected_n)
 
     @property
     def model_error_ratio(self) -> float | None:
-        """Return the error of the wanted force relative to the reference.
-
-        Return None if there is no reference.
-        """
+        """Return the relative error of the wanted force; None if there is no reference force."""
         if self.reference is None:
             return None
         return _relative_error(self.wanted_n, self.reference.force_n)
@@ -277,7 +294,8 @@ def _relative_error(force_n: float, expected_n: float) -> float:
 
 
 class ForceReference:
-    """A computation of the true forces in a recording with the simulator's membrane model."""
+    """An evaluator that computes the true forces in a recording with the simulator's membrane
+    model."""
 
     def __init__(self, recorded: ComplianceRecording) -> None:
         scene = apply_apparatus(recorded.scene, recorded.apparatus)
@@ -292,9 +310,9 @@ class ForceReference:
         self._curves: dict[str, ReferenceForceCurve | None] = {}
 
     def evaluate(self, at_ns: int, press: Press) -> ForceSample:
-        """Return the forces at the given time.
+        """Return the true forces at the time `at_ns`.
 
-        The depth is measured from the pushed surface point.
+        press: push to which this time belongs; the depth is measured from its surface point.
         """
         tip, left, right = self._read_poses(at_ns)
         depth_m = float((press.surface - tip) @ press.normal)
@@ -314,7 +332,8 @@ class ForceReference:
         )
 
     def _read_poses(self, at_ns: int) -> tuple[Floats, Floats, Floats]:
-        """Return the fingertip (3,) and the poses of both clamped edges (4, 4) at `at_ns`."""
+        """Return the true fingertip (3,) and the poses (4, 4) of both sheet edges at the time
+        `at_ns`."""
         times = np.array([at_ns])
         left, right = (
             edges.interpolate(times)[0].reshape(4, 4) @ clamp
@@ -325,7 +344,12 @@ class ForceReference:
     def _solve_n(
         self, left: Floats, right: Floats, tip: Floats, press: Press, cells: int = CELLS
     ) -> float:
-        """Return the force (N) of a purely elastic sheet along the normal of the push."""
+        """Return the force (N) of a purely elastic sheet on the finger, along the normal of the
+        push.
+
+        left, right: poses (4, 4) of the sheet's edges. tip: fingertip (3,). cells: membrane
+        elements per side.
+        """
         pressed = solve(
             self._rubber,
             left,
@@ -338,8 +362,9 @@ class ForceReference:
         return float(pressed.finger_force_n @ press.normal)
 
     def _history_ratio(self, at_ns: int, press: Press) -> float:
-        """Return the ratio of the rubber's force to that of an elastic sheet, at the time `at_ns`
-        in a push.
+        """Return the ratio of the rubber's force to the force of an elastic sheet.
+
+        at_ns: time during the push `press`.
         """
         if ForceHistory.of(self._recorded.apparatus) is None:
             return 1.0
@@ -350,11 +375,11 @@ class ForceReference:
         return float(np.interp(at_ns, times, ratios))
 
     def _follow_history(self, press: Press) -> tuple[Times, Floats]:
-        """Return the times (ns) of a push, and the ratios of the rubber's force to that of an
-        elastic sheet.
+        """Return the ratio of the rubber's force to the force of an elastic sheet during a push.
 
-        The membrane is solved at a few depths only, with the edges at the deepest point of the
-        push. That suffices, because the ratio depends only on the shape of the force curve.
+        The result contains the times (n,) in ns and the ratios (n,). The membrane is solved at a
+        few depths only, with the edges at the deepest point of the push. This is sufficient,
+        because the ratio depends only on the shape of the force curve.
         """
         begin_ns, end_ns = self._recorded.windows_ns[press.path.label]
         times = np.arange(begin_ns, end_ns + 1, round(HISTORY_STEP_S * 1e9))
@@ -384,19 +409,25 @@ def _interpolate_curve_n(rows: Floats, depth_m: float) -> float:
 
 
 def _sheet_normal(left: Floats, right: Floats) -> Floats:
-    """Return the unit normal (3,) of the unloaded sheet, towards the user."""
+    """Return the unit normal (3,) of the unloaded sheet, which points to the user.
+
+    left, right: poses (4, 4) of the sheet's edges.
+    """
     normal = np.cross(right[:3, 3] - left[:3, 3], left[:3, 1] + right[:3, 1])
     return np.asarray(normal / np.linalg.norm(normal))
 
 
 def _indentation_m(tip: Floats, left: Floats, right: Floats) -> float:
-    """Return the depth (m), at least 0, of the fingertip behind the plane of the unloaded sheet."""
+    """Return the depth (m) of the fingertip behind the plane of the unloaded sheet; at least 0.
+
+    tip: fingertip (3,). left, right: poses (4, 4) of the sheet's edges.
+    """
     middle = 0.5 * (left[:3, 3] + right[:3, 3])
     return max(float((middle - tip) @ _sheet_normal(left, right)), 0.0)
 
 
 def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
-    """Evaluate a bag; return the results of `experiment compliance --json`, in mm, N and %."""
+    """Evaluate a bag, and return the results of `experiment compliance --json` in mm, N and %."""
     recorded = read_bag(bag)
     reference = ForceReference(recorded)
     resting: list[dict[str, Any]] = []
@@ -446,9 +477,10 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
 
 
 def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | None:
-    """Return the mean measured force (N) of a rest; None if there is none in its interval.
+    """Return the mean force (N) that a gauge measured in a rest; None if there is no measurement.
 
-    The interval begins earlier than that of the true force, because gauges are slow.
+    forces: (k, 2), times (ns) and forces (N). begin_ns: start of the finger path. Because gauges
+    are slow, the averaging interval is longer than the interval for the true force.
     """
     since_s = 1e-9 * (forces[:, 0] - begin_ns)
     chosen = forces[(since_s > hold.end_s - MEASURED_S) & (since_s < hold.end_s), 1]
@@ -465,7 +497,10 @@ def _evaluate_moving(
 
 
 def _summarize_against_reference(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return median and maximum error (%) of each position, over result rows with a reference."""
+    """Return the median and maximum error (%) at each position.
+
+    Only result rows with a reference force are used.
+    """
     result = []
     for place in dict.fromkeys(row["at"] for row in rows):
         felt, model = (

@@ -1,4 +1,4 @@
-"""Run the demo (`flexsheet demo`): the whole system on one computer, with tables and figures."""
+"""Run the system on one computer as a demo, and create tables and figures of the errors."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.types import Correction, FingerPath
 
 METRES_PER_PX = 0.0007
-"""The resolution of images in Furukawa et al. 2007. It is sufficient for figures, and images take a
-quarter of the time of the default resolution."""
+"""The image resolution in Furukawa et al. 2007.
+
+It is sufficient for figures, and images take a quarter of the time of the default resolution.
+"""
 
 SECONDS = (10.0, 30.0)
 TILT_DEG = -40
@@ -37,7 +39,8 @@ PUSH_CORRECTIONS: tuple[Correction, ...] = ("none", "four_triangles", "two_pass"
 class DemoResult:
     """The results of the demo.
 
-    strokes: result of each stroke. followed: result of following the given path, or None.
+    strokes: one result per stroke. followed: errors of the sheet along the given finger path; None
+    if no path was given.
     """
 
     folder: Path
@@ -56,7 +59,11 @@ def run_demo(
     path: FingerPath | None = None,
     apparatus: str | None = None,
 ) -> DemoResult:
-    """Run two strokes (10 s, 30 s) or follow `path`; take images of a tilted and pushed sheet."""
+    """Run the demo on a graph, and return its results.
+
+    The finger makes strokes of 10 s and 30 s, or follows `path` if it is given. Images of a tilted
+    and of a pushed sheet are captured. folder: where the bag and the figures are written.
+    """
     bag = folder / "demo.mcap"
     procedure = chain_procedures(
         make_stroke_procedure(SECONDS, progress, path=path),
@@ -74,7 +81,7 @@ def run_demo(
 
 
 def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
-    """Return how well the sheet followed the finger path with a label.
+    """Return the errors with which the sheet followed the finger path that has the given label.
 
     Raises ExperimentError if the bag does not contain the path.
     """
@@ -85,7 +92,10 @@ def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
 def summarize(
     bag: Path, folder: Path, *, strokes: tuple[float, ...], path_label: str | None = None
 ) -> DemoResult:
-    """Compute the results of the demo from its bag, and draw its figures into `folder`."""
+    """Compute the results of the demo from its bag, and draw its figures into `folder`.
+
+    strokes: durations of the recorded strokes, s. path_label: label of a recorded finger path.
+    """
     recording = stroke.read_recording(bag)
     eye_images = image.read_images(bag)
     views, plot, latency = (folder / f"{name}.png" for name in ("eye", "stroke", "latency"))

@@ -63,21 +63,28 @@ SETTLED_RATE_RAD_PER_S = 0.8
 SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
 EYE_PIXELS_EVERY = 9
-"""The interval, in frames, between frames with pixels. It is odd, so that both eyes' frames have
-them in turn."""
+"""The interval, in frames, between frames that contain pixels.
+
+The interval is odd, so that such frames alternate between both eyes.
+"""
 WAIT_S = 20.0
 IMAGE_WAIT_S = 40.0
 MAX_TABLE_WAIT_S = 3600.0
-"""The maximum time until a table of the soft body is used; two idle cores need about a minute for
-the coarse table, and about eight minutes for the complete table."""
+"""The maximum time to wait for a table of the soft body.
+
+Two idle cores need about a minute for the coarse table, and about eight minutes for the complete
+table.
+"""
 PROGRESS_PERIOD_S = 5.0
 MAX_LOAD_PER_CORE = 3.0
-"""The load average per core above which the computer counts as overloaded. The demo causes a lower
-load."""
+"""The load average per core above which the computer is considered overloaded.
+
+The demo causes a lower load.
+"""
 
 
 class Driver:
-    """A connection of an experiment to a running graph; an asynchronous context manager."""
+    """A connection of an experiment to a running graph, used as an asynchronous context manager."""
 
     def __init__(
         self,
@@ -86,7 +93,7 @@ class Driver:
         pids: Callable[[], Mapping[str, int]] = dict,
         publish_scene: Callable[[Scene], int] | None = None,
     ) -> None:
-        """Store the arguments; `async with` connects to the graph.
+        """Store the arguments; `async with` connects the driver to the graph.
 
         pids: function that returns the process id of each running node, for measurements.
         publish_scene: function that replaces the scene and returns its source timestamp.
@@ -163,7 +170,7 @@ class Driver:
     async def wait_for(
         self, condition: Callable[[], bool], description: str, seconds: float
     ) -> None:
-        """Wait until `condition` is true; it is checked at each message.
+        """Wait until `condition` returns True; it is evaluated when a message arrives.
 
         description: text for the error. Raises ExperimentError after `seconds`.
         """
@@ -188,7 +195,10 @@ class Driver:
         return self._newest.get(topic)
 
     async def wait_ready(self) -> None:
-        """Wait until both arms are in mode "follow" and, if needed, a soft body is published."""
+        """Wait until both arms are in mode "follow".
+
+        If a node of the graph publishes soft bodies, also wait for the first soft body.
+        """
         needs_body = bool(self._plan.writers.get("soft_body"))
 
         def ready() -> bool:
@@ -202,12 +212,12 @@ class Driver:
     async def wait_for_table(
         self, scene: Scene, method: TableMethod, progress: Callable[[str], None]
     ) -> None:
-        """Wait until the soft body uses a table that is at least as precise as `method`.
+        """Wait until the soft body uses a table that is at least as accurate as `method`.
 
-        Until then, a node with an empty cache uses a less precise method. Return at once if the
-        scene or the parameters of all nodes choose such a method. progress: receives the node's
-        progress and remaining time. Raises ExperimentError after `MAX_TABLE_WAIT_S`, and if the
-        table cannot be computed.
+        If the cache has no such table, a node uses a less accurate method while it computes the
+        table. Return at once if the scene or the parameters of all nodes select such a method.
+        progress: function that receives the node's progress and remaining time. Raises
+        ExperimentError after `MAX_TABLE_WAIT_S`, and if the table cannot be computed.
         """
         solvers = {name: p for name, p in self._solvers() if _computes_table(p, scene)}
         if not solvers:
@@ -249,7 +259,7 @@ class Driver:
                 yield name, FemSolverParameters.model_validate(node.parameters)
 
     async def change_scene(self, scene: Scene) -> None:
-        """Replace the scene of the graph, and wait for its soft body and both arms."""
+        """Replace the scene of the graph, and wait until its soft body and both arms are ready."""
         if self._publish_scene is None:
             raise RuntimeError("this driver cannot publish a scene")
         source_ns = self._publish_scene(scene)
@@ -296,9 +306,10 @@ class Driver:
         *,
         pattern: Pattern = "object",
     ) -> TwinEye:
-        """Show the object with an image correction; return the simulated eye's image of it.
+        """Display the object with an image correction, and return the simulated eye's image.
 
-        Flat shading shows a sharp outline for measurements, soft shading is for figures.
+        label: label of the image. shading: "flat" for a sharp outline in measurements, "soft" for
+        figures.
         """
         self.show(
             Display(
@@ -324,7 +335,7 @@ class Driver:
         return eye
 
     async def capture_both_eyes(self, label: str, correction: Correction, pattern: Pattern) -> None:
-        """Show the object to both simulated eyes in turn, and wait for the image of each eye."""
+        """Display the object alternately to both simulated eyes, and wait for both images."""
         self.show(
             Display(
                 correction=correction,
@@ -349,7 +360,8 @@ class Driver:
 
 
 def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
-    """Return whether a solver node uses a table for a scene and computes a missing one."""
+    """Return whether a solver node uses a table for a scene, and computes the table if it is
+    missing."""
     method, _ = choose_method(
         scene,
         parameters.method,
@@ -361,7 +373,7 @@ def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
 
 
 def _describe_load() -> str:
-    """Return a hint for timeout errors if the computer is overloaded, else an empty text."""
+    """Return a hint for timeout errors if the computer is overloaded, otherwise an empty text."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load <= MAX_LOAD_PER_CORE * cores:
         return ""

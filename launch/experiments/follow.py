@@ -1,8 +1,9 @@
-"""Follow a recorded finger, and compute a lower bound for the sheet's error with the same arms.
+"""Simulate a sheet that follows a recorded finger, and compute a lower bound for its error.
 
-The bound is the optimum of a linear program over the whole recording. It assumes that
+The bound is the optimum of a linear program over the whole recording, with the limits of the same
+arms. It assumes that
 
-- the future of the finger is known, so delays, tracking and prediction cost nothing;
+- the future of the finger is known, so that delays, tracking and prediction cause no error;
 - the sheet rolls on the undeformed object without slip, with a constant stretch;
 - joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
   limited as in the arm bridges; there is no servo lag and no limit of the jerk;
@@ -57,15 +58,17 @@ from flexsheet.nodes.twin.paths import map_to_surface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 STEP_S = 1.0 / 30.0
-"""The time step of the linear program."""
+"""The time step of the linear program, in seconds."""
 
 WINDOW_STEPS = 60
-"""The number of time steps in a window. The solution time grows faster than linearly with this
-number."""
+"""The number of time steps in a window.
+
+The solution time grows faster than linearly with this number.
+"""
 
 MAX_DEVIATION_M = 0.05
 DEVIATION_M = 1e-4
-"""The displacement of the contact for numerical derivatives of the joint angles."""
+"""The displacement (m) of the contact for numerical derivatives of the joint angles."""
 
 ROLL_STEPS = 40
 
@@ -78,16 +81,17 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 SPEED_DIRECTIONS = DIRECTIONS[(np.abs(DIRECTIONS) > 0.0).sum(axis=1) != 2]
 SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
-"""The unit vectors (7, 3) along which the tool speed is limited, forwards and backwards."""
+"""The unit vectors (7, 3) along which the tool speed is limited in both directions."""
 
 
 @dataclass(frozen=True, slots=True)
 class LimitedMotion:
-    """The m limited quantities of a mechanism at n time steps, linear in k deviations from a
-    motion.
+    """A linear model of m limited quantities of a mechanism, such as joint angles.
 
-    values: (n, m), quantities in the nominal motion. slopes: (n, m, k), derivatives with respect to
-    the deviations. max_rate, max_acceleration, low, high: (m,), limits; infinite if there is none.
+    The quantities depend linearly on k deviations from a nominal motion of n time steps. values:
+    (n, m), quantities in the nominal motion. slopes: (n, m, k), derivatives with respect to the
+    deviations. max_rate, max_acceleration, low, high: (m,), limits of the quantities; infinite if
+    there is none.
     """
 
     values: Floats
@@ -101,10 +105,11 @@ class LimitedMotion:
 def find_least_deviation(
     motion: LimitedMotion, weights: Floats, step_s: float, *, max_deviation: float
 ) -> Floats | None:
-    """Return the lengths (n,) of the deviations with the least weighted mean length.
+    """Find the motion with the least weighted mean deviation from a nominal motion.
 
-    weights: (n,), zero where a deviation does not count. max_deviation: limit of each component.
-    The weighted mean of the lengths is a lower bound. Return None if no motion fulfils the limits.
+    weights: (n,), weights of the time steps. step_s: time step. max_deviation: limit of each
+    component of a deviation. Returns the lengths (n,) of the deviations, whose weighted mean is a
+    lower bound; None if no motion fulfils the limits.
     """
     steps, _, deviations = motion.slopes.shape
     scale = max_deviation
@@ -112,7 +117,7 @@ def find_least_deviation(
     limits: list[Floats] = []
 
     def add(operator: Any, nominal: Floats, bound: Floats) -> None:
-        """Add the constraint |nominal + operator e| <= bound on the scaled deviations e."""
+        """Add the constraint |nominal + operator e| <= bound for the scaled deviations e."""
         known = np.isfinite(bound)
         kept = operator[known]
         rows.extend((kept, -kept))
@@ -162,9 +167,7 @@ def _directions(count: int) -> Floats:
 
 
 def _differences(steps: int, order: int) -> csr_array:
-    """Return the matrix (steps - order, steps) that computes finite differences of the given order
-    in time.
-    """
+    """Return the sparse matrix (steps - order, steps) that computes finite differences in time."""
     return csr_array(np.diff(np.eye(steps), n=order, axis=0))
 
 
@@ -178,10 +181,10 @@ def _block_rows(rows: Floats) -> csr_array:
 
 @dataclass(frozen=True, slots=True)
 class RolledSheet:
-    """A sheet that touches the object.
+    """A sheet that touches the object at a point.
 
     point (3,), rotation (3, 3): contact point and orientation of the sheet, in the object's frame.
-    on_sheet_m: the same point in the sheet's coordinates, (x, y, 0).
+    on_sheet_m: the contact point in the sheet's coordinates, (x, y, 0).
     """
 
     point: Floats
@@ -189,12 +192,16 @@ class RolledSheet:
     on_sheet_m: Floats
 
     def pose(self, lifted_m: float = 0.0) -> Floats:
-        """Return object_from_sheet (4, 4) of the sheet, lifted along its normal by `lifted_m`."""
+        """Return the pose object_from_sheet (4, 4), displaced along the sheet's normal by
+        `lifted_m`."""
         contact = self.on_sheet_m - np.array([0.0, 0.0, lifted_m])
         return transform(self.rotation, self.point - self.rotation @ contact)
 
     def rolled_to(self, point: Floats, normal: Floats) -> RolledSheet:
-        """Return the sheet after rolling without slip to a nearby point with the given normal."""
+        """Return the sheet after it has rolled without slip to a nearby point of the object.
+
+        point: new contact point (3,). normal: unit normal (3,) of the object at this point.
+        """
         before = self.rotation[:, 2]
         axis = np.cross(before, normal)
         sine, cosine = float(np.linalg.norm(axis)), float(before @ normal)
@@ -210,7 +217,8 @@ class RolledSheet:
 
 
 class FollowedContact:
-    """A computation of the sheet motion that follows a finger exactly, and of its deviations."""
+    """A model of the sheet motion that follows a finger exactly, and of deviations from this
+    motion."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None = None) -> None:
         true_scene = apply_apparatus(scene, apparatus or nominal_apparatus(scene))
@@ -222,12 +230,16 @@ class FollowedContact:
         self._distance_m = scene.sheet.width_m * 0.5 * (low + high)
 
     def contact_heights_m(self, positions_world: Floats) -> Floats:
-        """Return the heights (n,) of fingertips above the undeformed object."""
+        """Return the heights (n,), in m, of fingertip positions (n, 3) above the undeformed
+        object."""
         local = apply(inverse(self._world_from_object), positions_world)
         return self._shape.closest(local).height_m
 
     def roll_along(self, positions_world: Floats) -> list[RolledSheet]:
-        """Return the sheet at each finger position (n, 3), after rolling there from the front."""
+        """Return the sheets after rolling over the object to each finger position.
+
+        positions_world: (n, 3), m. The sheet starts at the front of the object.
+        """
         object_from_world = inverse(self._world_from_object)
         front_world = map_to_surface(self._scene, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1e-3]]))
         front, above = apply(object_from_world, front_world)
@@ -251,11 +263,11 @@ class FollowedContact:
         return sheet.rolled_to(found.point, found.normal)
 
     def limit(self, sheets: Sequence[RolledSheet], reachable: list[bool]) -> LimitedMotion:
-        """Return the joint angles and the positions of the edge ends, linear in the deviations.
+        """Return joint angles and positions of the edge ends as linear functions of the deviations.
 
         The three deviations (m) of the contact are along the sheet's x and y on the object, and
-        along its normal. For each nominal sheet, appends to `reachable` whether the arms reach it.
-        The values of unreachable sheets are NaN.
+        along its normal. For each nominal sheet, the method appends to `reachable` whether the arms
+        reach the sheet. The values of unreachable sheets are NaN.
         """
         joints = np.full((len(sheets), 4, 2, 6), np.nan)
         ends = np.full((len(sheets), 4, 2, 2, 3), np.nan)
@@ -317,12 +329,12 @@ def bound_errors(
     *,
     apparatus: Apparatus | None = None,
 ) -> dict[str, Any]:
-    """Return the lower bound of the contact error for a finger path, in mm.
+    """Return a lower bound of the contact error for a finger path, in mm.
 
-    times_s: (n,), increasing. positions_world: (n, 3), true fingertip. The result contains the mean
-    and the 95 % quantile (p95) over the steps in contact, for the motion with the least mean. Steps
-    whose exact sheet the arms cannot reach, and windows without a solution, count as zero.
-    Raises ExperimentError if the path never touches the object.
+    times_s: (n,), increasing. positions_world: (n, 3), true fingertip, m. The result contains the
+    mean and the 95 % quantile (p95) over the steps in contact. They belong to the motion with the
+    least mean. Steps whose exact sheet the arms cannot reach, and windows without a solution, have
+    an error of zero. Raises ExperimentError if the path never touches the object.
     """
     followed = FollowedContact(scene, apparatus)
     grid = np.arange(times_s[0], times_s[-1], STEP_S)
@@ -373,7 +385,10 @@ def bound_errors(
 
 
 def _windows(reachable: Bools) -> list[slice]:
-    """Divide the reachable steps into windows of 3 to WINDOW_STEPS consecutive steps."""
+    """Divide the reachable time steps into windows of 3 to WINDOW_STEPS consecutive steps.
+
+    reachable: (n,), whether the arms reach the sheet in each time step.
+    """
     changes = np.flatnonzero(np.diff(reachable.astype(int))) + 1
     ends = [0, *changes.tolist(), len(reachable)]
     windows = []
@@ -393,7 +408,7 @@ def run_follow(
     *,
     apparatus: str | None = None,
 ) -> dict[str, Any]:
-    """Follow a finger path; return the results of `experiment follow --json`.
+    """Let the sheet follow a finger path, and return the results of `experiment follow --json`.
 
     bag: file in which to record the running graph; None: follow the path in simulated time, without
     a running graph.

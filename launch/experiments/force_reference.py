@@ -19,24 +19,26 @@ from flexsheet.messages.scene import Cylinder, Scene, StripSupport
 
 REFERENCE_FILE = Path(__file__).with_name("force_reference.json")
 SAME_RATIO = 1e-3
-"""The relative difference up to which lengths, angles or Poisson's ratios count as equal."""
+"""The relative difference up to which lengths, angles or Poisson's ratios are considered equal."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReferenceForce:
-    """The force (N) of the object on the finger, and its relative uncertainty."""
+    """The force (N) of the object on the finger, with its relative uncertainty."""
 
     force_n: float
     uncertainty_ratio: float
 
 
 class ReferenceForceCurve:
-    """A curve of force against depth from an independent solver, at one position on a scene's
-    object.
-    """
+    """A force-depth curve of an independent solver for one position on a scene's object."""
 
     def __init__(self, curve: dict[str, Any], *, finger_radius_m: float, modulus_pa: float) -> None:
-        """Store a curve of the file, which must contain two or more depths."""
+        """Convert a stored dimensionless curve to SI units.
+
+        curve: curve of the file, with two or more depths. modulus_pa: Young's modulus of the
+        object.
+        """
         self._depths_m = finger_radius_m * np.array(curve["depths"])
         forces = modulus_pa * finger_radius_m**2 * np.array(curve["forces"])
         # As in Hertz' theory, force / depth^1.5 hardly changes, so its interpolation is precise.
@@ -44,7 +46,7 @@ class ReferenceForceCurve:
         self._uncertainty = np.array(curve["uncertainty_ratio"])
 
     def force(self, depth_m: float) -> ReferenceForce | None:
-        """Return the force at a depth; None if it is more than 1 % outside the curve's depths."""
+        """Return the force at a depth; None if the depth is outside the curve by more than 1 %."""
         if not 0.99 * self._depths_m[0] <= depth_m <= 1.01 * self._depths_m[-1]:
             return None
         return ReferenceForce(
@@ -56,9 +58,10 @@ class ReferenceForceCurve:
 def find_reference_curve(
     scene: Scene, along_m: float, around_m: float, file: Path = REFERENCE_FILE
 ) -> ReferenceForceCurve | None:
-    """Return the stored curve for a position on the object of a scene, or None if none fits.
+    """Return the stored curve for a position on the object of a scene; None if there is no such
+    curve.
 
-    along_m: position along the axis. around_m: arc length from the side towards the user.
+    along_m: position along the axis. around_m: arc length from the side that faces the user.
     """
     geometry, support = scene.object.geometry, scene.object.support
     material = scene.object.material

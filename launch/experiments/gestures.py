@@ -32,12 +32,17 @@ from flexsheet.nodes.twin.paths import recorded_path
 Times = NDArray[np.int64]
 
 PREDICTION_HORIZONS_S = (0.0, 0.02, 0.05)
-"""The evaluated prediction horizons: zero, the latency from exposure to arm command, and that
-latency plus the servo lag of the arm."""
+"""The evaluated prediction horizons, in seconds.
+
+They are zero, the latency from exposure to arm command, and this latency plus the servo lag of the
+arm.
+"""
 
 MAX_LAG_S = 0.08
-"""The maximum lag in the cross-correlation. It is less than half the period of the fastest taps, so
-that a tap is not matched with the next one."""
+"""The maximum lag (s) in the cross-correlation of measured and true finger motion.
+
+It is less than half the period of the fastest taps, so that a tap is not matched with the next tap.
+"""
 
 MIN_SAMPLES = 10
 GAP_PERIODS = 2.5
@@ -48,11 +53,17 @@ GESTURES: dict[str, Callable[[Scene], FingerPath]] = {
     "stroke-30": partial(stroke.stroke_path, seconds=30.0),
     **twin_gestures.GESTURES,
 }
-"""The finger paths by name: the strokes of Furukawa et al. 2007, and models of human gestures."""
+"""The functions that make the finger paths of gestures, by name.
+
+The gestures are the strokes of Furukawa et al. 2007, and models of human motions.
+"""
 
 
 def gesture_path(name: str, scene: Scene) -> FingerPath:
-    """Make the finger path of a gesture on the scene's object; its label is the gesture's name."""
+    """Return the finger path of a gesture on the scene's object; its label is the gesture's name.
+
+    Raises ExperimentError if the gesture does not fit the object.
+    """
     try:
         return GESTURES[name](scene).model_copy(update={"label": name})
     except (FingerPathError, UnfitGeometryError) as error:
@@ -60,9 +71,11 @@ def gesture_path(name: str, scene: Scene) -> FingerPath:
 
 
 def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = ()) -> FingerPath:
-    """Make a finger path in the scene of a launch file, from a gesture's name or a recorded path.
+    """Return a finger path in the scene of a launch file.
 
-    settings: see `load_graph`; "scene=FILE" replaces the scene.
+    name_or_file: name of a gesture, or CSV file with a recorded path. settings: settings of the
+    launch file, as in `load_graph`; "scene=FILE" replaces the scene. Raises ExperimentError if the
+    path is unknown or invalid.
     """
     scene = load_graph(launch_file, settings=settings).scene_message()
     if scene is None:
@@ -93,17 +106,18 @@ def make_gestures_procedure(names: Sequence[str], progress: Progress) -> Procedu
 
 @dataclass(frozen=True, slots=True)
 class TrueFinger:
-    """The true finger motion at the exposures: times (n,) ns, positions and velocities (n, 3)."""
+    """The true finger motion at the exposures: times (n,) in ns, positions (m) and velocities (n,
+    3)."""
 
     times_ns: Times
     positions: Floats
     velocities: Floats
 
     def interpolate(self, times_ns: Times) -> Floats:
-        """Return the positions (m, 3) at other times (m,), by cubic Hermite interpolation.
+        """Return the finger positions (m, 3) at other times (m,), by cubic Hermite interpolation.
 
         At 60 Hz the interpolation error is at most 45 um in the fastest taps, 13 um in slower taps
-        and 8 um otherwise. Positions in gaps between exposures, and outside them, are NaN.
+        and 8 um otherwise. Positions in gaps between exposures, and outside the recording, are NaN.
         """
         zero = self.times_ns[0]
         seconds = (self.times_ns - zero) * 1e-9
@@ -120,10 +134,10 @@ class TrueFinger:
 
 @dataclass(frozen=True, slots=True)
 class GestureRecording:
-    """The data of gestures, read from a bag; all times are in ns on the same clock.
+    """The data of recorded gestures, read from a bag; all times are in ns on the same clock.
 
-    truth: true finger. fingertips: measured at the exposures `times_ns`. windows_ns: start and end
-    of each gesture.
+    truth: true finger motion. fingertips: messages measured at the exposures `times_ns`.
+    windows_ns: start and end of each gesture.
     """
 
     truth: TrueFinger
@@ -133,9 +147,10 @@ class GestureRecording:
 
 
 def read_gestures(bag: Path) -> GestureRecording:
-    """Read the true finger and the measured fingertips from a bag.
+    """Read the true finger motion and the measured fingertips from a bag.
 
-    The window of a gesture excludes the motion to its first point and the time after its last one.
+    The time window of a gesture excludes the motion to its first point, and the time after its last
+    point.
     """
     truths: dict[int, TwinFinger] = {}
     tips: dict[int, Fingertip] = {}
@@ -172,11 +187,11 @@ def read_gestures(bag: Path) -> GestureRecording:
 
 
 def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
-    """Return the jumps between consecutive position estimates, in standard deviations (n-1,).
+    """Return the jumps (n-1,) between consecutive position estimates, in standard deviations.
 
     errors: (n, 3) m, errors of the estimates. A jump is the difference of two errors, so it does
     not contain the finger's motion. covariances: (n, 3, 3) m^2, covariances of the estimates. The
-    standard deviation is along the jump, for independent estimates.
+    standard deviation is taken along the jump, for independent estimates.
     """
     jumps = np.diff(errors, axis=0)
     lengths = np.linalg.norm(jumps, axis=1)
@@ -187,7 +202,7 @@ def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
 
 
 def error_mm(errors: Floats) -> dict[str, float | None]:
-    """Return rms, 99 % quantile and maximum length of errors (n, 3) m, in mm.
+    """Return rms, 99 % quantile and maximum of the lengths (mm) of errors (n, 3), which are in m.
 
     All values are None if there are no errors.
     """
@@ -202,7 +217,10 @@ def error_mm(errors: Floats) -> dict[str, float | None]:
 
 
 def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
-    """Return the positions (n, 3) that fingertips predict for `lead_s` after their exposures."""
+    """Return the predicted fingertip positions (n, 3), in m, at `lead_s` after the exposures.
+
+    tips: n fingertip messages with predicted paths.
+    """
     if lead_s == 0.0:
         return _stack_rows([tip.position_world_m for tip in tips])
     return _stack_rows(
@@ -214,12 +232,12 @@ def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
 
 
 def _stack_rows(points: Sequence[Floats]) -> Floats:
-    """Stack points (3,) as rows of an array (n, 3). Without points, its shape is (0, 3)."""
+    """Stack points (3,) as rows of an array (n, 3); return shape (0, 3) if there are none."""
     return np.array(points, dtype=np.float64).reshape(len(points), 3)
 
 
 def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
-    """Return the tracking results of one gesture in mm and ms; None for unknown values.
+    """Return the tracking errors (mm) and delays (ms) of one gesture; unknown values are None.
 
     missing: number of exposures without a fingertip. reasons: number of invalid fingertips, by
     reason. jump: jumps between consecutive valid fingertips, see `jump_sigmas`.
@@ -255,7 +273,10 @@ def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
 
 
 def _summarize_jumps(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
-    """Return the largest jump between consecutive fingertips, and the number of jumps > SIGMAS."""
+    """Return the largest jump between fingertips, and the number of jumps above the limit SIGMAS.
+
+    errors: (n, 3), errors of the n fingertips, m.
+    """
     if len(tips) < 2:
         return {"max_sigmas": None, "max_mm": None, "beyond_3_sigmas": 0}
     sigmas = jump_sigmas(errors, np.array([tip.covariance[:3, :3] for tip in tips]))
@@ -269,7 +290,8 @@ def _summarize_jumps(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any
 def _evaluate_prediction(
     truth: TrueFinger, times_ns: Times, tips: Sequence[Fingertip], lead_s: float
 ) -> dict[str, Any]:
-    """Return the error and lag of the positions predicted for `lead_s` after each exposure."""
+    """Return the error and lag of positions that were predicted for `lead_s` after each
+    exposure."""
     ahead_ns = times_ns + round(lead_s * 1e9)
     true = truth.interpolate(ahead_ns)
     known = np.isfinite(true).all(axis=1)
@@ -285,9 +307,10 @@ def _evaluate_prediction(
 
 
 def gestures_result(bag: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Evaluate a bag; return the results of `experiment gestures --json`.
+    """Evaluate a bag, and return the results of `experiment gestures --json`.
 
-    followed: errors of the sheet for each path; None if the bag lacks the arms or the scene.
+    followed: errors of the sheet for each path; None if the bag does not contain the arms or the
+    scene.
     """
     recorded = read_gestures(bag)
     followed = {run["path"]: run for run in read_followed(bag)}

@@ -1,8 +1,8 @@
 """Evaluate the force that a simulated hand feels: `experiment stability --gestures`.
 
-The gestures are voluntary motions of a simulated hand that feels the sheet (coupled): the force of
-the sheet deflects the finger from them. This force is compared with the force of the object at the
-finger's true depth. Runs are in simulated time.
+The gestures are voluntary motions of a simulated hand, from which the force of the sheet deflects
+the finger. The force of the sheet is compared with the force of the virtual object at the finger's
+true depth. The simulation runs in simulated time.
 """
 
 from __future__ import annotations
@@ -47,23 +47,29 @@ from flexsheet.nodes.twin.paths import inside, limit_path_speed, map_to_surface,
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 
 DEPTH_FRACTION = 0.3
-"""The voluntary depth of the gestures, as a fraction of the scene's push depth."""
+"""The voluntary push depth of the gestures, as a fraction of the scene's maximum push depth."""
 
 TAPS, TAP_M, TAP_LIFT_M = 6, 0.004, 0.012
 STROKE_M_PER_S, MODULATION_HZ = 0.035, 1.0
 SLIP_FRACTION = 0.375
-"""The distance of a slip along the object, as a fraction of the sheet's width."""
+"""The distance that the finger slips along the object, as a fraction of the sheet's width."""
 
 TRANSIENT_S = 0.1
-"""The time after the start of a touch in which force errors are transients of the contact."""
+"""The duration (s) of the force transient after the start of a touch."""
 
 MIN_CONTACT_N = 2e-3
-"""The force above which the finger touches the sheet: a tenth of the smallest force that a
-fingertip can perceive."""
+"""The force above which the finger is considered to touch the sheet, in newtons.
+
+It is a tenth of the smallest force that a fingertip can perceive.
+"""
 
 
 def _press(depth_m: float, hold_s: float, lift_s: float) -> tuple[Floats, Floats]:
-    """Return times (n,) and surface positions (n, 3) of a push that is held and released."""
+    """Return the finger motion of a push that is held and then released.
+
+    Returns times (n,) in s and positions (n, 3) in m, in coordinates of the object's surface.
+    hold_s, lift_s: durations of the rest and of the release.
+    """
     return minimum_jerk(
         (0.0, 0.0, HOVER_M),
         [
@@ -91,24 +97,27 @@ def _place(scene: Scene, label: str, times_s: Floats, points: Floats) -> FingerP
 
 
 def make_tap(scene: Scene, depth_m: float) -> FingerPath:
-    """Make a finger path that taps six times, three times a second, to a fixed depth of 4 mm."""
+    """Return a finger path that taps six times, three times a second, to a fixed depth of 4 mm.
+
+    depth_m: not used.
+    """
     above, below = (0.0, 0.0, TAP_LIFT_M), (0.0, 0.0, -TAP_M)
     moves = [move for _ in range(TAPS) for move in ((0.11, below), (0.06, below), (0.16, above))]
     return _make_path(scene, "tap", minimum_jerk(above, moves))
 
 
 def make_hold(scene: Scene, depth_m: float) -> FingerPath:
-    """Make a finger path that pushes to `depth_m`, holds still for 3 s, and lifts."""
+    """Return a finger path that pushes to `depth_m`, holds still for 3 s, and lifts."""
     return _make_path(scene, "hold", _press(depth_m, 3.0, 0.8))
 
 
 def make_let_go(scene: Scene, depth_m: float) -> FingerPath:
-    """Make a finger path that pushes to `depth_m` and withdraws as fast as a person does."""
+    """Return a finger path that pushes to `depth_m` and withdraws as fast as a person does."""
     return _make_path(scene, "let-go", _press(depth_m, 1.5, 0.15))
 
 
 def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
-    """Make a finger path that strokes around the object and back.
+    """Return a finger path that strokes around the object and back.
 
     The depth oscillates between half of `depth_m` and `depth_m` once per second.
     """
@@ -133,7 +142,8 @@ def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_slip(scene: Scene, depth_m: float) -> FingerPath:
-    """Make a finger path that pushes, slides straight off the object's end, and lifts."""
+    """Return a finger path that pushes to half of `depth_m`, slides off the object's end, and
+    lifts."""
     times, places = _press(0.5 * depth_m, 2.5, 0.8)
     points = map_to_surface(scene, places)
     ends = map_to_surface(scene, np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0]]))
@@ -154,14 +164,15 @@ HAND_GESTURES: dict[str, tuple[Callable[[Scene, float], FingerPath], int]] = {
     "let-go": (make_let_go, 1),
     "slip": (make_slip, 1),
 }
-"""The function that makes each gesture, and the number of touches in the gesture, by name."""
+"""The function that makes the finger path, and the number of touches, of each gesture by name."""
 
 
 @dataclass(frozen=True, slots=True)
 class FeltForce:
-    """The force that a finger feels, and force of the object at the finger's depth.
+    """The force that a finger feels, and the force of the object at the finger's depth.
 
-    times_s, depths_m, felt_n, wanted_n: arrays (n,), one element per time step.
+    times_s, depths_m, felt_n, wanted_n: arrays (n,) with one element per time step. wanted_n: force
+    of the object.
     """
 
     times_s: Floats
@@ -171,7 +182,10 @@ class FeltForce:
 
 
 def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) -> FeltForce:
-    """Compute felt and wanted force of a run; curve (m, 2): depths and forces of the object."""
+    """Compute the felt force and the object's force during a recorded touch.
+
+    curve: (m, 2), depths (m) and forces (N) of the object.
+    """
     shape = make_shape(dict(scene.object.geometry))
     points = apply(inverse(object_pose(scene)), recorded.positions_m)
     nearest = shape.closest(points)
@@ -187,10 +201,11 @@ def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) ->
 
 
 def evaluate_touch(recorded: TouchRecording, force: FeltForce, touches: int) -> dict[str, Any]:
-    """Return force errors and numbers of contacts of one gesture.
+    """Return the force errors and the numbers of contacts of one gesture.
 
-    touches: number of touches that the gesture consists of. chatter: number of further touches.
-    transient_n: largest force error within TRANSIENT_S after a touch.
+    touches: number of touches that the gesture consists of. chatter (in the result): number of
+    touches in excess of this. transient_n: largest force error within TRANSIENT_S after the start
+    of a touch.
     """
     touching = force.felt_n > MIN_CONTACT_N
     active = touching | (force.wanted_n > MIN_CONTACT_N)
@@ -232,10 +247,10 @@ def hand_gestures_result(
     names: Sequence[str] = tuple(HAND_GESTURES),
     cache_dir: Path | None = None,
 ) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
-    """Simulate gestures with random hands; return the result, and the forces for a chart.
+    """Simulate gestures with random hands; return the results, and the forces for a chart.
 
-    hands: number of hands of each kind: finger, wrist and arm. curve (m, 2): depths (m) and forces
-    (N) of the object. The forces are indexed by kind of hand and gesture.
+    hands: number of hands of each kind, which are finger, wrist and arm. curve: (m, 2), depths (m)
+    and forces (N) of the object. The keys of the forces are (kind of hand, gesture).
     """
     progress("computing the reaction of the sheet (only once)")
     reaction = load_or_compute_reaction(scene, None, cache_dir)
@@ -276,11 +291,12 @@ def run_gestures(
     *,
     apparatus: str | None = None,
 ) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
-    """Start a graph, perform the gestures in it, and return the result and the felt forces.
+    """Start a graph, perform the gestures in it, and return the results and the felt forces.
 
-    Both have the format of `hand_gestures_result`. The force is sampled only at the exposures, so
-    shorter peaks are missed. curve (m, 2): depths (m) and forces (N) of the object. apparatus: file
-    with the true parameters of the simulated hardware, among them the hand's impedance.
+    Both have the same format as in `hand_gestures_result`. The force is sampled only at the
+    exposures, so shorter peaks are missed. curve: (m, 2), depths (m) and forces (N) of the object.
+    apparatus: file with the true parameters of the simulated hardware, which include the hand's
+    impedance.
     """
     coupled = [*settings, *make_settings(launch_file, "twin_finger", "hand=coupled")]
     plan = load_graph(launch_file, settings=coupled, apparatus=apparatus)
@@ -336,7 +352,7 @@ def _make_result(scene: Scene, seed: int | None, rows: list[dict[str, Any]]) -> 
 
 
 def read_touches(bag: Path) -> dict[str, TouchRecording]:
-    """Return the touches of a simulated hand that feels the sheet (coupled), by path label."""
+    """Return the touches of a simulated hand that the sheet's force moves, by label of the path."""
     fingers: dict[int, TwinFinger] = {}
     phases: dict[int, Phase] = {}
     valid_at: list[int] = []

@@ -1,9 +1,10 @@
-"""Simulate a hand that feels the sheet (coupled), in time steps of a quarter of a millisecond.
+"""Simulate a hand that the sheet's force moves, in time steps of a quarter of a millisecond.
 
-The simulation is the reference for the stability bounds of the planner, with which it shares no
-code. The finger is a mass on the spring and damper of the hand, with the finger pad in series. The
-sheet pushes it with a nonlinear force and cannot pull. The camera samples the finger depth with a
-finite resolution. After a delay, the sheet moves to the offset (its depth) computed from this.
+The simulation is the reference for the stability bounds of the planner, and shares no code with
+them. The finger is a mass on the spring and damper of the hand, with the finger pad in series. The
+sheet pushes the finger with a nonlinear force and cannot pull. The camera samples the finger depth
+with a finite resolution. After a delay, the sheet moves to the offset that is computed from the
+sampled depth.
 """
 
 from __future__ import annotations
@@ -21,21 +22,24 @@ Curve = Callable[[Floats], Floats]
 STEPS_PER_PERIOD = 64
 FILTER_DAMPING_RATIO = 0.5
 PAD_STIFFNESS_N_PER_M, PAD_DAMPING_NS_PER_M = 1100.0, 1.0
-"""The stiffness and damping of the finger pad at 1 N: Hertz contact, tissue of 0.07 to 0.2 MPa."""
+"""The stiffness (N/m) and damping (N s/m) of the finger pad at a force of 1 N.
+
+The stiffness is that of a Hertz contact with tissue of 0.07 to 0.2 MPa.
+"""
 
 JITTER_SEED = 0
 CAMERA_RESOLUTION_M = 2e-5
 RELEASE_M = 2e-3
-"""The distance from the equilibrium at which the finger is released."""
+"""The distance from the equilibrium at which the simulated finger is released, in metres."""
 
 MAX_AMPLITUDE_M = 5e-5
-"""The maximum amplitude at which the finger counts as being at rest."""
+"""The maximum amplitude (m) of a finger that is considered to be at rest."""
 
 SLOWEST_DECAY_PER_S = 0.5
-"""The minimum decay rate of an oscillation that counts as stable."""
+"""The minimum decay rate (1/s) of an oscillation that is considered stable."""
 
 ENERGY_FRACTION = 0.05
-"""The maximum ratio of the energy that a stable sheet delivers in 2 s to the energy at release."""
+"""The maximum energy that a stable sheet delivers in 2 s, relative to the energy at release."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,10 +47,10 @@ class Cases:
     """The hands and control loops that are simulated together; each field has shape (n,).
 
     delay_s: time from exposure to the sheet's motion. jitter_s: maximum additional delay of a
-    measurement, uniformly distributed; a measurement that a newer one overtakes is lost.
-    depth_m: finger depth at equilibrium. gain: factor of the sheet's motion relative to its
-    position at equilibrium. bandwidth_rad_per_s: natural frequency of the filter of the measured
-    depth; infinite for none. lead_s: time by which the filtered depth is extrapolated.
+    measurement, uniformly distributed; a measurement that a newer one overtakes is lost. depth_m:
+    finger depth at equilibrium. gain: factor by which the sheet's motion around equilibrium is
+    scaled. bandwidth_rad_per_s: natural frequency of the filter of the measured depth; infinite if
+    there is no filter. lead_s: time by which the filtered depth is extrapolated.
     """
 
     mass_kg: Floats
@@ -65,12 +69,13 @@ class Cases:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """The result of a simulation.
+    """The result of a simulation of n hands.
 
     decay_per_s (n,): decay rate of the oscillation between the second and the last quarter of the
-    time; infinite if it has died out. amplitude_m (n,): amplitude in the last quarter.
-    energy_ratio (n,): the largest energy that the sheet delivered to the finger in any 2 s, minus
-    that of a passive sheet, divided by the energy at release. The first eighth is ignored.
+    time; infinite if the oscillation has decayed completely. amplitude_m (n,): amplitude in the
+    last quarter. energy_ratio (n,): largest energy that the sheet delivers to the finger in any 2
+    s, relative to the energy at release. The energy that a passive sheet delivers is subtracted.
+    The first eighth of the time is ignored.
     """
 
     decay_per_s: Floats
@@ -79,21 +84,24 @@ class Motion:
 
     @property
     def decays(self) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the cases without a sustained oscillation."""
+        """Return a mask (n,) that is True for the cases without a sustained oscillation."""
         died_out = self.amplitude_m <= MAX_AMPLITUDE_M
         return np.asarray(died_out | (self.decay_per_s >= SLOWEST_DECAY_PER_S))
 
     @property
     def stable(self) -> NDArray[np.bool_]:
-        """Return a mask (n,) of the cases that decay and in which the sheet delivers no energy."""
+        """Return a mask (n,) that is True for stable cases.
+
+        A case is stable if its oscillation decays and the sheet delivers no energy.
+        """
         return np.asarray(self.decays & (self.energy_ratio <= ENERGY_FRACTION))
 
 
 class HeldOffset:
-    """A control loop that computes the sheet's offset from sampled finger depths, with filter and
-    delay.
+    """A control loop with filter and delay that computes the sheet's offset from finger depths.
 
-    Until the next offset takes effect, the sheet moves on at its last rate, as with the real arms.
+    Until the next offset takes effect, the sheet continues to move at its last rate, as the real
+    arms do.
     """
 
     def __init__(self, cases: Cases, offset: Curve, period_s: float, step_s: float) -> None:
@@ -124,7 +132,10 @@ class HeldOffset:
         self._columns = np.arange(len(cases))
 
     def sample(self, step: int, depths_m: Floats) -> None:
-        """Measure the finger depths (n,), and queue the offsets that are computed from them."""
+        """Measure the finger depths (n,), in m, and queue the sheet offsets computed from them.
+
+        step: number of the time step.
+        """
         seen = CAMERA_RESOLUTION_M * np.round(depths_m / CAMERA_RESOLUTION_M)
         self._seen = np.array([seen, self._seen[0]])
         filtered = np.sum(self._gains * self._seen + self._feedback * self._filtered, axis=0)
@@ -143,9 +154,9 @@ class HeldOffset:
         return np.asarray(self._rest_m + self._cases.gain * (offsets_m - self._rest_m))
 
     def advance(self, step: int) -> Floats:
-        """Return the sheet's offset (n,), m, at the given time step.
+        """Return the sheet's offsets (n,), in m, at a time step.
 
-        Call it for each step in order.
+        Call the method for all time steps in increasing order.
         """
         row = step % self._ring
         due = self._due[row] & (self._sampled[row] > self._newest)
@@ -159,11 +170,11 @@ class HeldOffset:
 def simulate_release(
     cases: Cases, *, force: Curve, offset: Curve, period_s: float, seconds: float = 8.0
 ) -> Motion:
-    """Release each finger at a distance of RELEASE_M from its equilibrium; return its motion.
+    """Release the fingers at a distance of RELEASE_M from equilibrium, and simulate their motion.
 
     force: sheet force (N) as a function of the sheet's indentation (m). offset: sheet offset (m) as
     a function of the finger depth (m); the sheet must be indented at equilibrium. period_s: camera
-    period.
+    period. seconds: simulated duration.
     """
     step_s = period_s / STEPS_PER_PERIOD
     steps = round(seconds / step_s)

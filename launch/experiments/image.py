@@ -1,9 +1,9 @@
 """Measure the size errors of the image on an inclined sheet and on a pushed sheet.
 
-These are the experiments of Furukawa et al. 2007 ("the paper"), section VI, Figs. 11 and 13. A case
-is an angle or depth with a correction: the method that corrects the image for the sheet's shape.
-The label of a case is in the renderer's frames and in the simulated eye's images. The results are
-computed from the eye's images in the bag.
+These are the experiments of Furukawa et al. 2007, section VI, Figs. 11 and 13. A case is a pair of
+an angle or depth, and a correction. A correction is a method that corrects the image for the
+sheet's shape. The renderer's frames and the simulated eye's images contain the label of their case.
+The results are computed from the eye's images in the bag.
 """
 
 from __future__ import annotations
@@ -34,9 +34,10 @@ REACH_S = 1.5
 def reach_path(
     scene: Scene, label: str, points: Sequence[tuple[float, float]], *, along_m: float = 0.0
 ) -> FingerPath:
-    """Make a finger path through points (angle around the cylinder in rad, height above it in m).
+    """Return a finger path through points near the cylinder.
 
-    along_m: position along the cylinder's axis, from its centre.
+    points: angle around the cylinder (rad) and height above its surface (m). along_m: position
+    along the cylinder's axis, from its centre.
     """
     radius = require_cylinder(scene).radius_m
     local = [
@@ -53,14 +54,15 @@ def reach_path(
 
 
 def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
-    """Make a finger path to a point above the cylinder where the sheet is inclined by an angle."""
+    """Return a finger path to a point above the cylinder where the sheet is inclined by an
+    angle."""
     return reach_path(scene, f"tilt {theta_deg:+g} deg", [(float(np.radians(theta_deg)), HOVER_M)])
 
 
 def push_path(
     scene: Scene, depth_mm: float, *, along_mm: float = 0.0, tilt_deg: float = 0.0
 ) -> FingerPath:
-    """Make a finger path that pushes the cylinder's side to a depth.
+    """Return a finger path that pushes the side of the cylinder to a depth.
 
     along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
     front. Raises ExperimentError for a position outside the limits.
@@ -78,11 +80,12 @@ def push_path(
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """An image experiment, in which one quantity varies.
+    """An image experiment in which one quantity varies.
 
-    key: result column of the varied value. name: format of a case's name with the value. path:
-    function that makes the finger path for a value. sizes: function that measures sizes (m) of the
-    cylinder in an image. size_names: symbols of the sizes in the paper. values: default values.
+    key: result column of the varied quantity. name: format string of a case's name, which contains
+    the value. path: function that makes the finger path for a value. sizes: function that measures
+    sizes (m) of the cylinder in an image. size_names: symbols of the sizes in the paper. values:
+    default values of the quantity.
     """
 
     key: str
@@ -108,7 +111,11 @@ PUSH = Series("depth_mm", "pushed {:g} mm", push_path, push_sizes, ("h", "w"), (
 
 
 def make_push_series(along_mm: float, tilt_deg: float) -> Series:
-    """Make the push experiment at a position on the cylinder's side; 0, 0 is its front centre."""
+    """Return the push experiment at a position on the side of the cylinder.
+
+    along_mm: position along the axis, from the centre. tilt_deg: angle around the axis, from the
+    front.
+    """
     if not along_mm and not tilt_deg:
         return PUSH
     return replace(
@@ -119,27 +126,30 @@ def make_push_series(along_mm: float, tilt_deg: float) -> Series:
 
 
 RAMPS: tuple[Pattern, ...] = ("coordinate_ramp_x", "coordinate_ramp_y")
-"""The patterns whose brightness encodes x or y on the screen plane, for errors at all points."""
+"""The patterns whose brightness is the x or y coordinate on the screen plane.
+
+They are used to measure the image error at all visible points.
+"""
 
 
 def make_pattern_label(label: str, pattern: Pattern) -> str:
-    """Return the label of the image of a pattern in the case `label`."""
+    """Return the label of the image that shows a pattern in the case `label`."""
     return f"{label}, {pattern}"
 
 
 def make_eyes_label(label: str, pattern: Pattern) -> str:
-    """Return the label of the images of a pattern in a case that are drawn for each eye."""
+    """Return the label of the images that show a pattern in the case `label`, one image per eye."""
     return f"{make_pattern_label(label, pattern)}, both eyes"
 
 
 def make_eye_key(label: str, viewpoint: Viewpoint) -> str:
-    """Return the key of an image in the result of `read_images`, from its label and viewpoint."""
+    """Return the key of an image in the result of `read_images`."""
     return label if viewpoint == "centre" else f"{label}, {viewpoint}"
 
 
 @dataclass(frozen=True, slots=True)
 class EyeImage:
-    """An image that the simulated eye sees, with the image that it should see (`expected`)."""
+    """An image that the simulated eye sees, and the image that it should see (`expected`)."""
 
     label: str
     correction: Correction
@@ -149,7 +159,7 @@ class EyeImage:
 
 
 def read_images(bag: Path) -> dict[str, EyeImage]:
-    """Read the newest image of each label and viewpoint from a bag."""
+    """Read images of the simulated eye from a bag: the newest image of each label and viewpoint."""
     images = {}
     for _, message, _, _ in BagReader(bag, topics=["twin/eye"]):
         if isinstance(message, TwinEye):
@@ -166,9 +176,9 @@ def read_images(bag: Path) -> dict[str, EyeImage]:
 def size_errors_mm(
     image: EyeImage, sizes: Callable[[NDArray[np.uint8], float], tuple[float, ...]]
 ) -> list[float]:
-    """Return the absolute differences (mm) of the cylinder's sizes in the seen and expected image.
+    """Return the absolute differences (mm) between sizes in the seen image and the expected image.
 
-    sizes: function that measures the sizes. The paper uses the same measure.
+    sizes: function that measures the sizes of the cylinder, as in Furukawa et al. 2007.
     """
     measured = np.array(sizes(image.seen, image.metres_per_px))
     expected = np.array(sizes(image.expected, image.metres_per_px))
@@ -176,18 +186,21 @@ def size_errors_mm(
 
 
 def find_image(images: dict[str, EyeImage], label: str) -> EyeImage:
-    """Return the image with that label. Raises ExperimentError if the bag does not contain it."""
+    """Return the image with the given label.
+
+    Raises ExperimentError if the bag did not contain such an image.
+    """
     return find_recorded(images, "image", label)
 
 
 def make_error_map(images: dict[str, EyeImage], label: str) -> ErrorMap:
-    """Compute the errors at all visible points of a case, from the images of both `RAMPS`."""
+    """Compute the image errors at all visible points of a case, from the images of both `RAMPS`."""
     x, y = (find_image(images, make_pattern_label(label, pattern)) for pattern in RAMPS)
     return error_map(x.seen, y.seen, x.metres_per_px)
 
 
 def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, ErrorMap]:
-    """Compute the errors at all visible points of a case for the left and for the right eye."""
+    """Compute the image errors at all visible points of a case, for the left and the right eye."""
 
     def errors_of(viewpoint: Viewpoint) -> ErrorMap:
         x, y = (
@@ -200,11 +213,11 @@ def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, Er
 
 
 def summarize_eyes(left: ErrorMap, right: ErrorMap) -> dict[str, float | None]:
-    """Return the mean error (mm) of each eye's image, and of the disparity.
+    """Return the mean image errors (mm) of both eyes, and of the disparity.
 
-    A mean is None if there are no points. The disparity error is the right eye's error minus the
-    left eye's, horizontal and vertical. It is computed at screen positions at which both eyes see
-    the object.
+    The disparity error is the right eye's error minus the left eye's, horizontal and vertical. It
+    is computed at screen positions at which both eyes see the object. A mean is None if there are
+    no points.
     """
     disparity_mm = 1e3 * np.abs(right.errors_m - left.errors_m)
     across_mm, up_mm = (
@@ -229,7 +242,7 @@ def make_rows(
     with_maps: bool = False,
     with_eyes: bool = False,
 ) -> list[dict[str, Any]]:
-    """Return the results of an experiment, one row per value and correction.
+    """Return the results of an image experiment, one row per value and correction.
 
     with_maps: add mean, 95 % quantile and maximum of the errors at all visible points. with_eyes:
     add the errors of both eyes and of the disparity.
@@ -254,7 +267,7 @@ def make_rows(
 
 
 def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Return the mean and the maximum size error (mm) of each correction."""
+    """Return the mean and the maximum size error (mm) by correction method."""
     return {
         method: {
             "mean_mm": float(np.mean([row["mean_mm"] for row in rows if row["method"] == method])),
@@ -271,9 +284,9 @@ def summarize_methods(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, flo
 
 
 def summarize_map(errors: ErrorMap) -> dict[str, float | None]:
-    """Return mean, 95 % quantile and maximum error (mm) of all visible points.
+    """Return the mean, 95 % quantile and maximum image error (mm) over all visible points.
 
-    Return None if there are no visible points.
+    All values are None if there are no visible points.
     """
     sizes_mm = 1e3 * errors.sizes_m
     if len(sizes_mm) == 0:

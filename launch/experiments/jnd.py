@@ -1,6 +1,6 @@
 """Measure the Weber fraction of stiffness with an adaptive staircase, and store its trials.
 
-In each trial the participant pushes two objects and names the stiffer one. One of them is the
+In each trial, the participant pushes two objects and names the stiffer object. One of them is the
 reference, and the other one is stiffer by the relative increment d. The probability of a correct
 answer is
 
@@ -11,12 +11,12 @@ is a preference for the second interval. It is added if the second interval has 
 and subtracted otherwise. The Weber fraction w is the increment of 75 % correct answers without
 lapses and bias: ln(1 + w) = 0.674 sigma.
 
-The increment of a trial is the one with the least expected entropy of the posterior of w: the psi
-method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown lapse rate
-and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w falls with the
-square root of the number of trials; `docs/jnd.md` states the measured error.
+The increment of a trial is the one with the least expected entropy of the posterior of w. This is
+the psi method (Kontsevich & Tyler, Vision Research 39:2729, 1999), marginalised over the unknown
+lapse rate and bias (Prins, Journal of Vision 13(7):3, 2013). The standard deviation of ln w falls
+with the square root of the number of trials; `docs/jnd.md` states the measured error.
 
-The CSV file is the only state of a session. All answers are replayed after an interruption.
+The CSV file is the only state of a session. After an interruption, all stored answers are replayed.
 """
 
 from __future__ import annotations
@@ -38,26 +38,30 @@ from flexsheet.messages.files import make_write_error
 from flexsheet.nodes.arrays import Floats
 
 CRITERION = 0.75
-"""The fraction of correct answers, without lapses, at an increment of one Weber fraction."""
+"""The fraction of correct answers, without lapses, if the increment equals the Weber fraction."""
 
 INCREMENTS = np.geomspace(0.02, 1.0, 25)
 WEBER_FRACTIONS = np.geomspace(0.02, 1.0, 81)
 LAPSE_RATES = np.array([0.0, 0.01, 0.03, 0.06, 0.12])
 LAPSE_SCALE = 0.03
-"""The mean of the exponential prior of the lapse rate."""
+"""The mean of the lapse rate in its exponential prior distribution."""
 
 BIASES = np.array([-0.5, -0.25, 0.0, 0.25, 0.5])
 BIAS_SCALE = 0.25
-"""The standard deviation of the normal prior of the bias, in sigmas."""
+"""The standard deviation of the bias in its normal prior distribution, in units of sigma.
+
+Sigma is the standard deviation of the perceived difference of two log stiffnesses.
+"""
 
 CATCH_PERIOD = 20
-"""The number of trials of which one has the largest increment, in order to detect inattention."""
+"""The period, in trials, with which the largest increment is used to detect inattention."""
 
 INTERVAL_QUANTILES = (0.025, 0.975)
 
 
 class StaircaseEstimator:
-    """The posterior of Weber fraction, lapse rate and bias, which selects the next increment."""
+    """The posterior distribution of Weber fraction, lapse rate and bias, used to select
+    increments."""
 
     def __init__(self) -> None:
         sigmas = np.log1p(WEBER_FRACTIONS) / ndtri(CRITERION)
@@ -76,18 +80,19 @@ class StaircaseEstimator:
     def add(self, increment: int, stiffer: int, correct: bool) -> None:
         """Update the posterior with the answer of one trial.
 
-        increment: index in INCREMENTS. stiffer: interval (1 or 2) with the stiffer object. correct:
-        whether the participant named this interval.
+        increment: index in INCREMENTS. stiffer: interval (1 or 2) that contained the stiffer
+        object. correct: whether the participant named this interval.
         """
         likely = self._correct[stiffer][increment]
         self._posterior = self._posterior * (likely if correct else 1.0 - likely)
         self._posterior /= self._posterior.sum()
 
     def choose(self, stiffer: int) -> int:
-        """Return the index of the increment whose answer is expected to be most informative.
+        """Return the index of the increment that gives the most information about the Weber
+        fraction.
 
-        It has the least expected entropy of the Weber fraction. stiffer: interval (1 or 2) with the
-        stiffer object.
+        This increment has the least expected entropy of the posterior after the answer. stiffer:
+        interval (1 or 2) that contains the stiffer object.
         """
         right = np.einsum("swn,wn->sw", self._correct[stiffer], self._posterior)
         expected = _expected_entropy(right) + _expected_entropy(self._marginal - right)
@@ -117,7 +122,7 @@ class StaircaseEstimator:
 
 
 def _expected_entropy(joint: Floats) -> Floats:
-    """Return the entropy of each row's distribution times the row's sum, for rows (n, m)."""
+    """Return the entropy of the normalized rows of an array (n, m), multiplied by the row sums."""
     total = joint.sum(axis=1, keepdims=True)
     inner = np.log(np.maximum(joint, 1e-300)) - np.log(np.maximum(total, 1e-300))
     return np.asarray(-(joint * inner).sum(axis=1))
@@ -125,7 +130,7 @@ def _expected_entropy(joint: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SessionPlan:
-    """The settings of a session, which must be the same when an interrupted session continues.
+    """The settings of a session; they must not change when an interrupted session continues.
 
     participant: random code, not a name. scene: name and hash of the scene's geometry.
     reference_pa: Young's modulus of the reference object.
@@ -140,7 +145,7 @@ class SessionPlan:
 
 @dataclass(frozen=True, slots=True)
 class PairTrial:
-    """A pair of objects with different stiffness, which is presented in one trial.
+    """A trial, in which a pair of objects with different stiffness is presented.
 
     number: number of the trial, from 1. increment: index in INCREMENTS. stiffer: interval with the
     stiffer object, 1 or 2. moduli_pa: Young's moduli in both intervals. catch: whether the trial
@@ -156,11 +161,11 @@ class PairTrial:
 
 @dataclass(frozen=True, slots=True)
 class PairAnswer:
-    """The answer of the participant, and what was measured while the pair was presented.
+    """The answer of the participant, with measurements of both intervals.
 
     stiffer: interval that the participant named, 1 or 2. response_s: time of the answer after the
-    end of the second interval. depths_m, forces_n: maximum push depth and maximum measured
-    force in each interval; None if not measured.
+    end of the second interval. depths_m, forces_n: maximum push depth and maximum measured force in
+    each interval; None if not measured.
     """
 
     stiffer: int
@@ -171,7 +176,7 @@ class PairAnswer:
 
 @dataclass(frozen=True, slots=True)
 class TrialRow:
-    """A line of the CSV file, with the result of a trial; unmeasured quantities are empty."""
+    """A line of the CSV file that contains one trial; unmeasured quantities are empty."""
 
     participant: str
     seed: int
@@ -203,7 +208,7 @@ class StaircaseSession:
     """
 
     def __init__(self, plan: SessionPlan, file: Path, *, now: Callable[[], str]) -> None:
-        """Create a session, or continue the session of an existing file.
+        """Start a session, or continue the session of an existing file.
 
         now: function that returns the present time as text.
         """
@@ -213,7 +218,7 @@ class StaircaseSession:
         self._resume()
 
     def next_trial(self) -> PairTrial | None:
-        """Return the next pair; None after the last trial."""
+        """Return the next trial; None after the last trial."""
         if self.done >= self.plan.trials:
             return None
         number = self.done + 1
@@ -226,7 +231,8 @@ class StaircaseSession:
         return PairTrial(number, increment, stiffer, moduli, catch)
 
     def record(self, trial: PairTrial, answer: PairAnswer) -> None:
-        """Append the answer to the file, flush it to the disk, and update the estimate."""
+        """Append a trial and its answer to the file, flush the file to disk, and update the
+        estimate."""
         correct = answer.stiffer == trial.stiffer
         row = TrialRow(
             participant=self.plan.participant,
@@ -265,7 +271,7 @@ class StaircaseSession:
         self.missed_catches += trial.catch and not correct
 
     def _resume(self) -> None:
-        """Replay the trials of an existing file; remove a last line that is not complete."""
+        """Replay the trials of an existing file, and remove the last line if it is incomplete."""
         if not self.file.exists():
             return
         data = self.file.read_bytes()
@@ -313,7 +319,8 @@ class StaircaseSession:
         self._count(trial, int(cells["answer"]) == trial.stiffer)
 
     def result(self) -> dict[str, Any]:
-        """Return the estimated Weber fraction and lapse rate as a row of the command's result."""
+        """Return the estimated Weber fraction and lapse rate, as a row of the result of `jnd
+        --json`."""
         low, high = self.estimator.interval
         return {
             "participant": self.plan.participant,
@@ -340,7 +347,10 @@ def _csv_line(cells: Sequence[object]) -> str:
 async def run_session(
     session: StaircaseSession, present: Present, progress: Callable[[int, int], None]
 ) -> None:
-    """Present the remaining trials of a session, and store each answer immediately."""
+    """Present the remaining trials of a session, and store the answers immediately.
+
+    present: coroutine function that presents a trial and returns the answer.
+    """
     while (trial := session.next_trial()) is not None:
         progress(session.done, session.plan.trials)
         session.record(trial, await present(trial))

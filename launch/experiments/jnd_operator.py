@@ -1,4 +1,4 @@
-"""Present pairs of soft objects with a running graph; the operator types the answers."""
+"""Present pairs of soft objects in a running graph, and read the operator's typed answers."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ Instructions for the operator
 
 
 class PeakMonitor:
-    """The maximum push depth and measured force since the last reset.
+    """A monitor of the maximum push depth (m) and measured force (N) since the last reset.
 
-    Both are None if there are no measurements.
+    Both values are None if there are no measurements.
     """
 
     def __init__(self) -> None:
@@ -51,7 +51,8 @@ class PeakMonitor:
 
 
 class PairPresenter:
-    """A presenter that shows the pairs of a session by changing the modulus of a graph's object."""
+    """A presenter of object pairs, which changes Young's modulus of the object in a running
+    graph."""
 
     def __init__(self, driver: Driver, scene: Scene, ask: Ask) -> None:
         self._driver, self._scene, self._ask = driver, scene, ask
@@ -59,9 +60,9 @@ class PairPresenter:
         driver.on_message = self._peaks.update
 
     async def present(self, trial: PairTrial) -> PairAnswer:
-        """Present both objects in turn, and return the answer.
+        """Present both objects of a trial in turn, and return the answer that the operator types.
 
-        Raise ExperimentError if the operator types "q".
+        Raises ExperimentError if the operator types "q".
         """
         depths: list[float | None] = []
         forces: list[float | None] = []
@@ -93,7 +94,10 @@ class PairPresenter:
 
 
 def replace_modulus(scene: Scene, modulus_pa: float) -> Scene:
-    """Return the scene with this Young's modulus; raise ExperimentError for a rigid object."""
+    """Return a copy of the scene whose object has the given Young's modulus.
+
+    Raises ExperimentError if the object is rigid.
+    """
     material = scene.object.material
     if material is None:
         raise ExperimentError(
@@ -106,7 +110,8 @@ def replace_modulus(scene: Scene, modulus_pa: float) -> Scene:
 
 
 async def open_terminal() -> Ask:
-    """Return a function that prints a question on stderr and awaits the answer from stdin."""
+    """Return a coroutine function that prints a question on stderr and reads an answer from
+    stdin."""
     reader = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(
         lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
@@ -123,7 +128,7 @@ async def open_terminal() -> Ask:
 
 
 def make_jnd_procedure(run: Callable[[PairPresenter], Awaitable[None]]) -> Procedure:
-    """Make a procedure for `run_experiment` that presents pairs on the graph.
+    """Make a procedure for `run_experiment` that presents pairs of objects in the graph.
 
     run: coroutine function that runs the session with the given presenter.
     """

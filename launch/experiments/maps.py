@@ -1,4 +1,4 @@
-"""Draw maps of the image error at each visible point, for each case and correction."""
+"""Draw maps of the image error at all visible points, by case and correction method."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from flexsheet.launch.experiments.pictures import CORRECTION_NAMES
 from flexsheet.nodes.twin.error_map import ErrorMap
 
 MIN_MM, MAX_MM = 0.01, 10.0
-"""The limits of the logarithmic colour scale."""
+"""The limits of the logarithmic colour scale, in mm."""
 
 CROSS_MAGNIFICATION = 20.0
 """The magnification of the error arrows in `draw_cross_errors`."""
 
 
 def draw_error_maps(images: dict[str, EyeImage], series: Series, path: Path) -> None:
-    """Draw error maps, with one row per value of the series and one column per correction.
+    """Draw error maps with one row per value of the series and one column per correction method.
 
     Raises ExperimentError if an image of a case is missing.
     """
@@ -64,7 +64,11 @@ def _find_box(maps: list[ErrorMap]) -> tuple[slice, slice]:
 
 
 def draw_cross_errors(errors: CrossErrors, path: Path) -> None:
-    """Plot, for each eye, the errors of the seen crosses relative to the touched points."""
+    """Draw arrows from the touched points to the positions at which each eye sees the drawn
+    crosses.
+
+    The arrows are magnified by CROSS_MAGNIFICATION.
+    """
     figure = Figure(figsize=(7, 6), layout="constrained")
     axes = figure.subplots()
     places_mm, errors_mm = 1e3 * errors.places_m, 1e3 * errors.errors_m

@@ -1,4 +1,4 @@
-"""Read the calibrations that the nodes of a graph use in addition to the scene."""
+"""Read the calibration files that the nodes of a graph use in addition to the scene."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class NodeCalibrations:
-    """The calibrations of stereo camera, sheet and marker that nodes use; None: the scene's values.
+    """The calibrations of stereo camera, sheet and marker that the nodes use.
 
-    stamp_offset_s: time that the camera node adds to timestamps.
+    A field that is None means that the nodes use the values of the scene. stamp_offset_s: time that
+    the camera node adds to timestamps.
     """
 
     stereo: StereoCalibration | None = None
@@ -33,7 +34,7 @@ class NodeCalibrations:
 
     @staticmethod
     def of(plan: ResolvedGraph) -> NodeCalibrations:
-        """Read the calibrations that the plan's camera, triangulator and planner use."""
+        """Read the calibrations of the camera node, the triangulator and the planner of a graph."""
         stereo: StereoCalibration | None = None
         sheet: SheetCalibration | None = None
         marker: MarkerCalibration | None = None
@@ -52,7 +53,10 @@ class NodeCalibrations:
         return NodeCalibrations(stereo, sheet, marker, stamp_offset_s)
 
     def find_marker_offset_m(self, scene: Scene) -> Floats:
-        """Return the measured vector (3,), in m, from finger pad to marker, in world axes."""
+        """Return the vector (3,) from the finger pad to the marker, in m and in world axes.
+
+        If there is no marker calibration, the vector of the scene is returned.
+        """
         marker = scene.finger if self.marker is None else self.marker
         turned = world_from_finger(scene.finger.direction_world)
         return np.asarray(turned @ np.array(marker.marker_from_pad_m))

@@ -1,13 +1,14 @@
-"""Evaluate an apparatus without running the nodes.
+"""Evaluate the errors of an apparatus without running the nodes.
 
 An apparatus is a set of true parameters of the simulated hardware. The nodes' methods get the
 parameters of the scene, and the simulator's models get the parameters of the apparatus. The errors
-of fingertip, sheet, image and felt force are computed at rest. Those of fingertip and sheet can
-also be computed for a constant speed of the finger, at which wrong exposure times cause errors.
+of fingertip, sheet, image and felt force are computed at rest. The errors of fingertip and sheet
+can also be computed for a constant speed of the finger, at which wrong exposure times cause errors.
+
 Only the force model of the rubber depends on time: it simulates a push in and out. Therefore servo
 lag, delays, frame rate, tremor and backlash have no effect. An experiment with running nodes
-measures these effects. Images have no noise. The references for the errors have their own models of
-camera, arms, membrane and eye, not those of the nodes.
+measures these effects. Images have no noise. The reference values come from separate models of
+camera, arms, membrane and eye, which share no code with the nodes.
 """
 
 from __future__ import annotations
@@ -53,18 +54,24 @@ from flexsheet.nodes.twin.true_object import TrueBody
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 METRES_PER_PX = 0.0007
-"""The resolution of the images in Furukawa et al. 2007."""
+"""The image resolution in Furukawa et al. 2007, in metres per pixel."""
 
 STROKE_RATIOS = (0.0, 0.5, 1.0)
-"""The evaluated finger positions, as fractions of the upper half of the touchable arc of the
-object."""
+"""The evaluated finger positions on the object.
+
+They are fractions of the upper half of the arc that the finger can touch.
+"""
 
 MAX_FORCE_DEPTHS_M = (0.004, 0.016)
-"""The depths of the pushes whose forces are compared. They are limited to half and to all of the
-push depth of the scene."""
+"""The maximum depths (m) of the two pushes whose forces are compared.
+
+The depths are limited to half and to all of the push depth of the scene.
+"""
 
 MIN_FORCE_N = 0.1
-"""The minimum denominator of relative force errors. Relative errors of smaller forces are not felt.
+"""The minimum denominator of relative force errors, in newtons.
+
+People do not feel relative errors of smaller forces.
 """
 
 MAX_IMAGE_DEPTH_M = 0.03
@@ -73,7 +80,7 @@ UNIT_COVARIANCE_PX2 = np.eye(2)
 
 
 class Metric(StrEnum):
-    """The names of the evaluated metrics in the results."""
+    """The names of the evaluated errors in the results."""
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"
@@ -83,17 +90,20 @@ class Metric(StrEnum):
 
 ALL_METRICS = frozenset(Metric)
 MOVING_METRICS = frozenset({Metric.SHEET, Metric.FINGERTIP})
-"""The metrics that can be evaluated while the finger moves."""
+"""The errors that can be evaluated while the finger moves."""
 
 
 CROSS_RATIOS, CROSS_ASIDES_M = (-1.0, -0.5, 0.0, 0.5, 1.0), (-0.03, 0.0, 0.03)
-"""The positions of the crosses: fractions of the stroke along the object, and distances to the
-right, in metres."""
+"""The positions of the crosses that are drawn on the object to measure the visual error.
+
+The first values are fractions of the stroke along the object, the second ones distances to the
+right, in metres.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """The errors of one apparatus; None for metrics that were not evaluated.
+    """The errors of one apparatus; a field is None if it was not evaluated.
 
     fingertip_m: (n, 3), measured minus true fingertip. sheet_m: (n, 3), point of the object under
     the true finger minus the contact point of the sheet. image_m: one map (rows, columns, 2) of
@@ -108,10 +118,10 @@ class Evaluation:
     expected_n: Floats | None = None
 
     def figures(self) -> dict[str, float | None]:
-        """Summarize the errors in one number per metric.
+        """Return a summary with one number per metric.
 
-        The image error is a root mean square, the force error a mean absolute relative error. The
-        errors of sheet and fingertip are mean lengths.
+        The image error is a root mean square in mm. The force error is a mean absolute relative
+        error in percent. The errors of sheet and fingertip are mean lengths in mm.
         """
         return {
             Metric.SHEET: _mean_length_mm(self.sheet_m),
@@ -121,10 +131,10 @@ class Evaluation:
         }
 
     def change_from(self, other: Evaluation) -> dict[str, float | None]:
-        """Return the differences from another evaluation of the same cases, as in `figures`.
+        """Return the mean differences from another evaluation of the same cases, by metric.
 
         Errors of single vectors, pixels and pushes are subtracted before averaging, so that errors
-        common to both evaluations cancel.
+        common to both evaluations cancel. The units are those of `figures`.
         """
         image = None
         if self.image_m is not None and other.image_m is not None:
@@ -158,7 +168,8 @@ def _mean_length_mm(vectors_m: Floats | None) -> float | None:
 
 
 def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
-    """Return the root mean square (mm) over all visible points; None if nothing is visible."""
+    """Return the root mean square (mm) over all visible points of error maps; None without
+    points."""
     squares = np.concatenate([np.sum(one**2, axis=2).ravel() for one in maps_m])
     squares = squares[np.isfinite(squares)]
     return 1e3 * float(np.sqrt(squares.mean())) if len(squares) else None
@@ -166,18 +177,23 @@ def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class CrossErrors:
-    """The errors of crosses that are projected at expected contact points.
+    """The position errors of crosses that are drawn at expected contact points, as the eyes see
+    them.
 
-    All positions are projected from a viewpoint onto the screen plane. places_m (n, 2): expected
-    contact points, seen from the midpoint between the true eyes. errors_m (n, 2, 2): positions (x,
-    y) at which the left and the right eye see the cross, minus the positions of the actual contact.
+    All positions are projected from an eye onto the screen plane. places_m (n, 2): expected contact
+    points, seen from the midpoint between the true eyes. errors_m (n, 2, 2): positions (x, y) at
+    which the left and the right eye see the cross, minus the positions of the actual contact.
     """
 
     places_m: Floats
     errors_m: Floats
 
     def figures(self) -> dict[str, float]:
-        """Return the error lengths, mm: for each eye, for both eyes, and for their disparity."""
+        """Return the lengths of the errors (mm).
+
+        The result contains the values for each eye, for the mean of both eyes, and for the
+        disparity.
+        """
         left, right = np.moveaxis(1e3 * self.errors_m, 1, 0)
         both = np.linalg.norm(0.5 * (left + right), axis=1)
         return {
@@ -191,7 +207,10 @@ class CrossErrors:
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """A sheet in contact: its pose (4, 4), and the touched point of the undeformed object (3,)."""
+    """A sheet that touches the object: pose of the sheet (4, 4), and touched surface point (3,).
+
+    The point is on the undeformed object.
+    """
 
     world_from_sheet: Floats
     point: Floats
@@ -202,12 +221,13 @@ class Contact:
 
 
 class OfflineEvaluator:
-    """An evaluator of the errors of apparatuses (true hardware parameters) of one scene.
+    """An evaluator of the errors of apparatuses (true hardware parameters) in one scene.
 
     metres_per_px: resolution of the images. cells: number of node intervals per side of the mesh of
     the true sheet. correction, sheet_shape: methods of the renderer.
 
-    Its methods raise ExperimentError if the equations of the sheet or the arms have no solution.
+    The methods of the class raise ExperimentError if the equations of the sheet or the arms have no
+    solution.
     """
 
     def __init__(
@@ -253,8 +273,8 @@ class OfflineEvaluator:
     ) -> Evaluation:
         """Evaluate the given metrics of an apparatus.
 
-        speed_m_per_s: speed of the finger along the object; affects fingertip and sheet only.
-        Raises ExperimentError if there is no solution.
+        speed_m_per_s: speed of the finger along the object, which affects only fingertip and sheet.
+        Raises ExperimentError if the equations of the sheet or the arms have no solution.
         """
         try:
             return self._evaluate(apparatus, metrics, speed_m_per_s)
@@ -288,9 +308,8 @@ class OfflineEvaluator:
     def _touch(self, around_m: float, aside_m: float = 0.0) -> Contact:
         """Return the contact after the sheet has rolled over the object without slip.
 
-        The sheet starts in contact with the front of the object. around_m, aside_m: position of the
-        new contact point relative to the front, m: arc length around the object, and distance to
-        the right.
+        The sheet starts in contact with the front of the object. around_m, aside_m: arc length
+        around the object, and distance to the right, from the front to the new contact point.
         """
         place = np.array([aside_m, around_m, 0.0])
         point, above = map_to_surface(self._scene, place + np.outer([0.0, 1e-3], [0, 0, 1]))
@@ -298,7 +317,11 @@ class OfflineEvaluator:
 
     @staticmethod
     def _lay_sheet(point: Floats, normal: Floats, on_sheet_m: Floats) -> Contact:
-        """Return the sheet with the given normal whose point `on_sheet_m` touches `point`."""
+        """Return the contact of a sheet with the given normal (3,) at the surface point `point`
+        (3,).
+
+        on_sheet_m: coordinates (3,) of the contact point on the sheet.
+        """
         x_axis = np.array([1.0, 0.0, 0.0]) - normal * normal[0]
         x_axis /= np.linalg.norm(x_axis)
         rotation = np.column_stack([x_axis, np.cross(normal, x_axis), normal])
@@ -311,10 +334,10 @@ class OfflineEvaluator:
         contacts: list[Contact],
         speed_m_per_s: float = 0.0,
     ) -> Floats:
-        """Return measured minus true fingertip positions (n, 3), one for each contact.
+        """Return the measured minus the true fingertip positions (n, 3), in m, for n contacts.
 
         Pixels are computed with the true camera, and triangulated with the nodes' calibration. The
-        finger strokes upwards at the given speed, at which wrong timestamps and different exposure
+        finger strokes upwards at the given speed. Therefore wrong timestamps and different exposure
         times of both cameras also cause errors.
         """
         camera = rig.make_true_camera(scene.camera)
@@ -342,9 +365,10 @@ class OfflineEvaluator:
         return np.array(errors)
 
     def _edges(self, contact: Contact) -> tuple[Floats, Floats]:
-        """Return the clamped edges (4, 4) that bring the sheet into contact.
+        """Return the poses (4, 4) of the clamped edges that bring the sheet into contact.
 
-        They are moved back by the sag at the sheet's centre, so that its centre touches the plane.
+        The edges are displaced by the sag of the sheet, so that the sheet's centre touches the
+        contact plane.
         """
         sheet = self._scene.sheet
         distance_m = sheet.width_m * self._stretch_ratio
@@ -362,10 +386,10 @@ class OfflineEvaluator:
     def _sheet_error(
         self, arms: ArmPair, surface: SheetSurface, contact: Contact, tip_error: Floats
     ) -> Floats:
-        """Return the error (3,), in m, of the sheet's contact point.
+        """Return the error (3,) of the sheet's contact point, in m, in the world frame.
 
-        The error is the object point under the true finger minus the contact point. The arms place
-        the sheet for the measured finger. The result is in the world frame.
+        The error is the object point under the true finger minus the contact point. The arms move
+        the sheet to the measured finger, which differs from the true finger by `tip_error`.
         """
         object_from_world = inverse(self._world_from_object)
         foot = self._shape.closest(apply(object_from_world, contact.point + tip_error))
@@ -401,9 +425,9 @@ class OfflineEvaluator:
     def _compare_forces(
         self, scene: Scene, apparatus: Apparatus, arms: ArmPair, tip_error: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the felt forces (k,) and the forces (k,), in N, of the planner's model.
+        """Return the felt forces (k,) and the forces (k,) that the planner's model predicts, in N.
 
-        Each push contributes two forces: while the finger moves in, and while it moves out.
+        A push gives two forces: one while the finger moves in, and one while it moves out.
         """
         contact = self._touch(0.0)
         left, right = arms.hold(self._edges(contact))
@@ -482,11 +506,11 @@ class OfflineEvaluator:
         return self._correct_parallax(errors, eye)
 
     def compare_crosses(self, apparatus: Apparatus) -> CrossErrors:
-        """Compare crosses projected at expected contact points with the actual contact points.
+        """Compare crosses drawn at expected contact points with the actual contact points.
 
-        The crosses lie on the object, and are drawn for each eye of the scene on the sheet in front
-        of it. The sheet then moves to the finger, which touches it where the tracker measures the
-        position of the cross. Raises ExperimentError if there is no solution.
+        The crosses are on the object, and are drawn for each eye of the scene on the sheet in front
+        of the object. The sheet then moves to the finger. The finger touches the sheet where the
+        tracker measures the position of the cross. Raises ExperimentError if there is no solution.
         """
         scene = apply_apparatus(self._scene, apparatus)
         arms = ArmPair(self._scene, apparatus)
@@ -543,10 +567,10 @@ class OfflineEvaluator:
         return CrossErrors(places[seen_by_both], found[seen_by_both])
 
     def _correct_parallax(self, errors_m: Floats, eye: Floats) -> Floats:
-        """Return the errors relative to what the true eye should see.
+        """Convert image errors (rows, columns, 2), in m, to errors relative to the true eye.
 
-        The expected positions on the screen plane are computed for the eye of the scene. From the
-        true eye position, the same object points should appear elsewhere on that plane.
+        The errors are measured relative to the image that the eye of the scene should see. From the
+        true eye position, the same object points should appear elsewhere on the screen plane.
         """
         believed_eye = self._scene.eyes.centre_world_m
         if np.array_equal(eye, believed_eye):
@@ -567,10 +591,10 @@ class OfflineEvaluator:
         return corrected
 
     def _parallax(self, eye: Floats) -> Floats:
-        """Return the shift (m) of object points on the screen plane if the eye is moved.
+        """Return how far object points shift on the screen plane if the eye moves to `eye`.
 
-        Shape (rows, columns, 2), for the pixels of `_object_points`; NaN where the scene's eye sees
-        no object.
+        The result has shape (rows, columns, 2), in m, for the pixels of `_object_points`. It is NaN
+        where the eye of the scene sees no object.
         """
         on_screen, points = self._object_points
         to_screen = eye[2] / (eye[2] - points[..., 2:])
@@ -578,10 +602,11 @@ class OfflineEvaluator:
 
     @cached_property
     def _object_points(self) -> tuple[Floats, Floats]:
-        """Return where the ray of each pixel of the measuring camera meets screen plane and object.
+        """Return the points at which the ray of each pixel meets the screen plane and the object.
 
-        The measuring camera is at the scene's eye position. Returns points on the screen plane
-        (rows, columns, 2) and on the object (rows, columns, 3); NaN where the ray misses it.
+        The rays start at the scene's eye position. Returns points on the screen plane (rows,
+        columns, 2) and on the object (rows, columns, 3), in m. The latter are NaN where a ray
+        misses the object.
         """
         size = round(2.0 * HALF_WINDOW_M / self._metres_per_px)
         rays = eye_rays(
@@ -601,13 +626,17 @@ class OfflineEvaluator:
 
 
 def _on_screen(eye: Floats, points: Floats) -> Floats:
-    """Project points (n, 3) from an eye (3,) to the screen plane z = 0; return x, y (n, 2), m."""
+    """Project points (n, 3) from an eye (3,) to the screen plane z = 0; return (x, y) as (n, 2),
+    m."""
     to_screen = eye[2] / (eye[2] - points[:, 2:])
     return np.asarray(eye[:2] + (points[:, :2] - eye[:2]) * to_screen)
 
 
 def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:
-    """Return the names of the metrics whose errors exceed the scene's tolerances."""
+    """Return the names of the metrics whose errors exceed the scene's tolerances.
+
+    figures: errors by metric.
+    """
     limits = metric_tolerances(scene)
     return [
         metric.value
@@ -617,7 +646,7 @@ def exceeded_tolerances(scene: Scene, figures: dict[str, Any]) -> list[str]:
 
 
 def metric_tolerances(scene: Scene) -> dict[Metric, float]:
-    """Return the scene's tolerances by metric, in the unit of the metric."""
+    """Return the scene's tolerance of each metric, in the unit of the metric."""
     given = scene.tolerances
     return {
         Metric.SHEET: 1e3 * given.sheet_position_m,

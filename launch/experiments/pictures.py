@@ -23,8 +23,7 @@ EVENTS = tuple(event for event in LatencyEvent if event is not LatencyEvent.LIGH
 
 MAX_BLACK = 8
 DRAWN_RANGE = (0.18, 0.82)
-"""The drawn part of the eye's image, as fractions of its size. The rest shows only the dark sheet.
-"""
+"""The drawn part of the eye's image, as fractions of its size; outside it, the image is dark."""
 
 CORRECTION_NAMES = {
     "none": "not corrected",
@@ -35,7 +34,8 @@ CORRECTION_NAMES = {
 
 
 def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -> None:
-    """Draw one row per case: the eye's image for each image correction, and the expected image."""
+    """Draw one row per case, with the eye's image for each image correction and the expected
+    image."""
     columns = max(len(images) for _, images in rows) + 1
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
@@ -63,7 +63,7 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -
 
 
 def compute_outline(image: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Return the bounding box of all non-black pixels (left, top, width, height), or None."""
+    """Return the bounding box (left, top, width, height) of all non-black pixels, or None."""
     ys, xs = np.nonzero(image.max(axis=2) > MAX_BLACK)
     if len(xs) == 0:
         return None
@@ -71,7 +71,7 @@ def compute_outline(image: np.ndarray) -> tuple[float, float, float, float] | No
 
 
 def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
-    """Draw position and angle errors against time, one column per stroke.
+    """Draw position and angle errors against time, with one column per stroke.
 
     The mean error of the same stroke in Furukawa et al. 2007 is included.
     """
@@ -107,7 +107,7 @@ def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
 
 
 def draw_latency(recording: StrokeRecording, path: Path) -> None:
-    """Draw the median and the range from 1 to 99 % of the latency from exposure to each event."""
+    """Draw the latencies from exposure to each event, as medians and ranges from 1 to 99 %."""
     events = [event for event in EVENTS if len(recording.delays_s.get(event, ()))]
     figure = Figure(figsize=(8, 0.7 * len(events) + 1.6), layout="constrained")
     axes = figure.subplots()
@@ -128,7 +128,7 @@ def draw_latency(recording: StrokeRecording, path: Path) -> None:
 
 
 def draw_compliance(result: dict[str, Any], path: Path) -> None:
-    """Draw the object's and the felt force against depth, one panel per position.
+    """Draw the force of the object and the felt force against depth, with one panel per position.
 
     Bands show the just-noticeable difference (JND) of forces.
     """
@@ -181,7 +181,8 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
 
 
 def draw_stability(result: dict[str, Any], path: Path) -> None:
-    """Draw the fraction of stable hands over stiffness and delay, one panel per control loop."""
+    """Draw the fraction of stable hands against stiffness and delay, with one panel per control
+    loop."""
     rows = [*result["rows"], *result["without_bounds"]]
     kinds = list(dict.fromkeys((row["kind"], row["jitter_ms"]) for row in rows))
     objects = sorted({row["object_pa"] for row in rows})
@@ -229,9 +230,10 @@ def draw_stability(result: dict[str, Any], path: Path) -> None:
 
 
 def draw_hand_gestures(forces: Mapping[tuple[str, str], FeltForce], path: Path) -> None:
-    """Draw felt and wanted force against time, one row per hand and one column per gesture.
+    """Draw the felt force and the object's force against time.
 
-    forces: felt and wanted forces by hand and gesture.
+    The figure has one row per hand and one column per gesture. forces: forces by (kind of hand,
+    gesture).
     """
     hands, names = (list(dict.fromkeys(key[number] for key in forces)) for number in (0, 1))
     figure = Figure(figsize=(3.4 * len(names), 2.2 * len(hands)), layout="constrained")
@@ -262,8 +264,8 @@ MIN_SHOWN_RATIO = 1e-3
 def draw_sensitivity(result: dict[str, Any], path: Path) -> None:
     """Draw the effects of the most important parameters relative to the scene's tolerances.
 
-    A dot is the larger effect of deviations by plus and minus one standard deviation (sigma). The
-    line ends at the larger effect of three sigma.
+    A dot is the larger of the effects of plus and minus one standard deviation (sigma). The line
+    ends at the larger effect of three sigma.
     """
     shown = result["ranking"][:SHOWN_PARAMETERS]
     figure = Figure(figsize=(9, 1.4 + 0.32 * max(len(shown), 3)), layout="constrained")

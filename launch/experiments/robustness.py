@@ -1,6 +1,6 @@
 """Evaluate the system with many random apparatuses (true parameters of the simulated hardware).
 
-Each apparatus represents a laboratory whose hardware differs at random from its scene file.
+An apparatus represents a laboratory whose hardware differs randomly from its scene file.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ _RANGE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Parse "A-B" (both ends included) or "A" into random seeds. Raises ExperimentError."""
+    """Parse a range of random seeds, "A-B" (both included) or "A"; raise ExperimentError if
+    invalid."""
     match = _RANGE.fullmatch(text.strip())
     if match is None:
         raise ExperimentError(f'--seeds "{text}": expected A-B, such as 0-9, or one whole number')
@@ -44,7 +45,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def apparatus_text(seed: int, profile: Profile, *, calibrated: bool) -> str:
-    """Return the value of the option --apparatus for the random apparatus with a seed."""
+    """Return the value of the command-line option --apparatus that selects a random apparatus."""
     return f"seed:{seed},{profile.value}{',calibrated' if calibrated else ''}"
 
 
@@ -63,11 +64,11 @@ def run_robustness(
     keep_bags: bool = False,
     commissioned: bool = False,
 ) -> dict[str, Any]:
-    """Run one trial per seed; return the results of `experiment robustness --json`.
+    """Run one trial per seed, and return the results of `experiment robustness --json`.
 
-    commissioned: calibrate each simulated laboratory first, in a folder of its own, and evaluate it
+    commissioned: calibrate each simulated laboratory first, in a separate folder, and evaluate it
     in simulated time with the resulting scene and launch file. The apparatus then has the errors of
-    uncalibrated hardware. The calibrated camera defines the world frame.
+    uncalibrated hardware, and the calibrated camera defines the world frame.
     """
     if commissioned and calibrated:
         raise ExperimentError(
@@ -130,7 +131,7 @@ def run_robustness(
 
 
 def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
-    """Compare what each laboratory's report predicts with its true errors.
+    """Compare the errors that the laboratories' reports predict with the true errors.
 
     confusion: number of laboratories by report (good or not) and by true errors (within tolerance
     or not), in total and by metric. stated_over_true: quantiles of the ratio of predicted rms error
@@ -179,7 +180,7 @@ def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
-    """Count the combinations of pairs: (reported as good, truly good)."""
+    """Count the cases by their combination of two flags: (reported as good, truly good)."""
     return {
         "good_and_within": cases.count((True, True)),
         "good_but_exceeded": cases.count((True, False)),
@@ -189,10 +190,12 @@ def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
 
 
 def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
-    """Return median, 95 % quantile and maximum of each metric, and the seed of the maximum.
+    """Summarize the trials by metric.
 
-    These values are None if a metric has no values. Also count the trials with the metric, the
-    trials out of tolerance, and among these the trials in which no self-check suspected a cause.
+    The result contains median, 95 % quantile and maximum of the metric, and the seed of the
+    maximum; None if there are no values. It also contains the number of trials with the metric, and
+    the number of trials out of tolerance. For the latter, the trials in which no self-check
+    suspected a cause are counted.
     """
     summary: dict[str, dict[str, float | None]] = {}
     for metric in METRICS:

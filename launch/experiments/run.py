@@ -31,22 +31,24 @@ DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 RUNS = Path("runs")
 DELIVERY_S = 0.3
 SWITCH_SEED, SWITCH_INTERVAL_S = 1, (0.25, 0.4)
-"""The random seed of the times between two switches of the projected image, and their range (s).
-The times exceed the latency, and vary the phase between switches and exposures."""
+"""The random seed and the range (s) of the times between two switches of the projected image.
+
+The times exceed the latency, and vary the phase between switches and exposures.
+"""
 
 Progress = Callable[[str], None]
 Procedure = Callable[[Driver, Scene], Awaitable[None]]
 
 
 def new_folder(name: str, parent: Path = RUNS) -> Path:
-    """Create a folder for an experiment's bag and images, such as runs/20261121-164500-stroke."""
+    """Create and return a new folder for an experiment, such as runs/20261121-164500-stroke."""
     folder = parent / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
     folder.mkdir(parents=True)
     return folder
 
 
 def require_scene(plan: ResolvedGraph) -> Scene:
-    """Return the scene of a planned graph. Raises ExperimentError if it has none."""
+    """Return the scene of a resolved graph; raise ExperimentError if the graph has no scene."""
     scene = plan.scene_message()
     if scene is None:
         raise ExperimentError(
@@ -56,7 +58,7 @@ def require_scene(plan: ResolvedGraph) -> Scene:
 
 
 async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -> None:
-    """Start the graph of a plan, run the procedure on it, and stop the graph.
+    """Start a graph, run the procedure on it, and stop the graph.
 
     Raises the errors of the procedure, and NodeFailedError if a node fails permanently.
     """
@@ -80,7 +82,7 @@ async def _run_procedure(
 
 
 async def _run_while_graph_runs(graph: RunningGraph, work: Coroutine[Any, Any, None]) -> None:
-    """Await `work` while the graph runs. If the graph ends first, raise the reason as an error."""
+    """Await `work` while the graph runs; if the graph ends first, raise the reason as an error."""
     task = asyncio.create_task(work)
     end = asyncio.create_task(graph.wait())
     try:
@@ -108,9 +110,10 @@ def run_experiment(
     needed: Collection[str] = (),
     without: Collection[Feature] = (),
 ) -> None:
-    """Run a procedure on the graph of a launch file, and record all topics to `bag`, if given.
+    """Run a procedure on the graph of a launch file.
 
-    settings, apparatus, needed, without: arguments for `load_graph`.
+    bag: file to which all topics are recorded; None for no recording. settings, apparatus, needed,
+    without: arguments for `load_graph`.
     """
     plan = load_graph(
         launch_file,
@@ -132,7 +135,7 @@ def run_experiment(
 
 
 async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
-    """Await `work`. On SIGINT or SIGTERM, cancel it and raise ExperimentInterruptedError."""
+    """Await `work`; on SIGINT or SIGTERM, cancel it and raise ExperimentInterruptedError."""
     task = asyncio.create_task(work)
     with handle_signals(task.cancel, signal.SIGINT, signal.SIGTERM):
         try:
@@ -142,9 +145,9 @@ async def _await_interruptible(work: Coroutine[Any, Any, None]) -> None:
 
 
 def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
-    """Return `setting` ("parameter=value") for each node of a type, with the node's name.
+    """Return the launch setting "NODE.parameter=value" for all nodes of a type.
 
-    Nodes of derived types are included.
+    Nodes of derived types are included. setting: text "parameter=value".
     """
     graph = load_graph(launch_file, needed=tuple(TOPICS))
     return [f"{node.name}.{setting}" for node in graph.nodes_of_type(node_type)]
@@ -153,7 +156,10 @@ def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
 def make_stroke_procedure(
     seconds: Sequence[float], progress: Progress, *, path: FingerPath | None = None
 ) -> Procedure:
-    """Make a procedure that moves the finger: one stroke per duration (s), or `path` if given."""
+    """Make a procedure that moves the finger along strokes, or along `path` if it is given.
+
+    seconds: durations of the strokes, s.
+    """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         if path is not None:
@@ -194,7 +200,7 @@ def make_image_procedure(
     with_maps: bool = False,
     with_eyes: bool = False,
 ) -> Procedure:
-    """Make a procedure that takes an image of each case with each correction.
+    """Make a procedure that captures an image of each case (value and correction method).
 
     with_maps: also take images of coordinate ramps, for errors at all visible points. with_eyes:
     also take images for each eye separately.
@@ -219,7 +225,10 @@ def make_image_procedure(
 
 
 def make_table_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
-    """Make a procedure that waits for the table of the soft body; see `Driver.wait_for_table`."""
+    """Make a procedure that waits until the soft body uses a table.
+
+    method: least accurate table that is accepted.
+    """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         await driver.wait_for_table(scene, method, progress)

@@ -1,4 +1,4 @@
-"""Measure how much the uncertainty of each single apparatus parameter affects the system's errors.
+"""Measure how much the uncertainty of single apparatus parameters affects the system's errors.
 
 The apparatus is the set of true parameters of the simulated hardware. Sigma is the standard
 deviation of a parameter in the tolerance table.
@@ -30,10 +30,11 @@ SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 class EvaluationKind(StrEnum):
     """The method by which the effect of a parameter was evaluated.
 
-    offline: errors of sheet and fingertip at the working speed, errors of image and force at rest.
-    simulated_time: errors of sheet and fingertip during strokes in simulated time. not_measured:
-    the parameter affects only images of a moving sheet or eye, which are not evaluated.
-    not_simulated: no simulator node uses the parameter.
+    offline: without a simulation of the motion; the errors of sheet and fingertip are evaluated at
+    the working speed, the errors of image and force at rest. simulated_time: the errors of sheet
+    and fingertip are evaluated during strokes in simulated time. not_measured: the parameter
+    affects only images of a moving sheet or eye, which are not evaluated. not_simulated: no
+    simulator node uses the parameter.
     """
 
     OFFLINE = "offline"
@@ -64,13 +65,13 @@ TIMING = frozenset(
         "projector.latency_offset_s",
     }
 )
-"""The parameters without effect at rest, or on a noise-free image of the marker."""
+"""The parameters that have no effect at rest, or no effect on a noise-free image of the marker."""
 
 STROKE_SEEDS = (0, 1, 2)
-"""The random seeds of the strokes; the nominal and the changed apparatus have the same."""
+"""The random seeds of the strokes, which the nominal and the changed apparatus share."""
 
 WITH_IMAGES = frozenset({"finger.marker_shape", "finger.marker_tilt_rad"})
-"""The parameters that affect the detection of the marker, so that strokes need rendered images."""
+"""The parameters that affect the detection of the marker, which requires rendered images."""
 
 AFFECTED: dict[str, frozenset[Metric]] = {
     "camera": frozenset(Metric),
@@ -81,7 +82,7 @@ AFFECTED: dict[str, frozenset[Metric]] = {
     "eyes": frozenset({Metric.IMAGE}),
     "projector": frozenset({Metric.IMAGE}),
 }
-"""The metrics that each section of the apparatus affects at rest."""
+"""The metrics that the parameters in a section of the apparatus affect at rest, by section."""
 
 
 def evaluation_of(parameter: str) -> EvaluationKind:
@@ -107,7 +108,7 @@ def run_sensitivity(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Vary the parameters one by one and return the results of `experiment sensitivity --json`.
+    """Vary the parameters individually, and return the results of `experiment sensitivity --json`.
 
     folder: where the results of finished trials are stored. seconds: duration of a stroke.
     """
@@ -163,10 +164,11 @@ def _make_row(
     evaluation: EvaluationKind,
     effects: Mapping[str, Mapping[str, float | None]] | None,
 ) -> Row:
-    """Return the effects of one deviation; a metric that was not evaluated is None.
+    """Return the effects of one deviation of a parameter; metrics without evaluation are None.
 
-    At rest, an effect is the mean change of single vectors, pixels and pushes. In simulated time it
-    is the mean error minus the mean error with the nominal apparatus.
+    At rest, an effect is the mean change of single vectors, pixels and pushes. In simulated time,
+    an effect is the mean error minus the mean error with the nominal apparatus. sigma: deviation in
+    standard deviations.
     """
     row: Row = {"parameter": parameter, "sigma": sigma, "evaluation": evaluation.value}
     row |= {metric.value: None for metric in Metric}
@@ -181,7 +183,7 @@ def _make_row(
 def rank(scene: Scene, rows: Sequence[Row]) -> list[Row]:
     """Return the measured parameters, sorted by their worst effect at a deviation of one sigma.
 
-    share: ratio of that effect to the scene's tolerance of the metric. The largest is first.
+    share: ratio of the effect to the scene's tolerance of the metric. The largest effect is first.
     """
     limits = metric_tolerances(scene)
     ranked = []

@@ -1,7 +1,7 @@
 """Simulate a participant of the stiffness experiment, in order to test the estimator.
 
-The participant perceives the logarithm of each stiffness with normal noise, prefers one interval,
-and sometimes answers at random. The estimator does not know these parameters.
+The participant perceives the logarithm of each stiffness with normally distributed noise, prefers
+one interval, and sometimes answers at random. The estimator does not know these parameters.
 """
 
 from __future__ import annotations
@@ -13,10 +13,14 @@ from statistics import NormalDist
 import numpy as np
 
 SEED_STREAM = 75
-"""The second element of the random seed; it makes the participant independent of the session."""
+"""The second element of the random seed, which makes the seed different from that of the
+session."""
 
 WEBER_RANGE = (0.08, 0.3)
-"""The range of Weber fractions; published values for stiffness are 0.07 (force cue) to 0.23."""
+"""The range of Weber fractions of simulated participants.
+
+Published values for stiffness are 0.07 (force cue) to 0.23.
+"""
 
 MAX_LAPSE_RATE = 0.05
 BIAS_SIGMAS = 0.2
@@ -38,15 +42,18 @@ class Perception:
 
     @property
     def weber_fraction(self) -> float:
-        """Return the stiffness increment of 75 % correct answers without lapses and bias."""
+        """Return the relative stiffness increment that gives 75 % correct answers.
+
+        Lapses and bias are not included.
+        """
         return math.expm1(NormalDist(0.0, math.sqrt(2.0) * self.noise).inv_cdf(0.75))
 
 
 class SimulatedParticipant:
-    """A simulated participant that compares two noisy percepts; equal seeds give equal answers.
+    """A simulated participant who compares the noisily perceived stiffness of two objects.
 
-    The noise of a trial depends only on the seed and the number of the trial, so an interrupted
-    session continues with the same answers.
+    The noise depends only on the seed and the number of the trial. Therefore an interrupted session
+    continues with the same answers.
     """
 
     def __init__(self, seed: int, perception: Perception | None = None) -> None:
@@ -54,7 +61,10 @@ class SimulatedParticipant:
         self.perception = perception or draw_perception(seed)
 
     def answer(self, trial: int, first_pa: float, second_pa: float) -> int:
-        """Return the interval, 1 or 2, in which the object appears stiffer."""
+        """Return the interval (1 or 2) in which the object appears stiffer.
+
+        trial: number of the trial. first_pa, second_pa: Young's moduli of the objects.
+        """
         random = np.random.default_rng((self._seed, SEED_STREAM, trial))
         mind = self.perception
         if random.random() < mind.lapse_rate:
@@ -65,7 +75,7 @@ class SimulatedParticipant:
 
 
 def draw_perception(seed: int) -> Perception:
-    """Return random parameters of a participant."""
+    """Return random perception parameters of a participant."""
     random = np.random.default_rng((seed, SEED_STREAM))
     low, high = np.log(WEBER_RANGE)
     weber = math.exp(random.uniform(low, high))

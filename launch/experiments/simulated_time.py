@@ -1,10 +1,10 @@
-"""Follow a finger in simulated time: tracking, planning and both arms without running nodes.
+"""Simulate tracking, planning and both arms in simulated time, without running nodes.
 
 The nodes' methods are called at the simulated times at which the nodes would call them: at the
-exposure, when its image arrives, when its target takes effect, and in each arm cycle. Results do
-not depend on the load of the computer and are reproducible. The path check before the first motion,
-the synchronization of the arms, and stops are not simulated; images only on request. The soft body
-applies no force, so the sheet keeps its stretch.
+exposure, when its image arrives, when its target takes effect, and in each arm cycle. The results
+are reproducible, and do not depend on the load of the computer. The path check before the first
+motion, the synchronization of the arms, and stops are not simulated. Images are simulated only on
+request. The soft body applies no force, so the sheet's stretch does not change.
 
 The ground truth comes from the simulator: camera, servos, flange compliance and sheet surface.
 """
@@ -76,35 +76,40 @@ from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 CYCLE_S = 0.0071
-"""The period of the commands to the arms."""
+"""The period of the commands to the arms, in seconds."""
 
 READ_OUT_S, COMPUTING_S, SENDING_S = 0.004, 0.002, 0.001
-"""The durations of three successive stages: camera read-out (unless the apparatus states it),
-computation until the target is published, and transmission until an arm command uses it."""
+"""The durations (s) of camera read-out, computation and transmission, which are successive.
+
+The read-out duration applies unless the apparatus defines it. The computation ends when the target
+is published. The transmission ends when an arm command uses the target.
+"""
 
 PIXEL_NOISE_PX = 0.02
 PREDICTION_S = 0.12
 SERVO_LAG_S = 0.025
-"""The servo lag of the simulated arms, unless the apparatus states it."""
+"""The servo lag (s) of simulated arms if the apparatus does not define it."""
 
 MAX_LAG_S, MAX_EXTRAPOLATION_S = 0.1, 0.06
-"""The maximum measured servo lag, and the maximum extrapolation time of a target, in seconds. The
-values are those of the bridges."""
+"""The maximum measured servo lag, and the maximum extrapolation time of a target, in seconds.
+
+The arm bridges use the same values.
+"""
 
 SETTLING_S = 2.0
-"""The time for which the finger rests at the start of the path, until the sheet has reached it."""
+"""The time (s) for which the finger rests at the start of the path, until the sheet is there."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopSettings:
-    """The settings of a run.
+    """The settings of a simulation run.
 
     tracking: tracking method. planner: parameters of the planner by name. lag_known: whether the
     bridges know the true servo lag of the arms; otherwise they measure it. computing_s: time from
     the end of the camera's read-out to the published target. calibrations: calibrated parameters
-    that the nodes use, which differ from the true ones; None: the nodes know camera, marker and
-    exposure times exactly. with_images: whether the marker is detected in rendered camera images;
-    otherwise the true pixels of the marker with added noise are used.
+    that the nodes use, which differ from the true ones. If it is None, the nodes know camera,
+    marker and exposure times exactly. with_images: whether the marker is detected in rendered
+    camera images; otherwise the true pixels of the marker with added noise are used.
     """
 
     tracking: str = "adaptive"
@@ -117,7 +122,8 @@ class LoopSettings:
 
 
 class MeasuredFinger:
-    """A simulated camera with pixel noise, and the triangulator's tracking of the finger."""
+    """A simulated camera that measures marker pixels with noise, with the triangulator's
+    tracking."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus, settings: LoopSettings) -> None:
         given, self._truth = settings.calibrations, apparatus.camera
@@ -140,7 +146,7 @@ class MeasuredFinger:
         self._horizons_s = make_horizons_s(PREDICTION_S)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Measure the finger at a timestamp; return its predicted path (n, 3), in m.
+        """Measure the finger at a timestamp, and return its predicted path (n, 3), in m.
 
         position_world, velocity: true position (m) and velocity (m/s) of the finger at the
         timestamp, (3,). The images are exposed slightly later.
@@ -169,7 +175,7 @@ class MeasuredFinger:
 
 
 class FilmedFinger:
-    """A simulated camera that takes images, and the triangulator node that detects the finger."""
+    """A simulated camera that takes images, with the triangulator node that detects the finger."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus, settings: LoopSettings) -> None:
         true_scene, self._truth = apply_apparatus(scene, apparatus), apparatus.camera
@@ -200,9 +206,10 @@ class FilmedFinger:
         return Header(1, at_ns, at_ns, "virtual", "camera", 1)
 
     def predict_path(self, at_ns: int, position_world: Floats, velocity: Floats) -> Floats:
-        """Take images of the finger at a timestamp; return its predicted path (n, 3), m.
+        """Take images of the finger at a timestamp, and return its predicted path (n, 3), in m.
 
-        position_world, velocity: true position and velocity (3,) of the finger at the timestamp.
+        position_world, velocity: true position (m) and velocity (m/s) of the finger at the
+        timestamp, (3,).
         """
         late_s = self._truth.stamp_offset_s
         if self._truth.exposure_jitter_s:
@@ -225,7 +232,7 @@ class FilmedFinger:
 
 
 class SimulatedArm:
-    """A simulated arm: the control methods of its bridge, and the simulator's servo."""
+    """A simulated arm: the control methods of its bridge, and the servo model of the simulator."""
 
     def __init__(
         self,
@@ -256,22 +263,25 @@ class SimulatedArm:
         self._now_s = 0.0
 
     def sheet_to(self, other: SimulatedArm) -> SheetMotion:
-        """Return the sheet between both arms, computed from joint angles as a bridge does."""
+        """Return the motion of the sheet between two arms, computed from joint angles as in a
+        bridge."""
         edges = [arm._geometry.world_from_edge(arm._servo.joints_rad) for arm in (self, other)]
         return self._geometry.sheet_between(*edges)
 
     @property
     def lag_s(self) -> float:
-        """Return the servo lag (s) that the bridge has measured or was given."""
+        """Return the servo lag (s) that the bridge has measured, or that it knows in advance."""
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     @property
     def lag_uncertainty_s(self) -> float | None:
-        """Return the standard deviation (s) of the measured servo lag; None before it is known."""
+        """Return the standard deviation (s) of the measured servo lag; None if it is not known
+        yet."""
         return None if self._lag.estimate is None else self._lag.estimate.uncertainty_s
 
     def advance(self, until_s: float) -> Floats:
-        """Advance the servo to a time, and return the true joint angles (6,), rad."""
+        """Advance the simulated servo to a time (s), and return the true joint angles (6,), in
+        rad."""
         while self._pending and self._pending[0][0] <= until_s:
             due_s, joints_rad = self._pending.popleft()
             self._run_servo(due_s)
@@ -345,7 +355,7 @@ class SimulatedSheet:
         self.on_edges: Callable[[float, Floats, Floats], None] | None = None
 
     def record(self, now_s: float) -> None:
-        """Advance the servos to a time, and record the true edges of the sheet."""
+        """Advance the servos to a time (s), and record the true poses of the sheet's edges."""
         flanges = [
             model.world_from_base @ model.mechanics.forward(arm.advance(now_s))
             for model, arm in zip(self._models, self.arms, strict=True)
@@ -397,7 +407,7 @@ class SimulatedLoop:
         return self._horizon_s
 
     def run_cycles(self, until_s: float) -> None:
-        """Run the cycles of the arms up to a time."""
+        """Run the command cycles of both arms up to a time (s)."""
         while self._commanded_s + CYCLE_S < until_s:
             self._commanded_s += CYCLE_S
             self._run_cycle(self._commanded_s, CYCLE_S)
@@ -405,10 +415,10 @@ class SimulatedLoop:
     def step(
         self, exposed_s: float, position: Floats, velocity: Floats | None = None
     ) -> PlannedStep:
-        """Measure the finger at an exposure, plan and move the arms.
+        """Measure the finger at an exposure, plan the sheet's motion, and move the arms.
 
-        position, velocity: true position and velocity (3,) of the finger at the timestamp. The
-        filtered position is stored in `fingertip`.
+        position, velocity: true position (m) and velocity (m/s) of the finger at the timestamp,
+        (3,). The filtered position is stored in `fingertip`.
         """
         predicted = self._tracked.predict_path(
             round(1e9 * exposed_s), position, np.zeros(3) if velocity is None else velocity
@@ -446,10 +456,11 @@ def follow_in_simulated_time(
     apparatus: Apparatus | None = None,
     settings: LoopSettings | None = None,
 ) -> dict[str, Any]:
-    """Simulate the sheet for a finger path; return its errors as `FollowedFinger.figures` does.
+    """Simulate the sheet's motion along a finger path, and return the errors of the sheet.
 
-    The keys `servo_lag_ms` and `servo_lag_uncertainty_ms` have the servo lags that the two bridges
-    have measured at the end, and their standard deviations.
+    The keys are those of `FollowedFinger.figures`. In addition, `servo_lag_ms` contains the servo
+    lags that the two bridges have measured at the end, and `servo_lag_uncertainty_ms` their
+    standard deviations.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
@@ -496,10 +507,10 @@ def record_in_simulated_time(
     path: FingerPath,
     span_s: tuple[float, float],
 ) -> StrokeRecording:
-    """Simulate the sheet for a finger path with tremor; return what a bag would contain.
+    """Simulate a finger path with tremor, and return the same data as a recorded bag.
 
-    span_s: interval of the path in which fingertips are recorded. The settings must have
-    calibrations.
+    span_s: interval of the path in which fingertips are recorded, s. `settings.calibrations` must
+    not be None.
     """
     given = settings.calibrations
     force_model = make_force_model(scene.sheet, None if given is None else given.sheet)
@@ -552,10 +563,10 @@ def record_in_simulated_time(
 def stroke_in_simulated_time(
     scene: Scene, apparatus: Apparatus, settings: LoopSettings, seconds: float
 ) -> dict[str, dict[str, float]]:
-    """Simulate the experiment `stroke`; return its errors in mm and degrees as `stroke_result`.
+    """Simulate the experiment `stroke`, and return its errors in mm and degrees.
 
-    The settings must have calibrations. Keys with the prefix `true_` contain true errors. The same
-    keys without the prefix contain the errors that the devices report.
+    Keys with the prefix `true_` contain true errors. The same keys without the prefix contain the
+    errors that the devices measure. `settings.calibrations` must not be None.
     """
     recorded = record_in_simulated_time(
         scene, apparatus, settings, stroke_path(scene, seconds), stroke_window_s(seconds)
@@ -575,12 +586,12 @@ def stroke_in_simulated_time(
 
 @dataclass(frozen=True, slots=True)
 class TouchRecording:
-    """A touch of a simulated hand that the sheet pushes, sampled at the exposures.
+    """A recorded touch of a simulated hand that the sheet pushes.
 
-    times_s (n,): times of the exposures. positions_m (n, 3): true fingertip.
-    phases (n,): contact phase of the planner. delay_s: time from an exposure to the sheet's motion.
-    steps (k, 3): time (s), indentation of the sheet (m) and its force (N) of each time step.
-    watchdog_triggers: number of oscillations that the planner stopped; None: unknown.
+    times_s (n,): times of the exposures. positions_m (n, 3): true fingertip. phases (n,): contact
+    phase of the planner. delay_s: time from an exposure to the sheet's motion. steps (k, 3): time
+    (s), indentation of the sheet (m) and its force (N) of each time step. watchdog_triggers: number
+    of oscillations that the planner stopped; None if unknown.
     """
 
     times_s: Floats
@@ -601,10 +612,10 @@ def touch_in_simulated_time(
     apparatus: Apparatus | None = None,
     settings: LoopSettings | None = None,
 ) -> TouchRecording:
-    """Simulate a hand that moves along a voluntary path and is pushed by the touched sheet.
+    """Simulate a hand that moves along a voluntary path while the sheet pushes the finger.
 
-    curve (m, 2): depths (m) and forces (N) of the object. bounds: the planner's bounds on the
-    sheet's offset.
+    curve: (m, 2), depths (m) and forces (N) of the object. make_finger: function that makes the
+    simulated finger from its voluntary path. bounds: the planner's bounds on the sheet's offset.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     voluntary = validate_path(path.times_s, path.positions_world_m, path.joined_by)
@@ -643,7 +654,10 @@ def touch_in_simulated_time(
 
 
 def make_soft_body(curve: Floats, stiffness_n_per_m: float = 0.0) -> SoftBody:
-    """Return a soft body at rest with this force curve (m, 2) and stiffness."""
+    """Return an undeformed soft body with a force curve.
+
+    curve: (m, 2), depths (m) and forces (N).
+    """
     return SoftBody(
         mesh_id="",
         method="curve",

@@ -3,13 +3,14 @@
 The sheet's offset (its depth) depends on the finger depth; the slope is the ratio of their changes.
 Two simulations run in the time domain, without running nodes:
 
-- boundary: the critical slope, above which a random hand is not stable, compared with the
+- boundary: the critical slope, above which a random hand is not stable. It is compared with the
   prediction by the eigenvalues of the sampled control loop (`nodes.models.hand_loop`).
-- map: the offset that the planner uses for objects of several stiffnesses, with each random hand at
-  several delays, packet jitters and depths, with and without the planner's stability bounds.
+- map: the stability with the offset that the planner uses for objects of several stiffnesses.
+  Random hands, delays, packet jitters and depths are combined, with and without the planner's
+  bounds.
 
-The random hands are sampled from the ranges in the literature with a separate seed. The bounds
-are therefore tested with hands that were not used to derive them.
+The random hands are sampled from the ranges in the literature with a separate seed. The bounds are
+therefore tested with hands that were not used to derive them.
 """
 
 from __future__ import annotations
@@ -47,12 +48,14 @@ HAND_RANGES = {
     "wrist": ((0.1, 0.2), (100.0, 400.0), (0.15, 0.5)),
     "arm": ((0.5, 1.5), (100.0, 800.0), (0.15, 0.6)),
 }
-"""The ranges of mass (kg), stiffness (N/m) and damping ratio. Sources: see
-`nodes.models.hand_loop`."""
+"""The ranges of mass (kg), stiffness (N/m) and damping ratio of random hands, by kind of hand.
+
+`nodes.models.hand_loop` lists the sources.
+"""
 
 DELAYS_S = (0.01, 0.03, 0.05, 0.07, 0.1)
 JITTERS_S = (0.0, 0.03)
-"""The ranges of the packet jitter: uniformly distributed additional delays up to this value."""
+"""The maximum packet jitters (s); the additional delays are uniformly distributed from zero."""
 
 RATES_HZ = (30.0, 60.0, 120.0)
 OBJECT_RATIOS = (0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
@@ -62,17 +65,19 @@ GAINS = (1.0, 1.25, 1.5, 2.0, 3.0)
 
 LINEAR_STIFFNESS_N_PER_M, LINEAR_DEPTH_M = 100.0, 0.02
 MAX_BOUNDARY_SLOPE = 1.5
-"""The maximum compared critical slope. Above it, the finger loses contact with the sheet."""
+"""The maximum slope that is compared; above it, the finger loses contact with the sheet."""
 
 SLOPES = 32
 FILTERS = ((math.inf, False), (math.inf, True), (10.0, False))
-"""The bandwidth of the depth's filter (rad/s), and whether the depth is predicted over the delay.
+"""The variants of the depth filter: bandwidth (rad/s), and whether the delay is predicted.
+
+An infinite bandwidth means that the depth is not filtered.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class StabilitySettings:
-    """The extent of the experiment.
+    """The settings of the experiment.
 
     hands: number of random hands per group of HAND_RANGES, sampled with `seed`. rates_hz: camera
     rates at which the critical slope is measured. object_ratios: factors by which the stiffness of
@@ -89,7 +94,11 @@ class StabilitySettings:
 
 
 def draw_hands(count: int, seed: int) -> list[Hand]:
-    """Sample `count` random hands from each group, log-uniform in mass and stiffness."""
+    """Return random hands: `count` hands from each group of HAND_RANGES.
+
+    Mass and stiffness are log-uniformly distributed, and the damping ratio is uniformly
+    distributed.
+    """
     rng = np.random.default_rng(seed)
     hands = []
     for masses, stiffnesses, dampings in HAND_RANGES.values():
@@ -103,7 +112,7 @@ def draw_hands(count: int, seed: int) -> list[Hand]:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A hand in a control loop, released near an equilibrium depth."""
+    """A hand in a control loop that is released near an equilibrium depth."""
 
     hand: Hand
     loop: SampledLoop
@@ -112,7 +121,10 @@ class Trial:
 
 
 def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
-    """Return the cases of each trial with every gain; cases of one trial are consecutive."""
+    """Return the simulation cases of all combinations of trials and gains.
+
+    The cases of one trial are consecutive.
+    """
 
     def repeat(values: Iterable[float]) -> Floats:
         return np.repeat(np.fromiter(values, dtype=np.float64), len(gains))
@@ -131,9 +143,11 @@ def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
 
 
 def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Floats:
-    """Return the smallest slope (n,) of the offset at which a hand is not stable; NaN above 1.5.
+    """Return the smallest slopes (n,) of the offset at which the hands of the trials are not
+    stable.
 
-    The slope is simulated for a linear sheet. All trials must have the same period.
+    A slope above 1.5 is returned as NaN. The slopes are simulated for a linear sheet. All trials
+    must have the same period.
     """
     slopes = np.geomspace(0.03, MAX_BOUNDARY_SLOPE, SLOPES)
     motion = simulate_release(
@@ -152,7 +166,7 @@ def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Fl
 
 
 def measure_boundary(settings: StabilitySettings, progress: Progress) -> list[dict[str, Any]]:
-    """Return the simulated and the predicted critical slope of each hand and control loop."""
+    """Return the simulated and the predicted critical slopes, one row per hand and control loop."""
     hands = draw_hands(settings.hands, settings.seed)
     rows: list[dict[str, Any]] = []
     for rate_hz, towards in product(settings.rates_hz, (True, False)):
@@ -213,9 +227,10 @@ def measure_map(
     *,
     cache_dir: Path | None = None,
 ) -> list[dict[str, Any]]:
-    """Return a table row for each object, hand, delay, jitter and kind of control loop.
+    """Simulate random hands that push objects of several stiffnesses; return table rows.
 
-    The planner knows the mean delay, to which the jitter adds half of its range.
+    There is one row for each object, hand, delay, jitter and kind of control loop. The planner
+    knows the mean delay, to which the jitter adds half of its range.
 
     Kinds: "bounded" is the planner's control loop; "unbounded" has no stability bounds and no depth
     filter; "predicted" is like "unbounded", but predicts the depth over the delay.
@@ -258,7 +273,10 @@ def measure_map(
 def _simulate_pushes(
     fitted: Compliance, hands: Sequence[Hand], loops: Sequence[SampledLoop], jitter_s: float
 ) -> list[dict[str, Any]]:
-    """Return a table row for each hand and control loop; stable means stable at every depth."""
+    """Return a table row for each hand and control loop.
+
+    A row is marked as stable if the hand is stable at all depths.
+    """
     indented_m = np.linspace(0.0, 2.0 * fitted.max_depth_m, 400)
     push = SheetPush(fitted.stretch_ratio, fitted.finger_radius_m)
     forces_n = fitted.model.evaluate(push, indented_m).force_n
@@ -307,7 +325,7 @@ def stability_result(
     settings: StabilitySettings,
     progress: Progress,
 ) -> dict[str, Any]:
-    """Run both simulations; return the result of `flexsheet experiment stability --json`."""
+    """Run both simulations, and return the result of `flexsheet experiment stability --json`."""
     boundary = measure_boundary(settings, progress)
     rows = measure_map(scene, model, curve, settings, progress)
     errors = np.abs([row["error_percent"] for row in boundary])

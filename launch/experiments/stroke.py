@@ -1,9 +1,9 @@
-"""Stroke the virtual cylinder and measure the error of the sheet.
+"""Stroke the virtual cylinder with a finger, and measure the error of the sheet.
 
-This is the experiment of section V and Table I of Furukawa et al. 2007 ("the paper"). D is the
-point of the object nearest to the finger, D' the contact point that the sheet presents instead.
-Errors (Fig. 9): delta d is the distance from D to D', delta theta the angle between the normals.
-"Light" is the time at which the projector shows an image.
+This is the experiment of Furukawa et al. 2007, section V and Table I. D is the point of the object
+nearest to the finger, and D' is the contact point of the sheet. The errors (Fig. 9) are delta d,
+the distance from D to D', and delta theta, the angle between the normals at D and D'. "Light" is
+the time at which the projector shows an image.
 """
 
 from __future__ import annotations
@@ -53,14 +53,16 @@ PAPER_TABLE_1 = {
     10.0: {"delta_d_mm": (0.443, 0.0330), "delta_theta_deg": (0.359, 0.267)},
     30.0: {"delta_d_mm": (0.277, 0.0221), "delta_theta_deg": (0.225, 0.179)},
 }
-"""The errors in Table I of the paper: mean and standard deviation, by duration of the stroke (s).
+"""The errors in Table I of Furukawa et al. 2007, by duration of the stroke (s).
+
+The values are mean and standard deviation.
 """
 
 NO_VALUES: Floats = np.empty(0)
 
 
 class LatencyEvent(StrEnum):
-    """An event that an exposure of the camera causes; its latency counts from the exposure."""
+    """An event that an exposure of the camera causes; its latency is measured from the exposure."""
 
     FINGERTIP = "fingertip"
     SHEET_TARGET = "sheet target"
@@ -80,7 +82,7 @@ ARM_EVENTS: dict[Side, LatencyEvent] = {
 
 @dataclass(frozen=True, slots=True)
 class DrawnFrames:
-    """The contents that the renderer drew, each with the time (ns) at the centre of its display.
+    """The contents of the drawn frames, with the time (ns) at the centre of each frame's display.
 
     fingertip: drawn fingertip position (3,), m. sheet: centre and normal of the sheet (6,).
     deformation_ages: age of the finger measurement that deforms the drawn object (1,), s.
@@ -91,7 +93,7 @@ class DrawnFrames:
     deformation_ages: list[tuple[int, Floats]]
 
     def add(self, frame: Frame) -> None:
-        """Add the contents of a frame; ignore a frame that was not displayed."""
+        """Add the contents of a frame; frames that were not displayed are ignored."""
         if not frame.light_ns:
             return
         pose = frame.world_from_sheet
@@ -103,7 +105,7 @@ class DrawnFrames:
             self.deformation_ages.append((frame.light_ns, np.array([age_s])))
 
     def shifted(self, late_ns: int) -> DrawnFrames:
-        """Return the contents at the true display times, `late_ns` after the recorded times.
+        """Return the contents with display times that are later by `late_ns`.
 
         The ages of the drawn deformation increase by the same time.
         """
@@ -116,12 +118,12 @@ class DrawnFrames:
 
 
 def stroke_label(seconds: float) -> str:
-    """Return the label of the finger path of a stroke with a duration in s."""
+    """Return the label of the finger path of a stroke with the given duration (s)."""
     return f"stroke {seconds:g} s"
 
 
 def stroke_path(scene: Scene, seconds: float) -> FingerPath:
-    """Make the finger path of the experiment.
+    """Return the finger path of the experiment.
 
     The finger approaches, touches, dwells, strokes over 60 degrees at constant speed, and lifts.
     """
@@ -157,7 +159,7 @@ def stroke_path(scene: Scene, seconds: float) -> FingerPath:
 
 
 def stroke_window_s(seconds: float) -> tuple[float, float]:
-    """Return the start and end of the stroke, in s from the start of the finger path."""
+    """Return the start and end of the stroke, in seconds from the start of the finger path."""
     begin = APPROACH_S + DWELL_S
     return begin, begin + seconds
 
@@ -169,29 +171,29 @@ def object_pose(scene: Scene) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SampledMotion:
-    """A sampled motion: times (n,) in ns, and k values at each time (n, k)."""
+    """A sampled motion with times (n,) in ns, and k values at each time (n, k)."""
 
     times_ns: NDArray[np.int64]
     values: Floats
 
     def interpolate(self, times_ns: NDArray[np.int64]) -> Floats:
-        """Interpolate linearly at times (m,) ns; return values (m, k).
+        """Return the values (m, k) at the given times (m,) in ns, by linear interpolation.
 
-        Times are converted to floats relative to the first sample. Floats of the time since the
-        computer's start could not resolve nanoseconds.
+        Times are converted to floats relative to the first sample, because floats of the time since
+        the computer's start cannot resolve nanoseconds.
         """
         zero = self.times_ns[0]
         x, xp = (times_ns - zero).astype(np.float64), (self.times_ns - zero).astype(np.float64)
         return np.column_stack([np.interp(x, xp, column) for column in self.values.T])
 
     def covers(self, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return a mask (m,) that is true for times between the first and the last sample."""
+        """Return a mask (m,) that is True for times between the first and the last sample."""
         inside: NDArray[np.bool_] = (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
         return inside
 
 
 def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
-    """Make a motion from samples (time in ns, value): sort them and drop repeated times.
+    """Make a motion from samples (time in ns, value), which are sorted; repeated times are dropped.
 
     name: name of the samples in the error text. Raises ExperimentError for fewer than two samples.
     """
@@ -208,7 +210,7 @@ def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
 
 @dataclass(frozen=True, slots=True)
 class StrokeRecording:
-    """The data of an experiment, read from a bag.
+    """The data of a stroke experiment, read from a bag.
 
     fingertip, measured, finger: filtered, measured and true position of the fingertip.
     measured_edges, true_edges: left and right clamped edge of the sheet. A row (9,) is the centre,
@@ -234,13 +236,13 @@ class StrokeRecording:
     true_surface: SheetSurface | None = None
 
     def arm_delays_s(self) -> Floats:
-        """Return the delays (n,), in s, from exposure to the sent command, for both arms."""
+        """Return the delays (n,), in s, from exposures to the commands sent to both arms."""
         both = [self.delays_s.get(event, NO_VALUES) for event in ARM_EVENTS.values()]
         return np.concatenate(both)
 
 
 def group_by_event(delays: dict[tuple[str, int], float]) -> dict[str, Floats]:
-    """Collect delays, given by (event, exposure), in one array (n,) for each event."""
+    """Group delays with keys (event, exposure) into arrays (n,) by event."""
     events: dict[str, list[float]] = {}
     for (event, _), delay_s in delays.items():
         events.setdefault(event, []).append(delay_s)
@@ -248,14 +250,18 @@ def group_by_event(delays: dict[tuple[str, int], float]) -> dict[str, Floats]:
 
 
 def make_edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats:
-    """Return the centre, y axis and z axis of a clamped edge as a row (9,)."""
+    """Return the centre, y axis and z axis of a clamped edge as a row (9,).
+
+    world_from_flange, flange_from_edge: poses (4, 4).
+    """
     edge = world_from_flange @ flange_from_edge
     return np.concatenate([edge[:3, 3], edge[:3, 1], edge[:3, 2]])
 
 
 def frame_events(frame: Frame, published_ns: int) -> list[tuple[LatencyEvent, int]]:
-    """Return the times at which a frame was begun, drawn and, if so, displayed: (event, time in
-    ns).
+    """Return the events of a frame with their times in ns.
+
+    The events are the start and the end of drawing and, if the frame was displayed, its display.
     """
     drawn_ns = frame.drawn_ns or published_ns
     begun_ns = drawn_ns - round(frame.draw_s * 1e9)
@@ -264,7 +270,10 @@ def frame_events(frame: Frame, published_ns: int) -> list[tuple[LatencyEvent, in
 
 
 def list_events(message: Message, header: Header) -> list[tuple[LatencyEvent, int, int]]:
-    """Return the events for latency measurements in a message: (event, exposure ns, time ns)."""
+    """Return the events in a message that are needed for latency measurements.
+
+    An event is a tuple of its kind, the exposure that caused it (ns), and its time (ns).
+    """
     exposure_ns = header.source_ns
     match message:
         case Fingertip() if message.valid:
@@ -285,7 +294,7 @@ def list_events(message: Message, header: Header) -> list[tuple[LatencyEvent, in
 def _find_windows_ns(
     times_by_label: dict[str, list[tuple[int, float]]],
 ) -> dict[str, tuple[int, int]]:
-    """Return the start and end (ns) of each finger path.
+    """Return the start and end (ns) of each finger path, by label.
 
     times_by_label: samples (timestamp in ns, time since the start of the path in s).
     """
@@ -296,7 +305,7 @@ def _find_windows_ns(
 
 
 def read_recording(bag: Path) -> StrokeRecording:
-    """Read the data of a stroke from a bag. Raises ExperimentError if data is missing."""
+    """Read the data of a stroke from a bag; raise ExperimentError if data are missing."""
     scene: Scene | None = None
     apparatus: Apparatus | None = None
     fingertip: list[tuple[int, Floats]] = []
@@ -385,7 +394,7 @@ def read_recording(bag: Path) -> StrokeRecording:
 def apply_compliance(
     scene: Scene, edges: tuple[SampledMotion, SampledMotion]
 ) -> tuple[SampledMotion, SampledMotion]:
-    """Displace the reported motions of both edges by the compliance of the flanges.
+    """Correct the reported motions of both edges by the compliance of the flanges.
 
     The arms report poses of rigid flanges, but the tension of the sheet displaces the flanges.
     """
@@ -410,7 +419,7 @@ def compute_sheet_planes(
     world_from_object: Floats,
     times_ns: NDArray[np.int64],
 ) -> SheetPlanes:
-    """Return the plane through both clamped edges at each time (n,), in the object's frame."""
+    """Return the planes through both clamped edges at times (n,), in the object's frame."""
     object_from_world = inverse(world_from_object)
     left, right = (
         np.concatenate(
@@ -433,10 +442,10 @@ def compute_sheet_planes(
 
 
 def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Floats]:
-    """Return the contact points D' (n, 3) of a sheet on a cylinder, and their angles (n,).
+    """Return the contact points D' (n, 3), in m, of a sheet on a cylinder, and their angles (n,).
 
-    D' is the point of the sheet's plane nearest to the point of the cylinder axis at x = `x_m`
-    (n,), in the object's frame. The angle (rad) is that of the plane's normal about the axis.
+    D' is the point of the sheet's plane that is nearest to the cylinder axis at x = `x_m` (n,), in
+    the object's frame. The angle (rad) is the direction of the plane's normal around the axis.
     """
     normal = planes.normals
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
@@ -445,17 +454,19 @@ def find_presented_points(planes: SheetPlanes, x_m: Floats) -> tuple[Floats, Flo
 
 
 MIN_CURVATURE_PER_M = 1.0
-"""The minimum principal curvature (1/m). A flatter surface has many points with nearly one normal.
+"""The minimum principal curvature (1/m) of a surface on which the contact point is computed.
+
+Flatter surfaces have many points with nearly the same normal.
 """
 
 
 def project_presented_point(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
-    """Return the contact points D' (n, 3) that a sheet presents, for an object of any shape.
+    """Return the contact points D' (n, 3), in m, of a sheet on an object of any shape.
 
     foot: points of the object nearest to the finger. centre, normal: (n, 3), point and normal of
-    the sheet's plane. D' is the surface point with the plane's normal, projected onto the plane.
-    Along a flat direction it stays at the foot. The error of this approximation is of second order
-    in the angle between the normals.
+    the sheet's plane. D' is the surface point that has the plane's normal, projected onto the
+    plane. Along a direction without curvature, D' has the position of the foot. The error of this
+    approximation is of second order in the angle between the normals.
     """
     curvatures, directions = principal_curvatures(foot.shape_operator, foot.normal)
     slopes = np.einsum("nki,ni->nk", directions, normal)
@@ -478,13 +489,14 @@ def sheet_errors(
     shape: Shape | None = None,
     surface: SheetSurface | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return the sheet's errors delta d (n,) m and delta theta (n,) rad at `times_ns`.
+    """Return the sheet's errors delta d (n,) in m and delta theta (n,) in rad at `times_ns`.
 
     finger, edges: motions of the fingertip and of both clamped edges. normal_offset_m (n,):
-    commanded depth of the sheet below the undeformed surface. The sheet renders that surface, so
-    the finger's push depth is not an error. On a cylinder, delta theta is the angle about its axis,
-    as in the paper; on other shapes it is the angle between the normals. shape: shape of the
-    scene's object, if already computed. surface: shape of the unloaded sheet; None if it is flat.
+    commanded depth of the sheet below the undeformed surface. The errors are relative to the
+    surface at this depth, so the finger's push depth is not an error. On a cylinder, delta theta is
+    the angle about its axis, as in Furukawa et al. 2007; on other shapes it is the angle between
+    the normals. shape: shape of the scene's object, if already computed. surface: shape of the
+    unloaded sheet; None if it is flat.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.interpolate(times_ns))
@@ -510,7 +522,7 @@ def sheet_errors(
 
 
 def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> SampledMotion:
-    """Smooth the measured positions from the first to the last of `times_ns`.
+    """Return the measured positions, smoothed from the first to the last of `times_ns`.
 
     The smoother also uses later measurements, so its error estimates a lower bound for causal
     filters. It fits a cubic smoothing spline per coordinate, by generalized cross-validation.
@@ -533,7 +545,10 @@ def summary(values: Floats, scale: float) -> dict[str, float]:
 
 
 def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
-    """Return median and 99 % quantile (ms) of durations (n,), in s; None if there are none."""
+    """Return the median and the 99 % quantile (ms) of durations (n,) in s.
+
+    Both are None if there are no durations.
+    """
     if len(values_s) == 0:
         return {"p50": None, "p99": None}
     return {
@@ -544,7 +559,7 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class StrokeErrors:
-    """The errors (m and rad) of a stroke as functions of time.
+    """The errors of a stroke as functions of time, in m and rad.
 
     seconds: (n,), times of the measured errors since the start of the stroke. These are exposures
     with a valid fingertip. true_seconds: (m,), times of the true errors. These are all exposures,
@@ -565,9 +580,9 @@ class StrokeErrors:
 
 
 def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int]:
-    """Return the start and end time (ns) of a stroke of `seconds`.
+    """Return the start and end time (ns) of the stroke with a duration of `seconds`.
 
-    Raises ExperimentError if the bag does not contain it.
+    Raises ExperimentError if the recording does not contain this stroke.
     """
     windows = recording.windows_ns
     zero_ns, end_ns = find_recorded(windows, "finger path", stroke_label(seconds))
@@ -576,9 +591,9 @@ def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int
 
 
 def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
-    """Compute the errors at each exposure of a stroke of `seconds`.
+    """Compute the errors at each exposure of the stroke with a duration of `seconds`.
 
-    Raises ExperimentError if the recording does not contain it.
+    Raises ExperimentError if the recording does not contain this stroke.
     """
     begin_ns, finish_ns = stroke_span_ns(recording, seconds)
 
@@ -634,9 +649,10 @@ def compute_arcs(
     times_ns: NDArray[np.int64],
     points: Floats,
 ) -> Floats:
-    """Return the arc lengths (n, 2) m around the cylinder to the sheet's contact line and `points`.
+    """Return the arc lengths (n, 2), in m, around the cylinder to two sets of points.
 
-    edges: motions of both clamped edges. points: (n, 3) m, in the world frame.
+    The first column belongs to the sheet's contact line, the second one to `points` (n, 3), which
+    are in m in the world frame. edges: motions of both clamped edges.
     """
     world_from_object = object_pose(scene)
     local = apply(inverse(world_from_object), points)
@@ -649,9 +665,9 @@ def compute_arcs(
 def tangential_distance(
     scene: Scene, world_from_object: Floats, points: Floats, others: Floats
 ) -> Floats:
-    """Return the distances (n,) m between two sets of points (n, 3) projected on the cylinder.
+    """Return the distances (n,), in m, between pairs of points that are projected on the cylinder.
 
-    Distances along the cylinder's axis are ignored.
+    points, others: (n, 3). Distances along the cylinder's axis are ignored.
     """
     object_from_world = inverse(world_from_object)
     on_surface = []
@@ -664,7 +680,7 @@ def tangential_distance(
 
 
 def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, float | None]:
-    """Return the lags (ms) of the displayed image behind reality; None for an unknown lag.
+    """Return the lags (ms) of the displayed image behind reality; unknown lags are None.
 
     fingertip, sheet: lag of the drawn fingertip, and of the drawn rotation of the sheet about the
     object, estimated by cross-correlation with the true motion. object: median age of the finger

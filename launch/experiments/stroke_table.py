@@ -1,4 +1,4 @@
-"""Repeat the strokes of Table I of Furukawa et al. 2007, and report the errors with uncertainty.
+"""Repeat the strokes of Table I of Furukawa et al. 2007, and report errors with their uncertainty.
 
 Optional variants switch off single methods (ablations), or use a cylinder of twice the radius.
 """
@@ -24,22 +24,26 @@ from flexsheet.messages.methods import TrackingMethod
 from flexsheet.messages.scene import Scene, require_cylinder
 
 FIRST_SEED = 4100
-"""The random seed of finger and camera noise in the first stroke. Charts and defaults use other
-seeds."""
+"""The random seed of the noise of finger and camera in the first stroke.
+
+Charts and defaults use other seeds.
+"""
 
 CONFIDENCE = 0.95
 RATES_HZ = (15.0, 30.0, 60.0)
 RADIUS_FACTOR = 2.0
-"""The ratio of the cylinder's radius in the variant to the radius in the scene. The angle and
-distance errors in the paper's table agree for a radius of 70.7 mm, which is twice the radius in the
-paper's text."""
+"""The ratio of the cylinder's radius in the variant to the radius in the scene.
+
+The angle and distance errors in the paper's table agree for a radius of 70.7 mm, which is twice the
+radius in the paper's text.
+"""
 
 ERRORS = ("delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")
 
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """A variant of the experiment. settings: override parameters of the launch file."""
+    """A variant of the experiment, with settings that override parameters of the launch file."""
 
     name: str
     launch_file: Path
@@ -50,9 +54,10 @@ class Variant:
 def make_variants(
     launch_file: Path, folder: Path, *, apparatus: str | None, ablations: bool, radii: bool
 ) -> list[Variant]:
-    """Return the variants to measure, the given configuration first.
+    """Return the variants to measure; the first one is the given configuration.
 
-    Scene, launch and apparatus files of the other variants are written into the folder.
+    Scene, launch and apparatus files of the other variants are written to the folder. ablations:
+    include variants without single methods. radii: include a larger cylinder.
     """
     scene = require_scene(load_graph(launch_file))
     variants = [Variant("as configured", launch_file, apparatus=apparatus)]
@@ -92,9 +97,10 @@ def _make_ablations(
 
 
 def write_radius_variant(launch_file: Path, folder: Path, radius_m: float) -> Path:
-    """Write a launch file with a cylinder of a different radius whose front does not move.
+    """Write a launch file whose scene has a cylinder of another radius; return the path of the
+    copy.
 
-    Return the path of the copy. Relative paths in it become absolute.
+    The front of the cylinder does not move. Relative paths in the copy become absolute.
     """
     graph = load_graph(launch_file)
     added_m = radius_m - require_cylinder(require_scene(graph)).radius_m
@@ -125,9 +131,9 @@ def run_stroke_table(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Any]:
-    """Run several strokes of each variant, each with a different seed.
+    """Run several strokes of each variant with different seeds; return the results for JSON.
 
-    Return the result for JSON.
+    seconds: duration of a stroke. repeats: number of strokes per variant.
     """
     common = {
         "experiment": "stroke",
@@ -176,10 +182,10 @@ def _trial_name(variant: Variant, number: int) -> str:
 
 
 def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
-    """Summarize errors, latency and lost messages of repeated strokes; count failed strokes.
+    """Summarize the errors, latencies and lost messages of repeated strokes.
 
-    mean: mean of the means of the strokes. std: mean of their standard deviations. max: largest
-    error. interval: half the width of the mean's confidence interval; None below two strokes.
+    The result also contains the number of strokes and the errors of failed strokes. Errors: see
+    `summarize_means`.
     """
     good = [row for row in rows if "error" not in row]
     result: dict[str, Any] = {
@@ -199,7 +205,12 @@ def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def summarize_means(strokes: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Return the mean over the strokes' mean errors, and its confidence interval."""
+    """Summarize the errors of repeated strokes.
+
+    mean: mean of the strokes' mean errors. std: mean of their standard deviations. max: largest
+    error. interval: half the width of the mean's confidence interval; None for fewer than two
+    strokes.
+    """
     means = np.array([one["mean"] for one in strokes])
     interval = None
     if len(means) > 1:

@@ -1,8 +1,8 @@
 """Run the trials of a sweep as separate processes, and continue an interrupted sweep.
 
-Each trial is one process that prints its result, a row, as JSON. A sweep's folder has `sweep.json`
-with its settings and one JSON file per trial. Trials whose row exists are not run again. Trials run
-on this computer or on the workers of a `dask.distributed` scheduler, which must find the launch
+A trial is a process that prints its result, a row, as JSON. A sweep's folder has `sweep.json` with
+its settings and one JSON file per trial. Trials whose row exists are not run again. Trials run on
+this computer or on the workers of a `dask.distributed` scheduler. The workers must find the launch
 file and the apparatus files under the same paths.
 """
 
@@ -34,13 +34,13 @@ SETTINGS_FILE = "sweep.json"
 TRIAL_MODULE = "flexsheet.launch.experiments.trial"
 POLL_S = 0.2
 END_S = 20.0
-"""The time in which the process of a stopped trial must end the nodes that it started."""
+"""The time (s) in which the process of a stopped trial must end the nodes that it started."""
 
 MAX_ERROR_CHARACTERS = 600
 
 
 class TrialError(ExperimentError):
-    """Raised in the parent process if a trial ended without a result."""
+    """Raised in the parent process if the process of a trial ended without a result."""
 
     code = "trial"
     remedy = "Run the same experiment alone; the text names what failed."
@@ -49,7 +49,7 @@ class TrialError(ExperimentError):
 def describe_graph(
     plan: ResolvedGraph, launch_file: Path, settings: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the properties of a sweep's graph that must be equal for the sweep to be continued."""
+    """Return the properties of a sweep's graph that must not change when the sweep is continued."""
     return {
         "launch_file": str(launch_file.resolve()),
         "settings": list(settings),
@@ -61,7 +61,7 @@ def describe_graph(
 def open_sweep(folder: Path, settings: Mapping[str, Any]) -> None:
     """Create the folder of a sweep, or check that it contains a sweep with the same settings.
 
-    Raises ExperimentError, which names the first setting that differs.
+    Raises ExperimentError if a setting differs; its text names the first such setting.
     """
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / SETTINGS_FILE
@@ -89,7 +89,7 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 
 def read_rows(folder: Path, names: Mapping[str, Any]) -> dict[str, Row]:
-    """Return the result rows of finished trials by name; failed trials count as not finished."""
+    """Return the result rows of successful trials, by trial name."""
     rows = {
         name: _read_json(folder / f"{name}.json") for name in names if _row_exists(folder, name)
     }
@@ -109,11 +109,12 @@ def run_sweep(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> dict[str, Row]:
-    """Run the trials without a result row; return all result rows by name, in the trials' order.
+    """Run all trials that have no result row yet; return all rows by name, in the trials' order.
 
     trials: JSON description of each trial for `trial.run_trial`. workers: number of simultaneous
     trials on this computer; ignored if a scheduler is given. scheduler: address of the scheduler
-    that runs the trials. A failed trial has a row with the key `error`; the other trials go on.
+    that runs the trials. A failed trial has a row with the key `error`, and does not stop other
+    trials.
     """
     open_sweep(folder, settings)
     done = read_rows(folder, trials)
@@ -160,7 +161,7 @@ def _interruptible() -> Iterator[None]:
 
 @contextmanager
 def _executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
-    """Yield an executor for trials. If the context ends with an error, stop the running trials."""
+    """Yield an executor for trials; if the context ends with an error, stop the running trials."""
     if scheduler is not None:
         # Import only when needed, since importing distributed takes half a second.
         from flexsheet.nodes.fem_solver.dask_executor import connect_workers

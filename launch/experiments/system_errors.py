@@ -1,8 +1,9 @@
 """Compute the errors of a configuration of the system in simulated time, without running nodes.
 
-The finger strokes around the object while the triangulator finds it in simulated images, and
-planner and arms follow. Images and forces are evaluated with the sheet at rest. The results do not
-depend on the load of the computer. All errors are relative to the simulator's ground truth.
+The finger strokes around the object. The triangulator detects the finger in simulated images, and
+planner and arms follow the finger. Images and forces are evaluated with the sheet at rest. The
+results do not depend on the load of the computer. All errors are relative to the simulator's ground
+truth.
 """
 
 from __future__ import annotations
@@ -57,34 +58,47 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 STROKE = "system stroke"
 TOUCH_M = 0.001
-"""The push depth during the stroke. It keeps the finger in contact despite drift and tremor."""
+"""The push depth (m) during the stroke, which keeps the finger in contact despite drift and
+tremor."""
 
 STROKED_RATIO = 0.9
-"""The fraction of the touchable arc length of the object that is stroked."""
+"""The fraction of the touchable arc length of the object that the finger strokes."""
 
 SAMPLE_S = 0.05
 MAX_STEP_RAD = 0.1
-"""The maximum phase of the stroke between two points of its path."""
+"""The maximum phase difference of the oscillating stroke between two points of its path, in rad."""
 
 APPROACH_S = 1.0
 WARM_UP_S = 0.5
-"""The time after the approach in which errors are not evaluated, until the sheet has settled."""
+"""The time (s) after the approach in which errors are not evaluated, until the sheet has
+settled."""
 
 HOVER_M = 0.03
 METRES_PER_PX = 0.0014
-"""The resolution of the images; the error map interpolates between the drawn coordinates."""
+"""The resolution of the images, in metres per pixel.
+
+The error map interpolates between the drawn coordinates.
+"""
 
 FORCE_STEP_S, FORCE_REST_S = 1.0 / 60.0, 1.5
-"""The time step of the planner during a push, and duration of the rest before a force is evaluated.
+"""The time step of the planner during a push, and the duration of rest before forces are evaluated.
+
+Both are in seconds.
 """
 
 STAGES = ("fingertip", "planner and arms", "geometry of the arms")
-"""The stages whose errors add up to the sheet's error. The errors are: measured minus true finger;
-computed sheet (from measured joint angles) minus measured finger; true minus computed sheet."""
+"""The stages whose errors add up to the sheet's error.
+
+The errors are: measured minus true finger; sheet computed from measured joint angles minus measured
+finger; true minus computed sheet.
+"""
 
 
 def make_stroke(scene: Scene, seconds: float, label: str = STROKE) -> FingerPath:
-    """Make a finger path that strokes back and forth around the object, up to the scene's speed."""
+    """Return a finger path that strokes back and forth around the object.
+
+    The maximum speed is that of the scene's working range. seconds: duration of the stroke.
+    """
     half_m = 0.5 * STROKED_RATIO * touchable(scene)[1]
     frequency_rad_per_s = scene.working_range.speed_m_per_s / half_m
     times = np.arange(0.0, seconds, min(SAMPLE_S, MAX_STEP_RAD / frequency_rad_per_s))
@@ -103,10 +117,10 @@ def make_stroke(scene: Scene, seconds: float, label: str = STROKE) -> FingerPath
 
 @dataclass(slots=True)
 class ErrorEvaluator:
-    """An evaluator of configurations of one scene with one apparatus (true hardware parameters).
+    """An evaluator of configurations in one scene with one apparatus (true hardware parameters).
 
     seconds: duration of the stroke. seed: random seed of the finger. Results of methods that
-    several configurations have in common are computed once.
+    several configurations have in common are computed only once.
     """
 
     scene: Scene
@@ -117,10 +131,11 @@ class ErrorEvaluator:
     _known: dict[tuple[Any, ...], Any] = field(default_factory=dict)
 
     def evaluate(self, methods: Methods, planner: Mapping[str, Any]) -> dict[str, Any]:
-        """Return mean, p95 and maximum of each error, or None for one that the scene lacks.
+        """Return mean, 95 % quantile and maximum of each error of a configuration.
 
-        methods: all methods of the configuration. planner: further parameters of the planner.
-        budget: fraction of the sheet's mean square error that each stage of `STAGES` causes.
+        An error is None if the scene does not have the required device or object. methods: all
+        methods of the configuration. planner: further parameters of the planner. budget (in the
+        result): fraction of the sheet's mean square error that each stage of `STAGES` causes.
         """
         has_image, has_force = self.scene.projector is not None, self.scene.object.material
         moving = (methods.marker, methods.tracking, *planner.items())
@@ -171,10 +186,11 @@ class ErrorEvaluator:
         return summarize_errors(found[np.isfinite(found)])
 
     def _force(self, methods: Methods) -> dict[str, float] | None:
-        """Return the errors (%) of the force that the finger feels while it rests at depths.
+        """Return the errors (%) of the force that the finger feels while it rests at several
+        depths.
 
-        The reference is the stored solution of an independent solver. Where the file contains none
-        for the scene, it is the force of the configuration's own soft body.
+        The reference is the stored solution of an independent solver. If there is no solution for
+        the scene, the reference is the force of the configuration's own soft body.
         """
         scene, truth = self.scene, apply_apparatus(self.scene, self.apparatus)
         press = compliance.make_presses(scene)[0]
@@ -228,7 +244,7 @@ class ErrorEvaluator:
 
 @dataclass(slots=True)
 class RestingPush:
-    """A planned sheet for a finger that moves in and rests.
+    """A planned sheet motion for a finger that pushes and then rests.
 
     measured_m: measured minus true fingertip (3,).
     """
@@ -238,7 +254,11 @@ class RestingPush:
     measured_m: Floats
 
     def rest_at(self, tip: Floats, surface: Floats) -> Any:
-        """Return the sheet's motion after the finger has moved to a point (3,) and rested there."""
+        """Return the planned sheet motion after the finger has rested at a point.
+
+        tip: fingertip (3,), m. surface: point (3,) of the object at which the finger first makes
+        contact.
+        """
         finger = tip + self.measured_m
         if not self.planner.in_contact:
             for _ in range(round(FORCE_REST_S / FORCE_STEP_S)):
@@ -263,22 +283,25 @@ def _load_curve(scene_json: str, method: SoftBodyMethod, spacing_m: float) -> So
 
 
 def load_body(scene: Scene, choice: SoftBodyChoice | None) -> SoftBody:
-    """Return the soft body at rest of a scene, by a method and skin spacing.
+    """Return the undeformed soft body of a scene.
 
-    As in the solver node, the linear method replaces a table that is not computed.
+    choice: method and spacing of the surface nodes. If a required table is not computed, the linear
+    method is used instead, as in the solver node.
     """
     given = choice or SoftBodyChoice(method="linear", skin_spacing_m=0.003)
     return _load_curve(scene.model_dump_json(), given.method, given.skin_spacing_m)
 
 
 def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: Any) -> Floats:
-    """Split the sheet's error into the errors of the stages `STAGES`, (3, n, 3) m.
+    """Split the sheet's error into the errors (3, n, 3), in m, of the three stages `STAGES`.
 
-    The total is the object's point nearest to the true finger, moved inward by the commanded offset
-    (n, 1), minus the contact point of the true sheet. Vectors are in the object's frame. A
-    displacement of a flat sheet along a flat object does not change the contact. For flat objects,
-    the total is the distance between the planes only, which is zero if the arms move within the
-    plane.
+    The total error is the difference of two points in the object's frame. The first is the object's
+    point nearest to the true finger, moved inward by the commanded offset (n, 1). The second is the
+    contact point of the true sheet.
+
+    A displacement of a flat sheet along a flat object does not change the contact. For flat
+    objects, the total error is therefore only the distance between the planes. It is zero if the
+    arms move within the plane.
     """
     world_from_object = object_pose(recording.scene)
     object_from_world = inverse(world_from_object)
@@ -305,7 +328,7 @@ def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: A
 
 
 def summarize_errors(values: Floats) -> dict[str, float] | None:
-    """Return mean, 95 % quantile and maximum of values (n,); None if there are no values."""
+    """Return the mean, 95 % quantile and maximum of values (n,); None if there are no values."""
     if len(values) == 0:
         return None
     return {

@@ -1,4 +1,4 @@
-"""Run one configuration of the graph, and measure processor time and latency during a stroke."""
+"""Run one configuration of the graph, and measure its processor time and latency in a stroke."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ DELAY_TOPICS = ("twin/apparatus", "arm_left", "arm_right", "frame")
 
 @dataclass(slots=True)
 class CpuUse:
-    """The average number of processor cores that the processes of a graph use, by node name."""
+    """The average number of processor cores that each process of a graph uses, by node name."""
 
     cores: dict[str, float] = field(default_factory=dict)
 
     async def measure(self, driver: Driver, path: FingerPath) -> None:
-        """Move the finger along a path, and measure the processor use during this time."""
+        """Move the finger along a path, and measure the processor use during this motion."""
         before, begin_s = read_cpu_s(driver.pids()), time.monotonic()
         await driver.follow(path)
         after, passed_s = read_cpu_s(driver.pids()), time.monotonic() - begin_s
@@ -52,8 +52,8 @@ class CpuUse:
 def read_cpu_s(pids: Mapping[str, int]) -> dict[str, float]:
     """Return the processor time (s) of each process, including its ended child processes.
 
-    pids: process id of each node. Nodes that share a process have one common entry, whose key is
-    their names joined by "+".
+    pids: process id of each node. Nodes that share a process have one entry, whose key is their
+    names joined by "+".
     """
     names: dict[int, list[str]] = {}
     for name, pid in pids.items():
@@ -72,9 +72,9 @@ def read_cpu_s(pids: Mapping[str, int]) -> dict[str, float]:
 def run_system(
     launch_file: Path, settings: Sequence[str], bag: Path, seconds: float, progress: Progress
 ) -> dict[str, Any]:
-    """Run the graph during a stroke of `seconds`; return its processor use and its latencies (ms).
+    """Run the graph during a stroke of `seconds`; return its processor use and latencies (ms).
 
-    A latency is None if the graph has no such output.
+    A latency is None if the graph does not have the corresponding output.
     """
     used = CpuUse()
 
@@ -134,10 +134,11 @@ def evaluate_stroke(bag: Path) -> dict[str, Any]:
 
 
 def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats]:
-    """Return the delays (s) from exposures in a window to arm commands, and to displayed images.
+    """Return the delays (s) from exposures to arm commands, and from exposures to displayed images.
 
-    Only the first effect of each exposure counts. The display time includes the true latency of
-    the projector beyond the latency that the renderer assumes.
+    Only exposures between `begin_ns` and `end_ns`, and only the first effect of an exposure, are
+    used. If the projector is slower than the renderer assumes, the difference is added to the
+    display time.
     """
     to_arm: dict[tuple[str, int], float] = {}
     to_light: dict[int, float] = {}
@@ -163,7 +164,7 @@ def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats
 def summarize_latency(values_s: Floats) -> dict[str, float] | None:
     """Return the median and the 95 % and 99 % quantiles, in ms, of delays (n,) in s.
 
-    Return None if there are no delays.
+    Returns None if there are no delays.
     """
     if len(values_s) == 0:
         return None

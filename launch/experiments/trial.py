@@ -1,6 +1,6 @@
 """Run one trial of a sweep: read its description as JSON from stdin, and print its result row.
 
-python -m flexsheet.launch.experiments.trial
+Run this module as `python -m flexsheet.launch.experiments.trial`.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ from flexsheet.nodes.twin.tolerance_table import Profile, deviate_apparatus
 Row = dict[str, Any]
 
 NICENESS = 10
-"""The niceness of trials without a graph, so that other programs on the computer stay usable."""
+"""The niceness of trials without a graph, which gives other programs on the computer priority."""
 
 
 @contextmanager
 def _bag_of(trial: Mapping[str, Any]) -> Iterator[Path]:
-    """Yield the path of the trial's bag; a bag that the trial does not name is temporary."""
+    """Yield the path of the trial's bag; the bag is temporary if the trial does not name one."""
     if trial.get("bag"):
         yield Path(trial["bag"])
         return
@@ -58,7 +58,10 @@ def _tell(text: str) -> None:
 
 
 def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
-    """Run one stroke in a separate graph; return its results and the suspected causes of errors."""
+    """Run one stroke in a separate graph, and return its results and the suspected error causes.
+
+    trial: description of the trial. apparatus: value of the option --apparatus.
+    """
     launch_file, seconds = Path(trial["launch_file"]), float(trial["seconds"])
     settings = [*choose_ports(launch_file), *trial.get("settings", ())]
     with _bag_of(trial) as bag:
@@ -74,7 +77,7 @@ def run_stroke(trial: Mapping[str, Any], apparatus: str | None) -> Row:
 
 
 def read_flags(bag: Path) -> list[SuspectedCause]:
-    """Return the causes that nodes suspected, each once, in the order of first occurrence."""
+    """Return the error causes that nodes suspected, without repetitions, in order of occurrence."""
     found: dict[SuspectedCause, None] = {}
     for _, message, _, _ in BagReader(bag, topics=["status"]):
         if isinstance(message, Status):
@@ -83,12 +86,15 @@ def read_flags(bag: Path) -> list[SuspectedCause]:
 
 
 def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
-    """Run one stroke; return its results. The trial's `apparatus` is a value of `--apparatus`."""
+    """Run one stroke with the apparatus that the trial names, and return its results."""
     return run_stroke(trial, trial.get("apparatus"))
 
 
 def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
-    """Return errors with a random apparatus: sheet and finger moving, image and force at rest."""
+    """Return the errors of the system with a random apparatus.
+
+    The errors of the sheet are measured in motion, the errors of image and force at rest.
+    """
     if trial.get("commission_folder"):
         return _run_commissioned_trial(trial)
     apparatus_file, launch_file = trial["apparatus"], Path(trial["launch_file"])
@@ -125,7 +131,7 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
     """Commission a simulated laboratory, and return its errors.
 
     The verification runs in simulated time, without a graph. Its result also contains the predicted
-    errors and the verdict of the laboratory's own report.
+    errors, and whether the laboratory's own report rates the result as good.
     """
     from flexsheet.launch.commands.commission import summarize
     from flexsheet.launch.commands.commission_steps import open_laboratory
@@ -170,9 +176,10 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the effects of deviations of one apparatus parameter, without a graph.
+    """Return the error changes due to deviations of one apparatus parameter, without a graph.
 
-    With `stroke_seeds`, strokes in simulated time are evaluated; otherwise the sheet at rest.
+    If the trial has `stroke_seeds`, the errors are those of strokes in simulated time. Otherwise
+    they are those of the sheet at rest.
     """
     plan = load_graph(Path(trial["launch_file"]), settings=trial["settings"])
     scene, calibrations = require_scene(plan), NodeCalibrations.of(plan)
@@ -231,7 +238,7 @@ def _mean_stroke_errors(
 
 
 def run_system_trial(trial: Mapping[str, Any]) -> Row:
-    """Run one configuration of the graph; return its processor use and latencies."""
+    """Run one configuration of the graph, and return its processor use and latencies."""
     launch_file = Path(trial["launch_file"])
     settings = [*choose_ports(launch_file), *trial["settings"]]
     with _bag_of(trial) as bag:
@@ -239,7 +246,7 @@ def run_system_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_system_errors_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the errors of several configurations with one apparatus, in simulated time."""
+    """Compute the errors of several configurations with one apparatus, in simulated time."""
     plan = load_graph(Path(trial["launch_file"]), apparatus=trial["apparatus"])
     scene = require_scene(plan)
     apparatus = plan.apparatus_message() or nominal_apparatus(scene)
@@ -262,7 +269,10 @@ KINDS: dict[str, Callable[[Mapping[str, Any]], Row]] = {
 
 
 def main() -> int:
-    """Run the trial that stdin describes; print its result row as the last line of stdout."""
+    """Read a trial from stdin, run it, and print its result row as the last line of stdout.
+
+    Returns the exit code.
+    """
     logs_on_stderr()
     trial = json.load(sys.stdin)
     try:

@@ -1,6 +1,7 @@
 """Compute the true poses of the sheet's edges for the poses that the nodes command.
 
-The kinematics of the simulated arms are used, which share no code with the nodes' kinematics.
+The module uses the kinematics of the simulated arms, which share no code with the nodes'
+kinematics.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from flexsheet.nodes.twin.truth import apply_apparatus
 
 
 def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Floats]:
-    """Return world_from_edge (4, 4) of the left and the right edge of a flat sheet.
+    """Return the poses (4, 4) of the left and the right edge of a flat sheet, in the world frame.
 
-    distance_m: distance between the edges.
+    world_from_sheet: pose (4, 4) of the sheet. distance_m: distance between the edges.
     """
     rotation, centre = world_from_sheet[:3, :3], world_from_sheet[:3, 3]
     half = 0.5 * distance_m * rotation[:, 0]
@@ -32,9 +33,8 @@ def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Fl
 
 @dataclass(frozen=True, slots=True)
 class ArmModel:
-    """The geometry of one arm: its mechanics, and the poses (4, 4) of its base and its clamped
-    edge.
-    """
+    """The geometry of one arm: its kinematics, and the poses (4, 4) of its base and its clamped
+    edge."""
 
     mechanics: ArmMechanics
     world_from_base: Floats
@@ -49,7 +49,10 @@ class ArmModel:
         )
 
     def solve_joints(self, world_from_edge: Floats, guess_rad: Floats) -> Floats:
-        """Return the joint angles (6,), rad, for a pose of the edge; ValueError if out of reach."""
+        """Return the joint angles (6,), in rad, for a pose (4, 4) of the edge.
+
+        guess_rad: initial joint angles. Raises ValueError if the pose is out of reach.
+        """
         flange = inverse(self.world_from_base) @ world_from_edge @ inverse(self.flange_from_edge)
         return self.mechanics.solve_inverse_kinematics(flange, guess_rad)
 
@@ -71,9 +74,10 @@ class ArmPair:
         self._guesses = [arm.mechanics.start_rad for arm in self._believed]
 
     def solve_joints(self, edges: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-        """Return the commanded joint angles (6,), in rad, of both arms for poses `edges` (4, 4).
+        """Return the commanded joint angles (6,), in rad, of both arms.
 
-        The bridges correct their commands by the scene's joint offsets and flange compliances.
+        edges: poses (4, 4) of the sheet's edges. The angles are corrected by the scene's joint
+        offsets and flange compliances, as in the arm bridges.
         """
         across = edges[1][:3, 3] - edges[0][:3, 3]
         length_m = float(np.linalg.norm(across))
@@ -92,10 +96,11 @@ class ArmPair:
     def hold(
         self, edges: tuple[Floats, Floats], *, play_rad: tuple[Floats, Floats] | None = None
     ) -> tuple[Floats, Floats]:
-        """Return the true poses (4, 4) of the edges at rest, for commanded poses `edges` (4, 4).
+        """Return the true poses (4, 4) of the edges at rest.
 
-        The pull of the true sheet displaces the true flanges. Servo lag is not included.
-        play_rad: position of each joint (6,) of both arms within its backlash.
+        edges: commanded poses (4, 4). The tension of the true sheet displaces the true flanges.
+        Servo lag is not included. play_rad: position of each joint (6,) of both arms within its
+        backlash.
         """
         commanded = self.solve_joints(edges)
         flanges = []
