@@ -1,1 +1,1 @@
-"""Measure speed and accuracy of interchangeable methods, draw charts, and choose for a scene."""
+"""Measure the speed and accuracy of alternative methods, and choose methods for a scene."""

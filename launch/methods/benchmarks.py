@@ -1,6 +1,7 @@
 """Method families whose errors are measured against the simulator.
 
-They are in `launch`, because only `launch` may import the methods and the simulator.
+They are in the layer `launch`, because only this layer may import both the methods and the
+simulator.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ RESTING = ("hold",)
 
 
 def make_finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
-    """Make the true finger motions of the tracking benchmark: gestures, and a cylinder's stroke."""
+    """Return the true finger motions of the tracking benchmark, by name.
+
+    They are human gestures and, if the object is a cylinder, a stroke.
+    """
     paths: dict[str, FingerPath] = {}
     if isinstance(scene.object.geometry, Cylinder):
         paths["stroke"] = stroke_path(scene, 10.0)
@@ -45,7 +49,7 @@ def make_finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
 
 
 def _make_motion(scene: Scene, path: FingerPath, *, resting: bool) -> TruePathCase:
-    """Make a finger motion with drift and tremor that begins at the first point of a path."""
+    """Return a finger motion with drift and tremor that begins at the first point of a path."""
     start = np.asarray(path.positions_world_m[0])
     motion = FingerMotion.resting(start, seed=1).followed_by(
         0.0,
@@ -68,6 +72,6 @@ SHEET_FORCE = sheet_force_family(
     compute_true_force, lambda scene: force_table.load_or_compute(scene, None)
 )
 SHEET_LAWS = sheet_force_family(compute_true_force, None)
-"""The method family of the sheet force models that need no long computation."""
+"""The method family of the sheet force models that need no long precomputation."""
 SHEET_SHAPE = sheet_shape_family(simulate_points)
 QUICK_SHAPE = sheet_shape_family(simulate_points, solved=False)

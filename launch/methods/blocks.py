@@ -1,9 +1,9 @@
 """Plan measurements of several configurations in randomised blocks, and evaluate them.
 
-A block contains every configuration once, in random order, so that slow changes of the computer
-affect all of them alike. One configuration, the control, runs twice in each block; the ratio of its
-two runs shows which differences are noise. Runs in a block are not independent, so confidence
-intervals are found by bootstrap over whole blocks (Kalibera and Jones, ISMM 2013).
+A block contains all configurations in random order, so that slow changes of the computer affect all
+of them equally. One configuration, the control, runs twice in each block; the ratio of its two runs
+shows which differences are noise. Runs in a block are not independent, so confidence intervals are
+computed by bootstrap over whole blocks (Kalibera and Jones, ISMM 2013).
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from flexsheet.nodes.methods import Interval, dominates
 CONFIDENCE = 0.95
 RESAMPLES = 2000
 SEED = 20261123
-"""The fixed random seed of the bootstrap, which makes intervals reproducible."""
+"""The fixed random seed of the bootstrap, so that confidence intervals are reproducible."""
 
 
 def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[str]]:
-    """Return the configuration names in a different random order for each block."""
+    """Return one list of all configuration names per block, each in a different random order."""
     random = np.random.default_rng(seed)
     return [[names[i] for i in random.permutation(len(names))] for _ in range(blocks)]
 
@@ -30,8 +30,8 @@ def order_blocks(names: Sequence[str], blocks: int, *, seed: int) -> list[list[s
 def bootstrap_median(values: Floats) -> Interval | None:
     """Return the median of values (n,), one per block, with its confidence interval.
 
-    NaN marks a failed run. Return None if there are no finite values. If only one block has a
-    value, the limits are infinite.
+    A failed run has the value NaN. Returns None if there are no finite values. If only one block
+    has a value, the limits are infinite.
     """
     known = values[np.isfinite(values)]
     if len(known) == 0:
@@ -48,7 +48,8 @@ def bootstrap_median(values: Floats) -> Interval | None:
 def compare_paired(values: Floats, control: Floats) -> Interval | None:
     """Return the median ratio of positive values (n,) to the control's values in the same blocks.
 
-    The median is computed from logarithms, so a ratio and its inverse have the same weight.
+    The ratio has a confidence interval. The median is computed from logarithms, so a ratio and its
+    inverse have the same weight.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         found = bootstrap_median(np.log(values / control))
@@ -59,10 +60,10 @@ def compare_paired(values: Floats, control: Floats) -> Interval | None:
 
 
 def attribute_error(parts: Floats) -> Floats:
-    """Return the fractions (k,) of a mean square error that k parts of the error cause.
+    """Return the fractions (k,) of a mean square error that k error components cause.
 
-    parts: (k, n, d), error vectors that add up to the whole error. The fractions add up to one. A
-    part that compensates other parts has a negative fraction.
+    parts: (k, n, d), error vectors that add up to the total error. The fractions add up to one. A
+    component that compensates other components has a negative fraction.
     """
     whole = parts.sum(axis=0)
     total = float(np.square(whole).sum())
@@ -74,8 +75,8 @@ def attribute_error(parts: Floats) -> Floats:
 def find_front(points: Mapping[str, Sequence[Interval]]) -> list[str]:
     """Return the names of the points that no other point dominates (the Pareto front).
 
-    points: costs of each point, smaller is better. A point dominates another if one of its costs is
-    lower and none is higher. Costs with overlapping confidence intervals count as equal.
+    points: costs of each point; smaller is better. A point dominates another if one of its costs is
+    lower and none is higher. Costs with overlapping confidence intervals are considered equal.
     """
     return [
         name

@@ -1,7 +1,7 @@
-"""Measure speed and accuracy of the methods of a method family for a scene, and draw charts.
+"""Measure the speed and accuracy of all methods of a method family for a scene, and draw charts.
 
-A method family contains interchangeable methods for one task. Results hold for the computer on
-which they were measured.
+A method family contains interchangeable methods for one task. The results are valid only for the
+computer on which they were measured.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ class UnknownFamilyError(FlexsheetError, KeyError):
 
 
 def find_family(name: str) -> Family:
-    """Return the method family with a name. Raises UnknownFamilyError."""
+    """Return the method family with the given name; raise UnknownFamilyError if it does not
+    exist."""
     if name not in FAMILIES:
         hint = did_you_mean(name, list(FAMILIES))
         raise UnknownFamilyError(f'unknown method family "{name}"; {hint}')
@@ -87,8 +88,9 @@ def measure_family(
 ) -> list[Point]:
     """Measure all selected trials of a method family, and report the progress.
 
-    A trial is a combination of a method and a case. Each trial is measured before the next is
-    requested, because the family may then release the data of the trial.
+    A trial is a combination of a method and a case. Trials are requested one by one and measured
+    immediately, because the family may then release their data. select: function that returns
+    whether a trial is measured.
     """
     family.prepare(scene, _make_reporter("computing the reference:", progress))
     points: list[Point] = []
@@ -102,7 +104,8 @@ def measure_family(
 
 
 def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
-    """Make a function of (done, total) that regularly reports the progress and remaining time."""
+    """Return a function (done, total) that regularly reports the progress and the remaining
+    time."""
     eta, last_s = EtaEstimator(), -math.inf
 
     def report(done: int, total: int) -> None:
@@ -117,7 +120,7 @@ def _make_reporter(prefix: str, progress: Callable[[str], None]) -> Callable[[in
 
 
 def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
-    """Return the result of a measured method family, as `flexsheet chart --json` prints it."""
+    """Return the result of a measured method family in the format of `flexsheet chart --json`."""
     return {
         "family": family.name,
         "unit": family.unit,
@@ -136,8 +139,8 @@ def make_chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
     """Draw error against time on logarithmic axes, with a line along the Pareto front of each case.
 
-    If the method family has a `sweep_key`, draw errors and extra metrics also against this property
-    of the cases. A band shows the reference's uncertainty.
+    If the method family has a `sweep_key`, also draw errors and extra metrics against this property
+    of the cases. A band shows the uncertainty of the reference.
     """
     from matplotlib.figure import Figure
 
@@ -164,7 +167,7 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
     """Draw error against time, with the tolerance as a dashed line.
 
     Bars extend to the 99 % quantile of the time, and over the error's confidence interval. Errors
-    below 1e-4 of the tolerance are rounding errors; they are drawn at that value.
+    below 1e-4 of the tolerance are rounding errors; they are drawn at this value.
     """
     methods = list(dict.fromkeys(point["method"] for point in result["points"]))
     min_error = 1e-4 * result["tolerance"]
@@ -227,9 +230,10 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
 
 
 def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
-    """Draw a metric over the sweep key, one line per method.
+    """Draw a metric against the swept case property, with one line per method.
 
-    Markers of cases outside the method's range are hollow. The reference's uncertainty is grey.
+    Markers of cases outside the method's range are hollow. The uncertainty of the reference is
+    grey.
     """
     key, points = result["sweep_key"], result["points"]
 
@@ -287,7 +291,7 @@ def _has_reference(point: dict[str, Any]) -> bool:
 
 
 def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the cases of the points, each once, in order."""
+    """Return the cases of the points in order, without repetitions."""
     cases: list[dict[str, Any]] = []
     for point in points:
         if point["case"] not in cases:
@@ -296,7 +300,7 @@ def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
-    """Write the figure and results of a chart to a folder; return both paths."""
+    """Write the figure and the results of a chart to a folder, and return both paths."""
     folder.mkdir(parents=True, exist_ok=True)
     image, numbers = folder / f"{result['family']}.svg", folder / f"{result['family']}.json"
     draw_chart(result, image)
@@ -305,7 +309,10 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
 
 
 def read_charts(folder: Path) -> list[dict[str, Any]]:
-    """Read the chart results in a folder: `FAMILIES` in their order, then other benchmarks."""
+    """Read all chart results in a folder.
+
+    The method families are in the order of `FAMILIES`; other benchmarks follow.
+    """
     order = list(FAMILIES)
     paths = sorted(
         folder.glob("*.json"),
@@ -330,14 +337,14 @@ def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_overview(folder: Path) -> Path:
-    """Write an overview page of all charts in the folder; return its path."""
+    """Write an overview page of all charts in the folder, and return its path."""
     path = folder / OVERVIEW
     write_file(path, f"# Speed against accuracy\n\n{render_overview(folder)}")
     return path
 
 
 def render_overview(folder: Path, link_prefix: str = "") -> str:
-    """Return Markdown text with a section for each chart in the folder.
+    """Return Markdown text with one section for each chart in the folder.
 
     link_prefix: path from the page to the folder, with a slash at its end.
     """
@@ -365,7 +372,7 @@ def _overview_lines(folder: Path, link_prefix: str) -> Iterator[str]:
 
 
 def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return for each method the largest times and errors, and the number of cases in range.
+    """Return the largest times and errors of each method, and the number of cases in its range.
 
     The times are medians and 99 % quantiles. Errors outside of the method's range are separate.
     """
@@ -407,7 +414,7 @@ def _overview_row(row: dict[str, Any]) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """Format a duration with a unit: 12 µs, 3.4 ms, 1.2 s."""
+    """Format a duration with a suitable unit, for example as 12 µs, 3.4 ms or 1.2 s."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"

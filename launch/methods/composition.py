@@ -1,10 +1,10 @@
 """Find the cheapest combination of one method per method family that meets all tolerances.
 
 The error of each system metric is predicted from the measured errors of the stages. Independent
-random errors (spreads) add as squares: marker noise, tracking error at the time of use, and errors
-that no measurement of a method contains (planner, servo, calibration). Signed errors of force
-models and delays (biases) add linearly. The prediction decides which combination is run next in the
-graph. The errors in this run decide whether it is accepted.
+random errors (spreads) add as squares. They are marker noise, tracking error at the time of use,
+and errors that no measurement of a method contains (planner, servo, calibration). Signed errors of
+force models and delays (biases) add linearly. The prediction decides which combination is run next
+in the graph. The measured errors of this run decide whether it is accepted.
 """
 
 from __future__ import annotations
@@ -19,14 +19,17 @@ from typing import Any
 from flexsheet.launch.experiments import ExperimentError
 
 MAX_RUNS = 4
-"""The maximum number of configurations that are run through the graph."""
+"""The maximum number of configurations that are tested in the graph."""
 
 EQUAL_RATIO = 1.05
-"""The ratio below which two errors of the system count as equal."""
+"""The ratio below which two errors of the system are considered equal."""
 
 EQUAL_DELAY_RATIO = 1.5
-"""The ratio below which two latencies count as equal. The 95 % latency of one configuration varies
-by about this ratio between the blocks of `flexsheet chart system` on an idle computer."""
+"""The ratio below which two latencies are considered equal.
+
+The 95 % latency of one configuration varies by about this ratio between the blocks of `flexsheet
+chart system` on an idle computer.
+"""
 
 P95_OVER_RMS = 1.614
 """The ratio of the 95 % quantile to the root mean square of the length of a 3D Gaussian error."""
@@ -34,8 +37,7 @@ P95_OVER_RMS = 1.614
 
 class SystemMetric(StrEnum):
     """The 95 % errors and latencies of the system that have a tolerance; the values are result
-    keys.
-    """
+    keys."""
 
     SHEET = "sheet_mm"
     IMAGE = "image_mm"
@@ -53,9 +55,9 @@ DELAYS = frozenset({SystemMetric.TO_ARM, SystemMetric.TO_LIGHT})
 class StageOption:
     """A method that can be chosen for a stage.
 
-    cores: processor time per second. spreads, biases: 95 % errors or delays (ms) that it adds to
-    metrics. given: methods of other stages for which these values were measured. outside: fraction
-    of the scene's cases that are out of the method's stated range.
+    cores: processor time per second. spreads, biases: random and signed 95 % errors or delays (ms)
+    that the method adds to system metrics. given: methods of other stages for which these values
+    were measured. outside: fraction of the scene's cases that are out of the method's stated range.
     """
 
     method: str
@@ -76,18 +78,18 @@ Figures = Mapping[SystemMetric, float]
 
 @dataclass(frozen=True, slots=True)
 class Unexplained:
-    """The excess of measured over predicted system metrics, learned from runs of the graph.
+    """The difference by which measured system metrics exceed predicted ones, learned from graph
+    runs.
 
-    The excess is added to later predictions.
+    The difference is added to later predictions.
     """
 
     parts: Figures = field(default_factory=dict)
 
     def learn(self, combination: Combination, measured: Figures) -> Unexplained:
-        """Return the excess updated with the measured metrics of a combination.
+        """Return the difference, updated with the measured metrics of a combination.
 
-        With this excess, `predict` returns the measured value of each metric that it underestimated
-        before.
+        With the updated difference, `predict` no longer underestimates the measured metrics.
         """
         parts = dict(self.parts)
         squares, sums = _add_up(combination)
@@ -100,7 +102,7 @@ class Unexplained:
 
 
 def predict(combination: Combination, unexplained: Unexplained | None = None) -> Figures:
-    """Predict the system metrics of a combination: spreads add as squares, biases linearly."""
+    """Predict the system metrics of a combination; spreads add as squares, biases add linearly."""
     squares, sums = _add_up(combination)
     for metric, value in (unexplained or Unexplained()).parts.items():
         if metric in DELAYS:
@@ -114,7 +116,7 @@ def predict(combination: Combination, unexplained: Unexplained | None = None) ->
 def _add_up(
     combination: Combination,
 ) -> tuple[dict[SystemMetric, float], dict[SystemMetric, float]]:
-    """Return the sum of the squared spreads, and the sum of the biases, of each metric."""
+    """Return the sum of the squared spreads and the sum of the absolute biases, by metric."""
     squares: dict[SystemMetric, float] = {}
     sums: dict[SystemMetric, float] = {}
     for option in combination.values():
@@ -126,7 +128,8 @@ def _add_up(
 
 
 def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
-    """Return the error that each stage adds to a metric; stages that add none are left out."""
+    """Return the error that each stage adds to a metric; stages without such an error are
+    omitted."""
     parts = {
         stage: option.spreads.get(metric, 0.0) + abs(option.biases.get(metric, 0.0))
         for stage, option in combination.items()
@@ -137,7 +140,8 @@ def budget(combination: Combination, metric: SystemMetric) -> dict[str, float]:
 def list_combinations(stages: Mapping[str, Sequence[StageOption]]) -> list[Combination]:
     """Return all combinations of one option per stage, sorted by their cost.
 
-    Combinations are omitted if an option was measured with another method of a stage (`given`).
+    A combination is omitted if one of its options was measured with another method of a stage
+    (field `given`).
     """
     combinations = [
         dict(zip(stages, options, strict=True)) for options in product(*stages.values())
@@ -156,7 +160,7 @@ def list_combinations(stages: Mapping[str, Sequence[StageOption]]) -> list[Combi
 
 
 def cost(combination: Combination) -> float:
-    """Return the processor cores that a combination uses."""
+    """Return the number of processor cores that a combination uses."""
     return sum(option.cores for option in combination.values())
 
 
@@ -171,11 +175,11 @@ def excess(figures: Figures, tolerances: Figures) -> dict[SystemMetric, float]:
 
 @dataclass(frozen=True, slots=True)
 class GraphRun:
-    """A run of one combination in the graph.
+    """A run of one combination of methods in the graph.
 
     predicted, measured: 95 % values by metric; a metric that the run does not measure has its
-    predicted value in both. exceeded: ratio of value to tolerance of each metric
-    that exceeds its tolerance.
+    predicted value in both. exceeded: ratio of value to tolerance of each metric that exceeds its
+    tolerance.
     """
 
     methods: Mapping[str, str]
@@ -189,7 +193,8 @@ class GraphRun:
 class Composition:
     """The result of the search for a combination of methods.
 
-    chosen: accepted combination, or the one that exceeds the tolerances least. runs: all runs.
+    chosen: accepted combination, or the combination that exceeds the tolerances least. runs: all
+    runs.
     """
 
     chosen: Combination
@@ -208,12 +213,13 @@ class Composition:
 
     @property
     def unmet(self) -> list[str]:
-        """Return the metrics that exceed their tolerance, and the stages out of their range."""
+        """Return the metrics that exceed their tolerance, and the stages whose method is out of
+        range."""
         stages = [stage for stage, option in self.chosen.items() if not option.in_range]
         return [*self.last.exceeded, *(f"{stage} out of range" for stage in stages)]
 
     def report(self) -> dict[str, Any]:
-        """Return the result as `flexsheet tune --json` prints it."""
+        """Return the result in the format of `flexsheet tune --json`."""
         return {
             "accepted": self.accepted,
             "tolerances": {metric.value: limit for metric, limit in self.tolerances.items()},
@@ -223,7 +229,8 @@ class Composition:
         }
 
     def explain(self) -> list[str]:
-        """Return the result in one sentence, and a sentence for each tolerance that is not met."""
+        """Return a sentence about the result, and one sentence for each tolerance that is not
+        met."""
         run = self.last
         names = ", ".join(f"{stage} {method}" for stage, method in run.methods.items())
         if self.accepted:
@@ -266,14 +273,18 @@ def compose(
     margin: float,
     max_runs: int = MAX_RUNS,
 ) -> Composition:
-    """Find the cheapest combination that meets all tolerances in a run of the graph.
+    """Find the cheapest combination of methods that meets all tolerances in a run of the graph.
 
-    Runs the cheapest combination whose predicted metrics keep the margin. If its run exceeds a
-    tolerance, corrects all predictions by the difference, and runs the next combination, until no
-    other one is predicted to be better in what exceeds its tolerance. If no combination can meet a
-    tolerance, the combination must be near the smallest value, and meet the other tolerances. Only
-    combinations with the fewest cases out of range are considered. At the end, cheaper combinations
-    are run whose errors may be as small, if the predictions were too large.
+    1. Only combinations with the fewest cases out of range are considered.
+    2. The cheapest combination whose predicted metrics meet the tolerances with the margin is run.
+    3. If it exceeds a tolerance, all predictions are corrected, and the next combination is run.
+    4. This ends if no other combination is predicted to be better in the exceeded metrics.
+    5. Finally, cheaper combinations are run if the predictions were too large.
+
+    If no combination can meet a tolerance, one near the smallest attainable value is chosen.
+
+    run_graph: function that runs a combination and returns its metrics. margin: fraction of each
+    tolerance that predictions must leave. Raises ExperimentError if there is no combination.
     """
     combinations = list_combinations(stages)
     if not combinations:
@@ -321,7 +332,10 @@ def compose(
 
 
 def _find_best(runs: Sequence[GraphRun], tolerances: Figures) -> int:
-    """Return the index of the cheapest run that exceeds the attainable limits least."""
+    """Return the index of the run that exceeds the attainable limits least.
+
+    If several runs are equal in this, the cheapest is chosen.
+    """
     limits = _relax(tolerances, [run.measured for run in runs])
     return min(
         range(len(runs)), key=lambda i: (_sum_excess(runs[i].measured, limits), runs[i].cores)
@@ -335,10 +349,12 @@ def _find_cheaper(
     tolerances: Figures,
     margin: float,
 ) -> Combination | None:
-    """Return the cheapest other combination that may be as good as the best run; None: none.
+    """Return the cheapest untested combination that is cheaper than the best run and may be as
+    good.
 
-    The errors of a method are those of its worst case, so that their sum overestimates the errors
-    of the system. The ratio of measured to predicted errors of the best run corrects this.
+    Returns None if there is no such combination. The errors of a method are those of its worst
+    case, so that their sum overestimates the errors of the system. This is corrected by the ratio
+    of measured to predicted errors of the best run.
     """
     allowed = {metric: (1.0 - margin) * limit for metric, limit in tolerances.items()}
     limits = _relax(allowed, [best.measured])
@@ -359,7 +375,8 @@ def _find_cheaper(
 def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figures) -> Combination:
     """Return the cheapest combination whose predicted metrics are within the attainable limits.
 
-    If there is none, return the one with the smallest excess.
+    limits: wanted limits, which are raised to the values that can be attained. If no combination is
+    within all limits, return the combination with the smallest excess.
     """
     predicted = [predict(one, unexplained) for one in left]
     attainable = _relax(limits, predicted)
@@ -371,12 +388,16 @@ def _propose(left: Sequence[Combination], unexplained: Unexplained, limits: Figu
 
 
 def _outside(combination: Combination) -> float:
-    """Return the sum of the fractions of cases that are out of the methods' ranges."""
+    """Return the sum, over all methods, of the fractions of cases that are out of range."""
     return sum(option.outside for option in combination.values())
 
 
 def _relax(limits: Figures, found: Sequence[Figures]) -> Figures:
-    """Raise each limit to the smallest value found, plus its spread, if the limit is smaller."""
+    """Raise the limits that are below the attainable values, and return the limits.
+
+    found: metrics of the combinations. A returned limit is at least the smallest value found,
+    multiplied by the ratio up to which two values are considered equal.
+    """
     return {
         metric: max(
             limit,
@@ -392,9 +413,9 @@ def _equal_ratio(metric: SystemMetric) -> float:
 
 
 def _sum_excess(figures: Figures, limits: Figures) -> float:
-    """Return the sum of the logarithms of value / limit over the metrics that exceed their limit.
+    """Return the sum of log(value / limit) over the metrics that exceed their limit.
 
-    Return infinity if a value is not a number.
+    Returns infinity if a value is not a number.
     """
     ratios = excess(figures, limits).values()
     return math.inf if any(map(math.isnan, ratios)) else sum(map(math.log, ratios))

@@ -33,7 +33,7 @@ NODE_PARAMETERS: Mapping[str, tuple[str, str]] = {
     "correction": ("renderer", "correction"),
     "compliance": ("planner", "compliance_mode"),
 }
-"""The node type, and its parameter that selects the method, for each key of `Methods`."""
+"""The node type and the node parameter that select the method, by key of `Methods`."""
 
 NODE_DEFAULTS = Methods(
     marker="subpixel_fit",
@@ -43,7 +43,7 @@ NODE_DEFAULTS = Methods(
     correction="two_pass",
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.003),
 )
-"""The methods that the nodes use if the scene contains no choice."""
+"""The methods that the nodes use if the scene does not choose methods."""
 
 PAPER = Methods(
     marker="moments",
@@ -54,12 +54,17 @@ PAPER = Methods(
     soft_body=SoftBodyChoice(method="linear", skin_spacing_m=0.0045),
     compliance="stiffness",
 )
-"""The methods of Furukawa et al. 2007, sections III and IV: no filter, linear FEM, four triangles,
-and stiffness rendered by the sheet's stretch only."""
+"""The methods of Furukawa et al. 2007, sections III and IV.
+
+These are no filter, linear FEM, four triangles, and stiffness rendered only by the stretch of the
+sheet.
+"""
 
 PAPER_PLANNER = {"prediction_horizon_s": 0.0}
-"""The parameters of the planner for the same paper, which does not compensate the delay (section
-V-C)."""
+"""The parameters of the planner for the methods of Furukawa et al. 2007.
+
+They do not compensate the delay (section V-C).
+"""
 
 FINEST = NODE_DEFAULTS.model_copy(
     update={
@@ -71,7 +76,7 @@ FINEST = NODE_DEFAULTS.model_copy(
 
 @dataclass(frozen=True, slots=True)
 class Configuration:
-    """The methods of all nodes, with further parameters of the planner by name."""
+    """A choice of methods for all nodes, with further parameters of the planner by name."""
 
     name: str
     methods: Methods
@@ -97,9 +102,10 @@ class Configuration:
         ]
 
     def prepare(self, scene: Scene, progress: Callable[[str], None]) -> None:
-        """Compute and cache the tables that the methods need; that of a soft body takes minutes.
+        """Compute and cache the tables that the methods need.
 
-        Otherwise other methods would be measured, because nodes replace a missing table.
+        Nodes replace missing tables by other methods, which would then be measured. The table of a
+        soft body takes minutes.
         """
         if self.methods.sheet_shape == "reduced_order" and scene.projector is not None:
             precompute_deflection_shapes(scene, None, progress)
@@ -110,12 +116,12 @@ class Configuration:
             precompute_soft_body(scene, body.skin_spacing_m, None, None, progress)
 
     def describe(self) -> dict[str, Any]:
-        """Return methods and parameters of the planner, for a trial in simulated time."""
+        """Return the methods and the planner's parameters, in the format of a sweep's trial."""
         return {"methods": self.methods.model_dump(mode="json"), "planner": dict(self.planner)}
 
 
 def choose_cheapest(scene: Scene) -> Methods:
-    """Return for each method family the cheapest method that covers the scene's working range.
+    """Return the cheapest method of each family whose range covers the scene's working range.
 
     Errors are not considered. If no method of a method family has a sufficient range, the method
     with the largest range is returned.
@@ -145,7 +151,7 @@ def choose_cheapest(scene: Scene) -> Methods:
 
 
 def choose_tuned(scene: Scene) -> Methods:
-    """Return for each method family the scene's method, or else the default of the nodes."""
+    """Return the method that the scene chooses for each family, or the default of the nodes."""
     chosen = scene.methods.model_dump(exclude_none=True)
     return Methods.model_validate(NODE_DEFAULTS.model_dump() | chosen)
 
@@ -153,15 +159,15 @@ def choose_tuned(scene: Scene) -> Methods:
 TUNED = "tuned"
 NAMES = ("paper", "cheapest in range", "default", TUNED, "most exact")
 CONTROL = TUNED
-"""The configuration with which the others are compared; it runs twice in each block."""
+"""The name of the configuration with which others are compared; it runs twice in each block."""
 
 CONTROL_AGAIN = "tuned, again"
 
 
 def list_configurations(scene: Scene) -> list[Configuration]:
-    """Return the compared configurations for a scene.
+    """Return the configurations that are compared for a scene.
 
-    If the scene names no methods, "tuned" equals "default".
+    If the scene chooses no methods, "tuned" equals "default".
     """
     tuned = choose_tuned(scene)
     found = [
@@ -175,7 +181,7 @@ def list_configurations(scene: Scene) -> list[Configuration]:
 
 
 def select_configurations(scene: Scene, names: Collection[str]) -> list[Configuration]:
-    """Return the configurations with these names, or all for no names, and always the control.
+    """Return the configurations with the given names and the control; return all if none is given.
 
     Raises ExperimentError for an unknown name.
     """
@@ -187,7 +193,8 @@ def select_configurations(scene: Scene, names: Collection[str]) -> list[Configur
 
 
 def write_launch_file(launch_file: Path, scene_file: Path, target: Path) -> Path:
-    """Write a copy of a launch file with a different scene; relative paths become absolute."""
+    """Write a copy of a launch file with another scene; relative paths in the copy become
+    absolute."""
     with edit_yaml(launch_file, target) as launch:
         launch["scene"] = str(scene_file.resolve())
         launch.pop("record", None)

@@ -15,7 +15,7 @@ MAX_LOAD_PER_CORE = 0.5
 
 
 def replace_non_finite(value: Any) -> Any:
-    """Replace NaN and infinity, which JSON does not support, by None in nested values."""
+    """Replace NaN and infinity by None in nested values, because JSON does not support them."""
     if isinstance(value, dict):
         return {key: replace_non_finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -26,7 +26,7 @@ def replace_non_finite(value: Any) -> Any:
 
 
 def machine_name() -> str:
-    """Return the processor, number of cores and Python version in one line."""
+    """Return one line with processor name, number of cores and Python version."""
     name = platform.processor() or platform.machine()
     if CPU_INFO.exists():
         lines = [line for line in CPU_INFO.read_text().splitlines() if "model name" in line]
@@ -35,7 +35,7 @@ def machine_name() -> str:
 
 
 def describe_load() -> str | None:
-    """Return a warning if other processes load the computer too much for timings, else None."""
+    """Return a warning if other processes make timings unreliable; otherwise return None."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
     if load <= MAX_LOAD_PER_CORE * cores:
         return None

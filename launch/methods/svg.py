@@ -1,4 +1,4 @@
-"""Save figures as SVG for light and dark pages."""
+"""Save figures as SVG files that are legible on light and dark pages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ INK, DARK_INK = "#1f2328", "#e6edf3"
 """The colours of axes and text on light and on dark pages."""
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#8c6bb1", "#7f7f7f")
-"""The colours that people with colour vision deficiency can distinguish (after Okabe and Ito)."""
+"""The colours of lines, which people with colour vision deficiency can distinguish.
+
+They are adapted from Okabe and Ito.
+"""
 
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK,
@@ -48,7 +51,7 @@ _DARK = f"""<style>
 
 @contextmanager
 def page_style() -> Iterator[None]:
-    """Set a figure style whose colours `save_svg` can replace on dark pages."""
+    """Set a matplotlib style whose colours `save_svg` can replace on dark pages."""
     import matplotlib as mpl
     from matplotlib.rcsetup import cycler
 
@@ -58,7 +61,7 @@ def page_style() -> Iterator[None]:
 
 
 def render_svg(figure: Figure) -> str:
-    """Return the figure as SVG text. Background is transparent; text is light on dark pages."""
+    """Return the figure as SVG text with transparent background, and light text on dark pages."""
     text = StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     head, tag, rest = text.getvalue().partition("<defs>")
@@ -66,5 +69,5 @@ def render_svg(figure: Figure) -> str:
 
 
 def save_svg(figure: Figure, path: Path) -> None:
-    """Write a figure to an SVG file for light and dark pages; see `render_svg`."""
+    """Write a figure to an SVG file that is legible on light and dark pages."""
     write_file(path, render_svg(figure))

@@ -1,10 +1,10 @@
-"""Measure speed and accuracy of the whole system for several configurations of its methods.
+"""Measure the speed and accuracy of the whole system for several configurations of its methods.
 
 Processor use and latency are measured in the running graph (`experiments/system_run.py`). A block
 contains all configurations; results are medians over blocks with their confidence intervals. Errors
-are 95 % values, computed in simulated time (`experiments/system_errors.py`) for the nominal
-apparatus (true parameters of the simulated hardware) and for random apparatuses. Each trial is a
-separate process.
+are 95 % values, computed in simulated time (`experiments/system_errors.py`). They are computed for
+the nominal apparatus (true parameters of the simulated hardware) and for random apparatuses. A
+trial is a separate process.
 """
 
 from __future__ import annotations
@@ -49,18 +49,17 @@ NOMINAL = "errors-nominal"
 """The name of the trial that computes the errors with the nominal apparatus."""
 
 FIRST_SEED = 100
-"""The seed of the first random apparatus; smaller seeds are for development."""
+"""The seed of the first random apparatus; smaller seeds are reserved for development."""
 
 ORDER_SEED = 19
 FINGER_SEED = 5200
-"""The random seed of the finger in the first block; charts of method families do not use it."""
+"""The random seed of the finger in the first block; other charts use different seeds."""
 
 ERRORS = ("sheet_mm", "image_mm", "force_percent", "fingertip_mm")
 LATENCIES = ("exposure_to_arm_ms", "exposure_to_light_ms")
 QUANTILES = ("p50", "p95", "p99")
 COMPARED = ("cpu_cores", "exposure_to_arm_ms.p50", "exposure_to_light_ms.p50")
-"""The keys of the speed values that are compared with the control configuration in the same block.
-"""
+"""The keys of the speed values for which ratios to the control configuration are computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +81,10 @@ class SceneTrials:
 def describe_errors(
     launch: Path, configurations: Sequence[Configuration], apparatus: str | None, seconds: float
 ) -> dict[str, Any]:
-    """Describe a trial that computes the errors of configurations with one apparatus."""
+    """Return the description of a trial that computes errors of configurations with one apparatus.
+
+    seconds: duration of the stroke.
+    """
     return {
         "kind": "system errors",
         "launch_file": str(launch),
@@ -102,7 +104,11 @@ def plan_trials(
     apparatuses: int,
     configurations: Sequence[str] = (),
 ) -> SceneTrials:
-    """Describe the trials of one scene: errors first, then the blocks in random order."""
+    """Return the trials of one scene: first the errors, then the blocks in random order.
+
+    blocks: number of repetitions. seconds: duration of each stroke. apparatuses: number of random
+    apparatuses.
+    """
     scene = load_scene(scene_file)
     return plan_configurations(
         scene_file,
@@ -123,7 +129,8 @@ def plan_configurations(
     seconds: float,
     apparatuses: int = 0,
 ) -> SceneTrials:
-    """Describe the trials of some configurations; the control, if among them, runs twice."""
+    """Return the trials of the chosen configurations; the control configuration runs twice per
+    block."""
     folder.mkdir(parents=True, exist_ok=True)
     launch = write_launch_file(DEMO_FILE, scene_file, folder / "launch.yaml").resolve()
     graph = load_graph(launch)
@@ -155,15 +162,16 @@ def plan_configurations(
 
 
 def _set_seed(graph: ResolvedGraph, block: int) -> list[str]:
-    """Return settings that give the finger the same random motion in all runs of a block."""
+    """Return launch settings with which the finger has the same random motion in all runs of a
+    block."""
     seed = FINGER_SEED + block
     return [f"{node.name}.seed={seed}" for node in graph.nodes_of_type("twin_finger")]
 
 
 def run_scene(planned: SceneTrials, folder: Path, progress: Progress) -> dict[str, Row]:
-    """Run the trials that have no result yet; return all results by trial name.
+    """Run the trials that have no result yet, and return all results by trial name.
 
-    Tables of the sheet that the methods need are computed before.
+    Tables of the sheet that the methods need are computed first.
     """
     for one in planned.configurations:
         one.prepare(planned.scene, progress)
@@ -180,7 +188,7 @@ def run_system_chart(
     apparatuses: int,
     configurations: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Measure the configurations for all scenes; return the result of `chart system --json`.
+    """Measure the configurations for all scenes, and return the result of `chart system --json`.
 
     blocks: number of repetitions per scene. seconds: duration of each stroke. apparatuses: number
     of random apparatuses.
@@ -231,7 +239,7 @@ def run_system_chart(
 
 
 def read_value(row: Row, key: str) -> float:
-    """Return the value at a key of a result row, such as "sheet_mm.p95"; NaN if it is missing."""
+    """Return the value at a dotted key of a result row, such as "sheet_mm.p95"; NaN if missing."""
     found: Any = row
     for part in key.split("."):
         found = None if found is None else found.get(part)
@@ -239,7 +247,7 @@ def read_value(row: Row, key: str) -> float:
 
 
 def list_tolerances(scene: Scene) -> dict[str, float]:
-    """Return the scene's tolerances, by the keys of the values in the result row of a trial."""
+    """Return the scene's tolerances, by the keys of the corresponding values in a result row."""
     limits = {f"{metric.value}.p95": limit for metric, limit in metric_tolerances(scene).items()}
     return limits | {
         "exposure_to_arm_ms.p95": 1e3 * scene.tolerances.latency_s,
@@ -248,7 +256,7 @@ def list_tolerances(scene: Scene) -> dict[str, float]:
 
 
 def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[str, Any]]:
-    """Summarize each configuration of a scene in a point of the chart.
+    """Summarize each configuration of a scene as a point of the chart.
 
     Configurations without a successful run are omitted.
     """
@@ -273,7 +281,7 @@ def summarize_scene(planned: SceneTrials, rows: Mapping[str, Row]) -> list[dict[
 
 
 def _good(rows: Mapping[str, Row], name: str) -> Row:
-    """Return the result row of a trial, or an empty row if the trial failed."""
+    """Return the result row of a trial; return an empty row if the trial failed."""
     row = rows.get(name, {})
     return {} if "error" in row else row
 
@@ -285,11 +293,11 @@ def summarize_configuration(
     errors: Row,
     random: Sequence[Row],
 ) -> dict[str, Any]:
-    """Summarize one configuration in a point of the chart.
+    """Summarize one configuration as one point of the chart.
 
     rows: processor use and latencies by configuration and block. errors, random: errors with the
-    nominal apparatus and with each random one. Ratios to the control use all blocks in which both
-    have a row.
+    nominal apparatus and with each random apparatus. Ratios to the control are computed from all
+    blocks in which both configurations have a row.
     """
     own, control = rows[name], rows.get(CONTROL, {})
     blocks = sorted(own)
@@ -357,12 +365,12 @@ def summarize_configuration(
 
 
 def upper_limit(one: Interval) -> float:
-    """Return the upper limit of an interval, or its value if it is infinite (a single block)."""
+    """Return the upper limit of an interval; if the limit is infinite, return the central value."""
     return one.high if np.isfinite(one.high) else one.value
 
 
 def scale(one: Interval, factor: float) -> Interval:
-    """Multiply an interval by a factor in order to convert its unit."""
+    """Multiply a value and its interval by a factor, to convert the unit."""
     return Interval(one.value * factor, one.low * factor, one.high * factor)
 
 
@@ -381,7 +389,7 @@ def _median_by_key(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
 
 def worst_ratio(point: Mapping[str, Any]) -> Interval:
-    """Return the largest ratio of an error of a point to its tolerance; latencies do not count."""
+    """Return the largest ratio of error to tolerance of a point; latencies are ignored."""
     ratios = [
         Interval(**one)
         for key, one in point["tolerance_ratios"].items()
@@ -391,7 +399,7 @@ def worst_ratio(point: Mapping[str, Any]) -> Interval:
 
 
 def find_system_front(points: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the names of a scene's configurations on the Pareto front.
+    """Return the names of a scene's configurations that are on the Pareto front.
 
     Costs are the latency from exposure to arm, the processor cores, and the worst error relative to
     its tolerance.

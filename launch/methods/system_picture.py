@@ -1,4 +1,4 @@
-"""Draw the chart of `flexsheet chart system`: error over speed, and the error budget."""
+"""Draw the chart of `flexsheet chart system`: error against latency, and the error budget."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ NAMES = {
     "fingertip_mm": "fingertip",
 }
 MIN_RATIO = 0.03
-"""The minimum of the drawn ratios of error to tolerance."""
+"""The minimum ratio of error to tolerance on the axis of the chart."""
 
 ROW_HEIGHT = 4.2
 
 
 def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
-    """Draw one row of two diagrams per scene and save it as SVG.
+    """Draw one row of two diagrams per scene, and save the figure as SVG.
 
     The left diagram shows the worst error against the latency, the right diagram shows all errors
-    of each configuration. Filled points meet all tolerances, crosses do not. Bars are 95 %
-    confidence intervals.
+    of each configuration. Filled points meet all tolerances; crosses exceed a tolerance. Bars are
+    95 % confidence intervals.
     """
     from matplotlib.figure import Figure
 
@@ -57,7 +57,10 @@ def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
 def _draw_front(
     axes: Axes, scene: str, points: Sequence[Mapping[str, Any]], front: set[str]
 ) -> None:
-    """Draw the worst ratio of error to tolerance against the latency from exposure to arm."""
+    """Draw the worst ratio of error to tolerance against the latency from exposure to arm command.
+
+    front: names of the points on the Pareto front.
+    """
     corners = []
     for colour, point in zip(COLOURS, points, strict=False):
         name, latency = point["configuration"], point["exposure_to_arm_ms"]
@@ -96,7 +99,7 @@ def _draw_front(
 
 
 def _allowed_ms(points: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the scene's maximum latency (ms) from exposure to arm command; None if unknown."""
+    """Return the scene's maximum latency (ms) from exposure to arm command; None if it has none."""
     key = "exposure_to_arm_ms.p95"
     for point in points:
         if key in point["spread"] and point["tolerance_ratios"][key]["value"] > 0.0:
@@ -111,9 +114,9 @@ def _failing(point: Mapping[str, Any]) -> str:
 
 
 def _bars(one: Interval, y: float) -> list[list[float]] | None:
-    """Return the lengths of the error bars below and above y.
+    """Return the lengths of the error bars below and above the value y.
 
-    Return None if there is no finite interval.
+    Returns None if the interval is not finite.
     """
     if not np.isfinite([one.low, one.high]).all():
         return None

@@ -1,9 +1,9 @@
-"""Choose the fastest sufficient method of each method family, and write it into the scene.
+"""Choose the fastest sufficient method of each method family, and write the choices to the scene.
 
 A method family contains interchangeable methods for one task. The methods are measured on this
 computer over the scene's working range. A method is sufficient if its stated range contains the
-working range, and its maximum error keeps a margin to the scene's tolerance. If no method is
-sufficient, the one closest to it is chosen and reported.
+working range, and its maximum error is below the scene's tolerance by a margin. If no method is
+sufficient, the best insufficient method is chosen and reported.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from flexsheet.nodes.methods import Family, Point, Trial
 
 REPEATS = 10
 MARGIN = 0.2
-"""The fraction of a tolerance that is reserved for errors in cases that are not measured."""
+"""The fraction of a tolerance that is reserved for errors in cases that were not measured."""
 TIE_RATIO = 1.1
-"""The maximum ratio of a method's time to the fastest time at which both count as equally fast.
+"""The ratio of the times of two methods below which both are considered equally fast.
 
 Of equally fast methods, the most accurate one is chosen.
 """
@@ -54,7 +54,7 @@ Setting = str | dict[str, Any]
 
 
 class UnknownTunableError(FlexsheetError, KeyError):
-    """Raised for the name of a method family that cannot be tuned in a scene."""
+    """Raised if a method family does not exist, or cannot be tuned in the scene."""
 
     code = "unknown-tunable"
     remedy = "Use one of the names that the error lists (docs/tune.md)."
@@ -64,11 +64,11 @@ class UnknownTunableError(FlexsheetError, KeyError):
 class Tunable:
     """A method family whose method can be chosen in a scene.
 
-    families: locations `module:NAME` of the `Family` objects that it consists of, in the order of
-    measurement. Later parts take minutes to prepare, and are measured only if no earlier method is
-    sufficient. settings: value to write into the scene for each method, by the method's name in the
-    chart of the method family. required_key: dotted key of the scene without which no node uses
-    the family.
+    families: locations `module:NAME` of the `Family` objects that form the method family, in the
+    order of measurement. Later objects take minutes to prepare, and are measured only if no earlier
+    method is sufficient. settings: value to write into the scene, by the method's name in the
+    chart. required_key: dotted key that a scene must have; otherwise no node uses the method
+    family.
     """
 
     name: str
@@ -78,7 +78,7 @@ class Tunable:
 
     @property
     def key(self) -> str:
-        """Return the key of the method family in the scene's `methods`."""
+        """Return the key of the method family in the mapping `methods` of a scene."""
         return self.name.replace("-", "_")
 
     def is_used(self, scene: Scene) -> bool:
@@ -87,7 +87,8 @@ class Tunable:
 
 
 def _make_settings(methods: object) -> dict[str, Setting]:
-    """Return the settings for all method names of a `Literal` type in `messages.methods`."""
+    """Return the scene settings of all methods that a `Literal` type in `messages.methods`
+    names."""
     return {name: name for name in get_args(methods)}
 
 
@@ -133,8 +134,10 @@ TUNABLES = (
         required_key=MATERIAL,
     ),
 )
-"""The tunable method families in the order of tuning. The sheet shape precedes the image
-correction, whose settings depend on it."""
+"""The tunable method families in the order of tuning.
+
+The sheet shape precedes the image correction, whose settings depend on the sheet shape.
+"""
 
 TWO_PASS_NAMES = {
     "four_triangles": "two_pass_triangles",
@@ -144,7 +147,7 @@ TWO_PASS_NAMES = {
 
 
 def find_tunables(names: Sequence[str], scene: Scene) -> list[Tunable]:
-    """Return the tunable method families that the scene uses, in tuning order.
+    """Return the tunable method families that the scene uses, in the order of tuning.
 
     names: names of the method families; if empty, all are returned. Raises UnknownTunableError for
     an unknown name, and for a family that the scene does not use.
@@ -197,10 +200,10 @@ class MethodEvaluation:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The choice of one method of a method family, with the evaluations of all measured methods.
+    """The chosen method of a method family, with the evaluations of all measured methods.
 
-    composed: whether the method was chosen for the errors of the whole system, so that the
-    tolerance of its method family does not decide.
+    composed: whether the method was chosen for the errors of the whole system. In this case, the
+    tolerance of the method family alone does not determine the choice.
     """
 
     family: str
@@ -217,11 +220,12 @@ class Choice:
 
     @property
     def spare_ratio(self) -> float:
-        """Return the fraction of the tolerance that remains; negative if the error exceeds it."""
+        """Return the remaining fraction of the tolerance; it is negative if the error is too
+        large."""
         return 1.0 - self.chosen.error / self.tolerance
 
     def explain(self) -> str:
-        """Return one sentence for the user that gives the reason for the choice."""
+        """Return a sentence that states the chosen method and the reason for the choice."""
         if self.composed:
             return self._explain_composed()
         one, unit = self.chosen, self.unit
@@ -264,7 +268,7 @@ class Choice:
         return " and ".join(parts)
 
     def report(self) -> dict[str, Any]:
-        """Return the choice as `flexsheet tune --json` prints it."""
+        """Return the choice in the format of `flexsheet tune --json`."""
         return {
             "family": self.family,
             "key": self.key,
@@ -300,9 +304,9 @@ def evaluate_methods(
     tolerance: float,
     margin: float = MARGIN,
 ) -> list[MethodEvaluation]:
-    """Evaluate each method of `settings` over the measured cases in the scene's working range.
+    """Evaluate the methods in `settings` over all measured cases in the scene's working range.
 
-    tolerance, margin: maximum error, and the fraction of it that must remain.
+    tolerance: maximum error. margin: fraction of the tolerance that must remain.
     """
     allowed, evaluations = (1.0 - margin) * tolerance, []
     for method, setting in settings.items():
@@ -331,7 +335,11 @@ def evaluate_methods(
 
 
 def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
-    """Return the fastest sufficient method; if there is none, the one closest to sufficient."""
+    """Return the fastest method that meets the tolerance over the working range.
+
+    If several methods are equally fast, the most accurate one is returned. If no method is
+    sufficient, the method with the fewest cases out of range is returned.
+    """
     sufficient = [one for one in evaluations if one.meets]
     if not sufficient:
         return min(evaluations, key=_miss_key)
@@ -341,7 +349,8 @@ def choose(evaluations: Sequence[MethodEvaluation]) -> MethodEvaluation:
 
 
 def _miss_key(one: MethodEvaluation) -> tuple[int, int, float, float]:
-    """Return a key that sorts insufficient methods, first by their number of cases out of range."""
+    """Return a sort key for insufficient methods; methods with fewer cases out of range come
+    first."""
     return len(one.outside), one.missed, one.error, one.median_s
 
 
@@ -353,10 +362,11 @@ def tune(
     measure: Measure | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Choice]:
-    """Measure the methods of each family in order, and choose one of each.
+    """Measure the methods of all given families in order, and choose one method per family.
 
-    measure: function that replaces the measurement in tests. Passes on the errors of method
-    families that do not support the scene's shape, mesh or sheet.
+    margin: fraction of each tolerance that is reserved. measure: function that replaces the
+    measurement in tests. Errors of method families that do not support the scene's shape, mesh or
+    sheet are raised.
     """
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
@@ -379,7 +389,7 @@ def tune(
 
 
 def find_choice(choices: Sequence[Choice], family: str) -> Choice | None:
-    """Return the choice for a method family; None if it was not tuned."""
+    """Return the choice for a method family; None if the family was not tuned."""
     return next((one for one in choices if one.family == family), None)
 
 
@@ -455,8 +465,9 @@ def insert_choices(
     """Return the text of a scene file with the choices inserted in its mapping `methods`.
 
     All other text is unchanged, including the methods of other method families. If `methods` is a
-    mapping on one line, it is expanded to several lines. unmet: system metrics that exceed their
-    tolerance, and stages out of their range, for the comment.
+    mapping on one line, it is expanded to several lines. today, machine, commit: values for the
+    generated comment. unmet: system metrics that exceed their tolerance, and stages out of their
+    range, for the comment.
     """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
@@ -501,8 +512,9 @@ class _Block:
     """The block `methods` of a scene file, with the indices of its lines.
 
     start: first line, including the generated comment above it. end: line after the block. If the
-    file has no such block, both are the end of the file. header: the line `methods:`, if it can be
-    reused. parts: key and lines of each method family, in order; comments have an empty key.
+    file has no such block, both are the end of the file. header: the line `methods:` if it can be
+    reused, otherwise empty. parts: key and lines of each method family, in order; comments have an
+    empty key.
     """
 
     start: int
@@ -556,7 +568,7 @@ FILES = (("object", "geometry", "file"), ("object", "appearance", "image_file"))
 
 
 def relocate_paths(text: str, source: Path, target: Path) -> str:
-    """Return the text of a scene file with its relative paths adapted to the target's folder.
+    """Return the text of a scene file with relative paths that are valid in the target's folder.
 
     Raises BadInputError if a path in the text cannot be replaced.
     """
@@ -585,7 +597,10 @@ def relocate_paths(text: str, source: Path, target: Path) -> str:
 
 
 def check_target(source: Path, target: Path) -> None:
-    """Check before a long measurement that the target can be written; else raise BadInputError."""
+    """Raise BadInputError if the target cannot be written.
+
+    The check runs before a long measurement, so that its result is not lost.
+    """
     relocate_paths(_read(source), source, target)
     try:
         if target.is_dir():
@@ -620,9 +635,9 @@ def write_choices(
 ) -> None:
     """Write the choices atomically into a scene file or into a copy of it.
 
-    unmet: as in `insert_choices`. If the file is a symbolic link, the file that it points to is
-    written. Raises BadInputError if other parts of the scene would change, or the target cannot be
-    written.
+    source: scene file. target: file to write; if it is a symbolic link, the file that it points to
+    is written. unmet: as in `insert_choices`. Raises BadInputError if other parts of the scene
+    would change, or if the target cannot be written.
     """
     text = insert_choices(
         relocate_paths(_read(source), source, target),
@@ -657,7 +672,10 @@ def write_choices(
 
 
 def _load_draft(draft: Path, source: Path) -> Scene:
-    """Load the draft; report problems as problems of the source file, which users know."""
+    """Load a temporary copy of a scene file that contains the choices.
+
+    Errors name the source file instead of the copy, which the user does not know.
+    """
     try:
         return load_scene(draft)
     except BadInputError as error:

@@ -1,4 +1,4 @@
-"""Choose methods so that the whole system meets its tolerances, and verify this by running it."""
+"""Choose methods with which the whole system meets its tolerances, and verify them in the graph."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ from flexsheet.nodes.methods import Point, Trial
 from flexsheet.nodes.triangulator.tracking_benchmark import HORIZON_MS, make_tracking_family
 
 RENDERED_HZ = 30.0
-"""The maximum frame rate of the renderer in `launch/demo.yaml`."""
+"""The maximum frame rate of the renderer in `launch/demo.yaml`, in hertz."""
 
 IMAGES = 2
-"""The number of images per exposure in which the marker is searched."""
+"""The number of images per exposure in which the marker is detected."""
 
 STROKE_S = 10.0
 MeasureTracking = Callable[[Scene, float], Sequence[MethodEvaluation]]
@@ -63,7 +63,7 @@ def list_tolerances(scene: Scene) -> dict[SystemMetric, float]:
 
 
 def measure_tracking(scene: Scene, noise_px: float) -> list[MethodEvaluation]:
-    """Measure the tracking methods with marker noise of `noise_px` (pixels)."""
+    """Measure the tracking methods with marker noise of `noise_px` (standard deviation, pixels)."""
     from flexsheet.launch.methods.benchmarks import make_finger_motions
 
     family = make_tracking_family(make_finger_motions, noise_px)
@@ -81,9 +81,9 @@ def make_stages(
 ) -> dict[str, list[StageOption]]:
     """Return the methods of each tuned method family, with the errors that they add to the system.
 
-    Tracking is measured with the noise of each marker method. Its error at the exposure counts for
-    the fingertip, and its error at the longest prediction horizon for the sheet. The image
-    correction was measured with the chosen sheet shape only.
+    Tracking is measured with the noise of each marker method. Its error at the exposure adds to the
+    fingertip's error, and its error at the longest prediction horizon adds to the sheet's error.
+    The image correction was measured only with the chosen sheet shape.
     """
     stages: dict[str, list[StageOption]] = {}
     for choice in choices:
@@ -135,10 +135,7 @@ def _make_option(
 
 
 def _largest(points: Sequence[Point], value: Callable[[Point], float]) -> float:
-    """Return the largest finite absolute value at the points in the method's range.
-
-    Return 0 if there are no such points.
-    """
+    """Return the largest finite absolute value over the points in the method's range; 0 if none."""
     found = [abs(value(point)) for point in points if point.in_range]
     return max((one for one in found if math.isfinite(one)), default=0.0)
 
@@ -178,7 +175,7 @@ def _make_tracking(scene: Scene, one: MethodEvaluation, given: Mapping[str, str]
 
 
 def _outside(one: MethodEvaluation) -> float:
-    """Return the fraction of the cases out of the method's range; 1 if it has no reference."""
+    """Return the fraction of cases that are out of the method's range; 1 if it has no reference."""
     return len(one.outside) / one.cases if math.isfinite(one.error) else 1.0
 
 
@@ -187,7 +184,7 @@ def _error(point: Point) -> float:
 
 
 def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> list[Choice]:
-    """Replace the chosen method in each choice by that of `methods`; return the new choices."""
+    """Return the choices with the chosen method of each family replaced by the one in `methods`."""
     return [
         replace(
             choice,
@@ -199,7 +196,10 @@ def choose_methods(choices: Sequence[Choice], methods: Mapping[str, str]) -> lis
 
 
 def make_methods(scene: Scene, choices: Sequence[Choice]) -> Methods:
-    """Return the chosen methods; for other method families those of the scene or the defaults."""
+    """Return the methods for a configuration of the scene.
+
+    Families without a choice have the method of the scene, or else the default.
+    """
     chosen = {choice.key: choice.chosen.setting for choice in choices}
     return Methods.model_validate(choose_tuned(scene).model_dump() | chosen)
 
@@ -216,8 +216,9 @@ def tune_system(
 ) -> tuple[Composition, list[Choice]]:
     """Find the cheapest combination of measured methods that meets the tolerances of the system.
 
-    Return the search result, and the choices for the scene. runs: number of runs per combination,
-    of which the largest 95 % value counts. Raises ExperimentError if all runs of one fail.
+    Returns the search result, and the choices for the scene. runs: number of runs per combination;
+    the largest 95 % value of these runs is used. Raises ExperimentError if all runs of a
+    combination fail.
     """
     scene = load_scene(scene_file)
     progress("measuring the tracking with the noise of each marker method")
@@ -241,9 +242,10 @@ def run_proposal(
     *,
     runs: int,
 ) -> Figures:
-    """Return each metric of a configuration: the 95 % error in simulated time, or the latency.
+    """Return the system metrics of a configuration.
 
-    The latency is the largest 95 % value of `runs` runs of the graph.
+    Errors are 95 % values in simulated time. A latency is the largest 95 % value of `runs` runs of
+    the graph.
     """
     planned = plan_configurations(
         scene_file, [configuration], folder, blocks=runs, seconds=STROKE_S
