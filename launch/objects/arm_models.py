@@ -1,11 +1,11 @@
-"""Read the arms of a scene file that refers to URDF files.
+"""Read the arm models of a scene file that refers to URDF files.
 
 A scene file may give the model of an arm as
 
 model: {urdf: ur5e.urdf, base: base_link, tip: tool0, start_rad: [...]}
 
-with a path relative to the scene file. The scene message contains the resulting joint chain,
-so only the computer that reads the scene file needs the package yourdfpy.
+with a path relative to the scene file. The scene message contains the resulting joint chain.
+Therefore only the computer that reads the scene file needs the package yourdfpy.
 """
 
 from __future__ import annotations
@@ -26,18 +26,21 @@ from flexsheet.nodes.models.rigid import rpy_from_rotation
 JOINTS = 6
 MAX_BYTES = 4 << 20
 CONTINUOUS_RANGE_RAD = 2.0 * np.pi
-"""The assumed range (+-) of a joint without limits, which protects the cables: one revolution."""
+"""The assumed range of a joint without limits: one revolution in both directions.
+
+This range protects the cables of the arm.
+"""
 
 
 class UrdfError(FlexsheetError, ValueError):
-    """The error that is raised for a URDF file that does not describe a usable arm."""
+    """Raised if a URDF file does not describe a usable arm."""
 
     code = "urdf"
     remedy = "Correct the URDF file or the links `base` and `tip` of the scene file."
 
 
 class UrdfArm(LimitedModel):
-    """A model of an arm in a scene file that refers to a URDF file."""
+    """The model of an arm in a scene file that refers to a URDF file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -52,7 +55,7 @@ class UrdfArm(LimitedModel):
 def load_arm_models(document: Document) -> None:
     """Replace references to URDF files in a parsed scene file by joint chains.
 
-    Raises BadInputError for an invalid reference or file.
+    Raises BadInputError if a reference or a URDF file is invalid.
     """
     arms = document.values.get("arms")
     for side in ("left", "right"):

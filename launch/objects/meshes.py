@@ -35,18 +35,24 @@ from flexsheet.nodes.models.shapes.triangles import (
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in GEOMETRIES if name != "mesh"), MESH_FILE)
-"""The shape names that scene files may contain. In a scene file, a mesh is a file, not arrays."""
+"""The shape names that scene files may contain.
+
+A scene file refers to a mesh by a file name, and does not contain its arrays.
+"""
 SUFFIXES = (".obj", ".stl")
 MAX_BYTES = 64 << 20
 MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0
-"""The minimum and maximum plausible extent of an object; a wrong unit gives another extent."""
+"""The minimum and maximum plausible extent of an object, in metres.
+
+An extent outside this range is probably caused by a wrong unit.
+"""
 MAX_COORDINATE = 1e9
-"""The maximum coordinate in a mesh file, in its unit, which causes no overflow."""
+"""The maximum coordinate in a mesh file, in the unit of the file, which prevents overflow."""
 
 MAX_CUTTING_RATIO = 0.01
-"""The maximum ratio of the number of intersecting triangle pairs to the number of triangles.
+"""The maximum number of intersecting triangle pairs, relative to the number of triangles.
 
-Up to this ratio, the smooth surface bridges the intersections. With more intersections, a mesh is
+Up to this ratio, the smooth surface bridges the intersections. A mesh with more intersections is
 not a solid.
 """
 
@@ -69,9 +75,9 @@ class MeshFile(LimitedModel):
 
 
 def make_scene(document: Document) -> Scene:
-    """Make the scene from a parsed scene file, including its mesh, image and arms.
+    """Make the scene message from a parsed scene file, including its mesh, image and arms.
 
-    Raises BadInputError for an invalid file.
+    Raises BadInputError if the scene file or a file in it is invalid.
     """
     name = _find_shape_name(document)
     if name is not None and name not in SHAPE_NAMES:
@@ -91,7 +97,7 @@ def make_scene(document: Document) -> Scene:
 
 
 def _find_shape_name(document: Document) -> Any:
-    """Return the name of the object's shape in a scene file, or None if it has no shape."""
+    """Return the name of the object's shape in a scene file; None if the file contains no shape."""
     value: Any = document.values
     for key in (*GEOMETRY, "shape"):
         value = value.get(key) if isinstance(value, dict) else None
@@ -99,11 +105,12 @@ def _find_shape_name(document: Document) -> Any:
 
 
 def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> Mesh:
-    """Read a closed mesh from a file, convert its unit to metres, and repair it.
+    """Read a closed mesh from a file, convert its unit to metres, and repair the mesh.
 
     Repairs merge duplicate vertices, remove degenerate and duplicate triangles and unused vertices,
-    and orient the triangles outwards. `Mesh.origin` lists the repairs. Raises MeshError for holes
-    and other faults that cannot be repaired.
+    and orient the triangles outwards. `Mesh.origin` lists the repairs. smoothing_m: smoothing
+    length of the surface; None for the default. Raises MeshError for holes and other faults that
+    cannot be repaired.
     """
     vertices, triangles, repairs = _repair(_load_trimesh(path), metres_per_unit)
     extent_m = float(np.ptp(vertices, axis=0).max())
@@ -135,7 +142,7 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
 
 
 def _load_trimesh(path: Path) -> Any:
-    """Read a mesh file as an unchanged `trimesh.Trimesh`; raise MeshError for an invalid file."""
+    """Read a mesh file as a `trimesh.Trimesh` without repairs; raise MeshError if it is invalid."""
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(
             f"the mesh format {path.suffix} is not supported; convert the file to "
@@ -167,7 +174,10 @@ def _load_trimesh(path: Path) -> Any:
 
 
 def _check_arrays(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
-    """Raise MeshError for invalid arrays that trimesh accepts."""
+    """Raise MeshError if arrays are invalid although trimesh has accepted them.
+
+    vertices: (v, 3). faces: (t, 3).
+    """
     if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
         raise MeshError("the faces are not triangles of 3D points; triangulate the mesh")
     if not (np.abs(vertices) < MAX_COORDINATE).all():
@@ -182,9 +192,10 @@ def _check_arrays(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
 def _repair(
     mesh: Any, metres_per_unit: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], list[str]]:
-    """Return vertices (v, 3), m, triangles (t, 3) and descriptions of the repairs.
+    """Repair a mesh, and convert its unit to metres.
 
-    Raises MeshError if no valid triangle remains, or if there are too many.
+    Returns vertices (v, 3) in m, triangles (t, 3), and descriptions of the repairs. Raises
+    MeshError if no valid triangle remains, or if there are too many triangles.
     """
     repairs = []
     if not len(getattr(mesh, "faces", ())):

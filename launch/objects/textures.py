@@ -1,6 +1,6 @@
 """Read and check the texture image of a scene's object.
 
-In a scene file the object may have
+In a scene file, the object may have
 
 appearance: {texture: image, image_file: marble.png}
 
@@ -23,11 +23,11 @@ APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_SIDE_PX = 2048
-"""The maximum width and height of a texture image. The projector has fewer pixels."""
+"""The maximum width and height of a texture image, in pixels; the projector has fewer pixels."""
 
 
 class TextureError(FlexsheetError, ValueError):
-    """The error that is raised if a file cannot be used as the texture of an object."""
+    """Raised if a file cannot be used as the texture of an object."""
 
     code = "texture"
     remedy = "Use a PNG or JPEG file, and a mesh with texture coordinates."
@@ -57,7 +57,7 @@ def load_image(document: Document) -> None:
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """Read an image file as RGB array (height, width, 3); raise TextureError on failure."""
+    """Read an image file as an RGB array (height, width, 3); raise TextureError if this fails."""
     if path.suffix.lower() not in SUFFIXES:
         raise TextureError(
             f"the image format {path.suffix} is not supported; convert the file to "

@@ -1,1 +1,1 @@
-"""Read, check and resolve launch files and scenes."""
+"""Read and check launch files and scenes, and resolve launch files to graphs."""

@@ -1,4 +1,4 @@
-"""Load the apparatus given by `--apparatus`, and pass it to the simulator nodes of a graph.
+"""Load the apparatus that the option `--apparatus` names, and pass it to the simulator nodes.
 
 The apparatus is the set of true parameters of the simulated hardware. The scene contains the
 parameters that the other nodes assume.
@@ -34,14 +34,14 @@ TOPIC = "twin/apparatus"
 _SEED = re.compile(r"seed:(?P<seed>\d{1,18})(?P<words>(?:,[a-z]+)*)")
 CALIBRATED = "calibrated"
 COMMISSION_STATE = "commission.json"
-"""The file that names the scene before commissioning, in the folder of the new scene."""
+"""The name of the file, in the folder of a calibrated scene, that names the original scene."""
 
 PROFILES = tuple(one.value for one in Profile)
 
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """A random sample of an apparatus, parsed from `seed:N[,modern|paper][,calibrated]`."""
+    """The specification of a random apparatus, parsed from `seed:N[,modern|paper][,calibrated]`."""
 
     seed: int
     profile: Profile
@@ -49,9 +49,9 @@ class Draw:
 
 
 def parse_draw(text: str) -> Draw | None:
-    """Parse the value of `--apparatus`; return None if the value is a file.
+    """Parse the value of `--apparatus`; return None if the value is a file name.
 
-    Raises BadInputError for an invalid random sample.
+    Raises BadInputError if the value starts like a random sample but is invalid.
     """
     if not text.startswith("seed:"):
         return None
@@ -70,10 +70,10 @@ def parse_draw(text: str) -> Draw | None:
 
 
 def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> Apparatus:
-    """Read an apparatus from a file, or sample it from a text such as "seed:7".
+    """Read an apparatus from a file, or sample a random apparatus from a text such as "seed:7".
 
     scene_file: file of the scene. If a commissioning wrote this file, uncalibrated hardware is
-    sampled around the scene before commissioning, in the world frame of the camera.
+    sampled relative to the scene before commissioning, in the world frame of the camera.
 
     Raises BadInputError if the file cannot be read, contains unknown keys or impossible values, or
     belongs to another scene.
@@ -98,7 +98,8 @@ def load_apparatus(text: str, scene: Scene, scene_file: Path | None = None) -> A
 
 
 def _load_base(scene_file: Path | None) -> Scene | None:
-    """Load the scene before commissioning; return None if no commissioning wrote the scene file."""
+    """Load the scene before commissioning; return None if the file does not result from
+    commissioning."""
     state = None if scene_file is None else scene_file.parent / COMMISSION_STATE
     if state is None or not state.is_file():
         return None
@@ -130,7 +131,7 @@ def _compare_scenes(apparatus: Apparatus, scene: Scene, document: Document) -> l
 
 
 def format_apparatus(apparatus: Apparatus) -> str:
-    """Return the YAML text of an apparatus file."""
+    """Return an apparatus as the YAML text of an apparatus file."""
     yaml = YAML()
     yaml.default_flow_style = None
     yaml.width = 4096
@@ -148,7 +149,10 @@ def give_apparatus(
     apparatus: Apparatus | None,
     document: Document,
 ) -> None:
-    """Set the apparatus as a parameter of all simulator nodes, and report problems."""
+    """Set the apparatus as a parameter of all simulator nodes.
+
+    Problems, such as an apparatus in the launch file, are stored in `document`.
+    """
     simulators = [one for one in entries if isinstance(one.parameters, SimulatorParameters)]
     for entry in simulators:
         if "apparatus" in entry.spec.parameters:
@@ -166,7 +170,8 @@ def give_apparatus(
 
 
 def refuse_apparatus_readers(entries: list[NodeEntry], document: Document) -> None:
-    """Check that only simulator nodes and the recorder read the topic of the apparatus.
+    """Report a problem if a node other than simulators and recorders reads the topic of the
+    apparatus.
 
     Other nodes must not know the true parameters, because experiments measure their errors.
     """

@@ -1,7 +1,7 @@
 """Read YAML files, and report their errors with file, line, key, value and remedy.
 
-A file is read with its line numbers and validated against a pydantic model. All errors are reported
-together as `Problem`s.
+A file is read with its line numbers and validated against a pydantic model. All errors of a file
+are reported together as `Problem` objects.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
 MAX_DEPTH = 50
 MAX_VALUES = 5000
-"""The maximum number of values in a file, which the parser reads in about one second.
+"""The maximum number of values in a YAML file; the parser reads them in about one second.
 
-The largest shipped file contains 300.
+The largest shipped file contains 300 values.
 """
 
 OPENING_TOKENS = (
@@ -74,18 +74,22 @@ SCALARS: tuple[tuple[type, type], ...] = (
     (ScalarInt, int),
     (ScalarString, str),
 )
-"""The scalar types of the YAML parser, which preserve formatting, and their Python types."""
+"""The scalar types of the YAML parser, which preserve formatting, with their Python types."""
 
 MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
 """The types of pydantic errors for values that should be mappings."""
 
 Key = tuple[str | int, ...]
-"""The path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
+"""A path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """An error in an input file: location, key, what is wrong, and what to do."""
+    """An error in an input file.
+
+    where: location, such as "file:line". key: path of the value. what: description of the error.
+    remedy: what the user should do.
+    """
 
     where: str
     key: Key
@@ -99,7 +103,7 @@ class Problem:
 
 
 class BadInputError(FlexsheetError, ValueError):
-    """The error that is raised for an input that cannot be used; `problems` lists all errors."""
+    """Raised if an input cannot be used; the attribute `problems` lists all errors."""
 
     code = "bad-input"
     exit_code = 2
@@ -113,13 +117,13 @@ class BadInputError(FlexsheetError, ValueError):
 
     @classmethod
     def single(cls, where: str, key: Key, what: str, remedy: str = "") -> Self:
-        """Return an error that contains one problem."""
+        """Make an error that contains one problem."""
         return cls([Problem(where, key, what, remedy)])
 
 
 @dataclass(slots=True)
 class Document:
-    """The values of a YAML file, with the line of every key and the origin of overridden values."""
+    """The values of a YAML file, with the line of each key and the origin of overridden values."""
 
     path: Path
     values: dict[str, Any]
@@ -131,9 +135,10 @@ class Document:
     """The source file of each key that was inherited from another file by `extend`."""
 
     def where(self, key: Key) -> str:
-        """Return the location of `key` for error texts: "file:line", or the overriding option.
+        """Return the location of `key` for error texts.
 
-        For a key without a line, return the line of its nearest parent.
+        It is "file:line", or the command-line option that overrides the value. If the key has no
+        line, the line of its nearest parent is used.
         """
         for length in range(len(key), 0, -1):
             part = key[:length]
@@ -146,8 +151,8 @@ class Document:
     def folder(self, key: Key) -> Path:
         """Return the folder to which a relative path in the value of `key` refers.
 
-        Return the folder of the file that contains `key`, or the current folder for a value that an
-        option overrides.
+        It is the folder of the file that contains `key`. For a value that a command-line option
+        overrides, it is the current folder.
         """
         if key in self.overrides:
             return Path.cwd()
@@ -155,10 +160,10 @@ class Document:
         return self.extended.get(next(known, ()), self.path).parent
 
     def extend(self, base: Document, levels: int) -> None:
-        """Inherit the values of `base` that this document does not contain.
+        """Inherit the values of the document `base` that this document does not contain.
 
-        Mappings are merged down to the depth `levels`. A deeper mapping replaces the mapping of
-        `base` completely.
+        Mappings are merged down to the depth `levels`. At greater depth, a mapping replaces the
+        mapping of `base` completely.
         """
         own = self.lines
         self.lines = {**base.lines, **own}
@@ -169,15 +174,19 @@ class Document:
         self.text = f"# {base.path}\n{base.text}\n# {self.path}\n{self.text}"
 
     def problem(self, key: Key, what: str, remedy: str = "") -> Problem:
-        """Return a problem with the location of `key` in this document."""
+        """Return a problem that is located at `key` in this document.
+
+        what: description of the error. remedy: what the user should do.
+        """
         return Problem(self.where(key), key, what, remedy)
 
     def report(self, key: Key, what: str, remedy: str = "") -> None:
-        """Store a problem, which `raise_problems` raises together with other problems."""
+        """Store a problem at `key`, so that `raise_problems` raises it together with other
+        problems."""
         self.problems.append(self.problem(key, what, remedy))
 
     def error(self, key: Key, what: str, remedy: str = "") -> BadInputError:
-        """Return an error with one problem at `key` of this document."""
+        """Return an error that contains one problem at `key` of this document."""
         return BadInputError([self.problem(key, what, remedy)])
 
     def raise_problems(self) -> None:
@@ -188,7 +197,7 @@ class Document:
     def set(self, key: Key, value: Any, origin: str) -> None:
         """Override the value at `key`, and create missing parent mappings.
 
-        origin: option that sets the value, which later errors name as the location.
+        origin: command-line option that sets the value; error texts use it as the location.
         """
         target: dict[Any, Any] = self.values
         for part in key[:-1]:
@@ -213,14 +222,14 @@ def _merge(base: Any, own: Any, levels: int) -> Any:
 def parse_value(text: str) -> Any:
     """Parse a YAML value: "3" becomes a number, "[1, 2]" a list and "yes" a string.
 
-    Raises YAMLError.
+    Raises YAMLError if the text is invalid.
     """
     return plain(_parse_tree(text))
 
 
 @lru_cache(maxsize=32)
 def _parse_tree(text: str) -> Any:
-    """Parse text into a YAML tree that includes comments.  Raises YAMLError for all errors.
+    """Parse text into a YAML tree that includes comments; raise YAMLError for all errors.
 
     Callers must not change the tree, because all calls with the same text return the same tree.
     """
@@ -237,7 +246,7 @@ def _parse_tree(text: str) -> Any:
 
 
 def _check_size(text: str) -> None:
-    """Reject a text whose parsing would be too slow.  Raises YAMLError.
+    """Raise YAMLError if the parsing of a text would be too slow.
 
     The parsing time grows at least quadratically with the nesting depth. Tokens are counted before
     parsing, unless the punctuation shows that there are only a few.
@@ -282,7 +291,7 @@ def parse_json(text: str) -> Any:
 
 
 def read_document(path: Path) -> Document:
-    """Read a YAML file that contains one mapping; raise BadInputError for an invalid file."""
+    """Read a YAML file that contains one mapping; raise BadInputError if the file is invalid."""
     try:
         text = path.read_text(encoding="utf-8")
     except OSError as error:
@@ -322,7 +331,7 @@ def read_document(path: Path) -> Document:
 
 
 def plain(tree: Any) -> Any:
-    """Convert a YAML tree into Python's built-in types, without comments and quoting.
+    """Convert a YAML tree to Python's built-in types, without comments and quoting.
 
     Raises YAMLError if a key is a list or a mapping, and if aliases expand to more than MAX_VALUES
     values.
@@ -392,7 +401,8 @@ def _name_type(value: Any) -> str:
 
 
 def did_you_mean(name: object, known: Sequence[str]) -> str:
-    """Return the remedy for an unknown name: the most similar known name, or all known names."""
+    """Return a remedy for an unknown name, which suggests the most similar name or all known
+    names."""
     near = get_close_matches(str(name), known, n=1)
     if near:
         return f'did you mean "{near[0]}"?'
@@ -400,7 +410,10 @@ def did_you_mean(name: object, known: Sequence[str]) -> str:
 
 
 def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
-    """Validate the values below the key `at`.  Raises BadInputError with all problems."""
+    """Validate the values below the key `at` against a pydantic model, and return the model object.
+
+    Raises BadInputError with all problems.
+    """
     values: Any = document.values
     for part in at:
         values = values[part]
@@ -442,7 +455,8 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
 def _existing_part(document: Document, key: Key) -> Key:
     """Return the longest prefix of `key` that exists in the document.
 
-    The error locations of pydantic also contain members of unions, which are not keys of the file.
+    The error location of pydantic may also contain the name of a type, which is not a key of the
+    file.
     """
     values: Any = document.values
     for number, part in enumerate(key):
@@ -457,7 +471,7 @@ def _existing_part(document: Document, key: Key) -> Key:
 
 
 def _renamed_keys(model: type[BaseModel], document: Document, key: Key) -> Mapping[str, str]:
-    """Return the new names of renamed keys by old name, for the mapping that contains `key`."""
+    """Return the new names of the renamed keys in the mapping that contains `key`, by old name."""
     if key[0] == "nodes" and key[2:3] == ("parameters",):
         node_type = document.values["nodes"][key[1]].get("type")
         # A launch file may also give the class path of a shipped node as its type.
@@ -472,9 +486,11 @@ def _shorten(value: Any) -> str:
 
 
 def _walk(model: Any, location: Key) -> tuple[Key, Any]:
-    """Convert the location of a pydantic error into a key of the file and the type of its value.
+    """Convert the location of a pydantic error into a key of the file; also return the value's
+    type.
 
-    Inside a union of models, the location also names the chosen member, which is not a key.
+    In a union of models, the location also contains the name of the chosen model, which is not a
+    key of the file.
     """
     key: list[str | int] = []
     for part in location:
@@ -520,7 +536,7 @@ def _inner_type(annotation: Any, part: str | int) -> Any:
 
 @contextmanager
 def edit_yaml(source: Path, copy: Path) -> Iterator[Any]:
-    """Yield the tree of a YAML file, and write the tree to `copy` after the caller's changes.
+    """Yield the tree of a YAML file; when the context ends, write the changed tree to `copy`.
 
     Comments and layout are preserved.
     """

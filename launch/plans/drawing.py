@@ -38,8 +38,8 @@ STYLE = """
 class Arrow:
     """An arrow for the topics from one node to another, or for a connection to a device.
 
-    path: points of the SVG polyline. label_at: position of the label, px. wire: label of a device
-    connection; empty for topics.
+    path: points of the SVG polyline, px. label_at: position of the label, px. wire: label of a
+    device connection; empty for topics.
     """
 
     writer: str
@@ -55,8 +55,8 @@ class Arrow:
 class GraphDrawing:
     """The geometry (px) of the drawing of a graph.
 
-    hosts: left, top, width and height of each host's frame. boxes, devices: centre of the box of
-    each node and device.
+    hosts: left, top, width and height of each host's frame. boxes, devices: centres of the boxes of
+    nodes and devices, by name.
     """
 
     title: str
@@ -68,7 +68,7 @@ class GraphDrawing:
 
 
 def svg(drawing: GraphDrawing) -> str:
-    """Return the text of an SVG file with the drawing, for light and dark colour schemes."""
+    """Return the drawing as the text of an SVG file for light and dark colour schemes."""
     width, height = drawing.size
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
@@ -107,7 +107,7 @@ def svg(drawing: GraphDrawing) -> str:
 
 
 MARGIN, COLUMN, ROW, HOST_GAP = 30, 230, 75, 45
-"""Lengths (px) in a drawing: outer margin, column pitch, row pitch, and gap between hosts."""
+"""The outer margin, column pitch, row pitch, and gap between hosts in a drawing, in pixels."""
 
 
 def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
@@ -128,9 +128,10 @@ def list_links(plan: ResolvedGraph) -> dict[tuple[str, str], list[str]]:
 
 
 def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> dict[str, int]:
-    """Assign each node a column to the right of all nodes whose topics it reads; ignore cycles.
+    """Assign columns to nodes, so that each node is to the right of all nodes whose topics it
+    reads.
 
-    links: pairs (writer, reader).
+    links: pairs (writer, reader). Cycles are ignored.
     """
     order: list[str] = []
     seen: set[str] = set()
@@ -155,7 +156,7 @@ def assign_columns(names: Sequence[str], links: Sequence[tuple[str, str]]) -> di
 
 
 def lay_out(plan: ResolvedGraph) -> GraphDrawing:
-    """Lay out a graph automatically: writers to the left of readers, and one frame per host."""
+    """Compute the layout of a graph, with writers to the left of readers and one frame per host."""
     links = list_links(plan)
     columns = assign_columns(list(plan.nodes), list(links))
     boxes: dict[str, Position] = {}
@@ -179,7 +180,11 @@ def lay_out(plan: ResolvedGraph) -> GraphDrawing:
 
 
 def _connect(boxes: dict[str, Position], writer: str, reader: str, topics: Sequence[str]) -> Arrow:
-    """Return a straight arrow to a reader on the right, or an arrow below both boxes otherwise."""
+    """Return the arrow between two nodes.
+
+    The arrow is straight if the reader is on the right; otherwise it passes below both boxes.
+    boxes: centres of the nodes, px.
+    """
     (x1, y1), (x2, y2) = boxes[writer], boxes[reader]
     if x2 > x1:
         start, end = (x1 + WIDTH / 2, y1), (x2 - WIDTH / 2, y2)
@@ -209,7 +214,8 @@ def mermaid(plan: ResolvedGraph) -> str:
 
 
 def text_lines(plan: ResolvedGraph) -> Iterator[str]:
-    """Yield text lines that list the nodes of each host with their topics and the readers."""
+    """Yield text lines that list the nodes of each host, with their topics and the readers of
+    these."""
     links = list_links(plan)
     for host, address in plan.hosts.items():
         yield f"{host} ({address})"

@@ -1,4 +1,7 @@
-"""Define the parts of the display that a run can omit, in a module that commands import fast."""
+"""List the parts of the display that a run can omit.
+
+The module is separate, so that commands import it fast.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from enum import StrEnum
 
 
 class Feature(StrEnum):
-    """A part of the display that can be omitted in a run: the projected image or rendered force."""
+    """The parts of the display that a run can omit."""
 
     IMAGE = "image"
     FORCE = "force"

@@ -1,6 +1,6 @@
 """Check that the addresses and keys of hosts are valid and unique.
 
-The module also defines the names of nodes and writers that exist once per host.
+The module also defines the names of nodes and topic writers that exist once per host.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from flexsheet.messages.security import is_key
 
 
 def check_hosts(hosts: dict[str, HostSpec], document: Document) -> None:
-    """Check that the hosts' addresses and keys are valid and unique; report problems."""
+    """Report a problem if the address or key of a host is invalid or not unique."""
     if MAIN not in hosts:
         document.report(
             ("hosts",), f'no host is named "{MAIN}"', "rename the host that runs the tools"
@@ -73,7 +73,10 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document) -> None:
 
 
 def load_keys(path: Path) -> dict[str, str]:
-    """Read the public key of each host from a launch file; raise BadInputError on failure."""
+    """Read the public key of each host from a launch file.
+
+    Raises BadInputError if the launch file is invalid.
+    """
     document = read_launch_file(path)
     spec = validate(LaunchFile, document)
     check_hosts(spec.hosts, document)
@@ -82,7 +85,7 @@ def load_keys(path: Path) -> dict[str, str]:
 
 
 def launcher_on(host: str) -> str:
-    """Return the writer name of the launcher on a host."""
+    """Return the name under which the launcher on a host publishes messages."""
     return LAUNCHER if host == MAIN else f"{LAUNCHER}_{host}"
 
 

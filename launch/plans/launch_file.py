@@ -1,4 +1,4 @@
-"""Define the keys of launch files, and apply the options of the command line to them."""
+"""Define the keys of launch files, and apply command-line options to launch files."""
 
 from __future__ import annotations
 
@@ -23,27 +23,35 @@ from flexsheet.nodes.node import find_role
 RECORDER_NICE = 5
 """The default niceness of the recorder.
 
-A delay of the recorder affects no other node, because its input messages wait in queues.
+A delay of the recorder affects no other node, because messages for the recorder wait in queues.
 """
 
 CONSOLE_NICE = 10
-"""The niceness of the console that --console adds; the console must not delay other nodes."""
+"""The niceness of the console that the option --console adds.
+
+It is high, because the console must not delay other nodes.
+"""
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
-"""The path of bag files that the console records, as strftime pattern in the working folder."""
+"""The strftime pattern of the path of bag files that are recorded from the console.
+
+The path is relative to the working folder.
+"""
 
 MERGED_LEVELS = 4
-"""The depth of keys to which a launch file is merged with the file that it extends:
-nodes.NAME.parameters.KEY."""
+"""The depth to which a launch file is merged with the file that it extends.
+
+It includes the keys nodes.NAME.parameters.KEY.
+"""
 
 SCENE_KEY_SET = frozenset({"object", "sheet", "arms", "camera", "working_range"})
-"""The keys that identify a scene file, because launch files do not have these keys."""
+"""The keys by which a scene file is distinguished from a launch file."""
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=32)]
 
 
 class HostSpec(StrictModel):
-    """The settings of one host, which is a computer of the graph."""
+    """The settings of one host (computer) of the graph."""
 
     address: str = Field(description="IP address on which the host's nodes listen")
     key: str | None = Field(
@@ -97,7 +105,10 @@ class NodeSpec(StrictModel):
 
 
 class ClocksSpec(StrictModel):
-    """The required accuracy of the clock comparison between hosts; see docs/clocks.md."""
+    """The required accuracy of the clock comparison between hosts.
+
+    docs/clocks.md describes the comparison.
+    """
 
     max_offset_uncertainty_s: float = Field(
         default=0.005,
@@ -116,7 +127,7 @@ class ClocksSpec(StrictModel):
 
 
 class LaunchFile(StrictModel):
-    """The content of a launch file: its keys with their types and defaults."""
+    """The keys of a launch file, with their types and defaults."""
 
     extends: str | None = Field(
         default=None,
@@ -139,9 +150,10 @@ class LaunchFile(StrictModel):
 
 
 def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
-    """Read a launch file and merge it with the files that it extends.  Raises BadInputError.
+    """Read a launch file, and merge it with the files that it extends.
 
     extending: files that extend this file, directly or indirectly, to detect circular references.
+    Raises BadInputError if a file is invalid.
     """
     document = read_document(path)
     if SCENE_KEY_SET & document.values.keys() and "nodes" not in document.values:
@@ -176,12 +188,15 @@ def read_launch_file(path: Path, extending: tuple[Path, ...] = ()) -> Document:
 
 
 def apply_scene(document: Document, scene: Path) -> None:
-    """Apply the option --scene: replace the scene of the launch file."""
+    """Replace the scene of a launch file, as the option --scene does."""
     document.set(("scene",), str(scene.absolute()), f"--scene {scene}")
 
 
 def apply_setting(document: Document, setting: str) -> None:
-    """Apply one option --set NODE.PARAMETER=VALUE or --set scene=FILE.  Raises BadInputError."""
+    """Apply one value of the option --set to a launch file.
+
+    setting: NODE.PARAMETER=VALUE or scene=FILE. Raises BadInputError if the setting is invalid.
+    """
     origin = f"--set {setting}"
     target, equals, text = setting.partition("=")
     if target == "scene" and text:
@@ -215,7 +230,8 @@ def apply_setting(document: Document, setting: str) -> None:
 
 
 def apply_record(document: Document, bag: Path) -> None:
-    """Apply the option --record: set the recorder's bag file; add a recorder if necessary."""
+    """Set the bag file of the recorder, as the option --record does; add a recorder if
+    necessary."""
     origin = f"--record {bag}"
     if bag.exists():
         raise BadInputError.single(
@@ -230,7 +246,7 @@ def apply_record(document: Document, bag: Path) -> None:
 
 
 def apply_console(document: Document) -> None:
-    """Apply the option --console: add a console, and a recorder that starts paused."""
+    """Add a console and a recorder that starts paused, as the option --console does."""
     origin = "--console"
     nodes = document.values.get("nodes")
     specs = [one for one in nodes.values() if isinstance(one, dict)] if nodes else []
@@ -247,7 +263,7 @@ def apply_console(document: Document) -> None:
 
 
 def _find_role(type_name: object) -> NodeRole | None:
-    """Return the role of a node type; None if its class has none or cannot be imported."""
+    """Return the role of a node type; None if its class has no role or cannot be imported."""
     try:
         return find_role(node_class(str(type_name)))
     except (UnknownNodeError, ImportError, AttributeError, TypeError):

@@ -1,8 +1,8 @@
 """Omit the nodes of a graph that its scene and its other nodes do not need.
 
-Without a material in the scene, the soft body is not computed. Without a projector, no image is
-rendered.  A node with `Node.on_demand` is omitted if no other node reads its topics. A recorder
-counts as a reader of the topics in its parameters, but not of its default topics.
+Without a material in the scene, no soft body is computed. Without a projector, no image is
+rendered. A node whose class sets `Node.on_demand` is omitted if no other node reads its topics. A
+recorder counts as a reader of the topics in its parameters, but not of its default topics.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ REASON_TEXTS = {
 
 
 def remove_features(scene: Scene, features: Collection[Feature]) -> Scene:
-    """Return a copy of the scene without these parts of the display."""
+    """Return a copy of the scene without the given parts of the display."""
     changes: dict[str, object] = {}
     if Feature.IMAGE in features:
         changes["projector"] = None
@@ -43,8 +43,8 @@ def omit_unneeded(
 ) -> tuple[list[NodeEntry], list[OmittedNode]]:
     """Return the nodes that are started, and the omitted nodes with the reasons.
 
-    Ports that a node does not use with its parameters and this scene are disconnected.  The scene
-    is ignored if a node of the graph publishes scenes, because a later scene may need more nodes.
+    Ports that a node does not use with its parameters and this scene are disconnected. The scene is
+    ignored if a node of the graph publishes scenes, because a later scene may need more nodes.
 
     needed: topics that command-line tools read. external: topics that command-line tools write.
     """
@@ -106,7 +106,10 @@ def _required_inputs(entry: NodeEntry) -> set[str]:
 
 
 def _list_read_topics(entry: NodeEntry) -> set[str]:
-    """Return the topics that a node reads; for a recorder, only those in its parameters."""
+    """Return the topics that a node reads.
+
+    For a recorder, only the topics in its parameters are returned.
+    """
     if entry.type is None or entry.parameters is None:
         return set()
     if isinstance(entry.parameters, RecorderParameters):

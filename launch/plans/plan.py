@@ -1,8 +1,8 @@
-"""Check a launch file and resolve it to nodes with hosts, parameters and endpoints.
+"""Check a launch file, and resolve it to nodes with hosts, parameters and endpoints.
 
 `load_graph` returns a `ResolvedGraph` with all defaults and network endpoints, before any process
-starts. All errors of the file are reported together. Every host must resolve the launch file to
-the same graph, so the hosts compare its hash.
+starts. All errors of the file are reported together. All hosts must resolve the launch file to the
+same graph; for this purpose they compare its hash.
 """
 
 from __future__ import annotations
@@ -81,12 +81,12 @@ def load_graph(
     """Read, check and resolve a launch file.
 
     settings: texts "node.parameter=value" with a YAML value, or "scene=FILE", which override the
-        file.
-    record: bag file to which is recorded, which overrides the launch file.
+    file. record: bag file to write, which overrides the recorder's setting in the launch file.
     console: whether to add a console and a paused recorder, unless the file contains them.
-    apparatus: true parameters of the simulated hardware: a file or "seed:N"; None: as in the scene.
-    needed: topics that the caller reads, whose writers are therefore started.
+    apparatus: true parameters of the simulated hardware, as a file or "seed:N"; None uses the
+    scene's values. needed: topics that the caller reads, whose writers are therefore started.
     without: parts of the display that are omitted.
+
     Raises BadInputError with all errors of the file.
     """
     document = read_launch_file(path)
@@ -199,7 +199,7 @@ def _load_apparatus(
 
 
 def load_scene(path: Path) -> Scene:
-    """Read and check a scene file.  Raises BadInputError."""
+    """Read and check a scene file; raise BadInputError if it is invalid."""
     return make_scene(read_document(path))
 
 
@@ -261,9 +261,10 @@ def _marked(parameters: NodeParameters, mark: ParameterMark) -> list[Any]:
 
 
 def _device_address(parameters: NodeParameters) -> str | None:
-    """Return "host:port" of the device that a node controls.
+    """Return the address "host:port" of the device that a node controls.
 
-    Return None unless exactly one parameter is marked as the device's host, and one as its port.
+    Returns None unless exactly one parameter is marked as the device's host, and exactly one as its
+    port.
     """
     hosts = _marked(parameters, ParameterMark.DEVICE_HOST)
     ports = _marked(parameters, ParameterMark.DEVICE_PORT)
@@ -271,7 +272,7 @@ def _device_address(parameters: NodeParameters) -> str | None:
 
 
 def _device_files(parameters: NodeParameters) -> tuple[str, ...]:
-    """Return the sorted device files among the parameters; URLs of streams are not files."""
+    """Return the sorted device files in the parameters of a node; stream URLs are not included."""
     files = _marked(parameters, ParameterMark.DEVICE_FILE)
     return tuple(sorted({file for file in files if not urlsplit(file).scheme}))
 

@@ -1,4 +1,4 @@
-"""Data model of a resolved launch file, which is called the plan of a graph.
+"""Define the data model of a resolved launch file, which is called the plan of a graph.
 
 A plan contains the nodes with their hosts and all defaults, and the network endpoints of every
 topic. The model is separate from the resolver (`launch.plans.plan`), so that tools start fast.
@@ -23,10 +23,10 @@ MAIN = "main"
 """The name of the host on which the launcher's topics, the recorder and command-line tools run."""
 
 LAUNCHER, TOOLS = "launch", "tools"
-"""The names of the topic writers that are not nodes: the launcher, and all command-line tools."""
+"""The names under which the launcher and all command-line tools publish messages."""
 
 RUN_DIRECTORY = "@run"
-"""The placeholder in endpoints and parameters that a run replaces by the path of its folder."""
+"""The placeholder for the path of the run's folder in endpoints and parameters."""
 
 
 ROLES_OF_TYPES = {
@@ -38,15 +38,21 @@ ROLES_OF_TYPES = {
     "renderer": NodeRole.RENDERER,
     "twin_finger": NodeRole.FINGER_SIMULATOR,
 }
-"""The node roles by node type, for plans in older bags, which contain no roles."""
+"""The roles of nodes by node type, for plans in older bags that do not contain roles."""
 
 
 OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
-"""The parameters with a calibration file, for plans in older bags, which list no calibrations."""
+"""The node parameters that name a calibration file, for plans in older bags.
+
+These plans do not list calibrations.
+"""
 
 
 class ArmingMode(StrEnum):
-    """A value of the arm bridge parameter `arming`: the arm moves after a command, or by itself."""
+    """The values of the parameter `arming` of the arm bridge.
+
+    auto: the arm moves without a command. manual: the arm moves only after a command of the user.
+    """
 
     MANUAL = "manual"
     AUTO = "auto"
@@ -74,7 +80,8 @@ class RestartSpec(StrictModel):
 
 
 class Writer(StrictModel):
-    """A writer of a topic, with an ipc endpoint for readers on its host and a tcp endpoint."""
+    """A writer of a topic, with an ipc endpoint for its own host and a tcp endpoint for other
+    hosts."""
 
     name: str
     host: str
@@ -91,17 +98,18 @@ class Writer(StrictModel):
         return self.tcp
 
     def source_for(self, host: str) -> Source:
-        """Return the endpoint to which a subscriber on `host` connects, and the writer's name.
+        """Return the writer's name, and the endpoint to which a subscriber on `host` connects.
 
         The source of a TCP connection also names the writer's host, so that the subscriber can
-        authenticate that host.
+        authenticate this host.
         """
         far = host != self.host and self.tcp is not None
         return Source(self.endpoint_for(host), self.name, self.host if far else None)
 
 
 class ResolvedPort(StrictModel):
-    """A port of a node, its topic, and the endpoints that it binds (output) or reads (input)."""
+    """A port of a node, with its topic and the endpoints that it binds (output) or reads
+    (input)."""
 
     port: str
     topic: str
@@ -109,7 +117,7 @@ class ResolvedPort(StrictModel):
 
 
 class ResolvedNode(StrictModel):
-    """The complete settings with which a node is started."""
+    """The complete settings of a node, with which it is started."""
 
     name: str
     type: str
@@ -140,7 +148,7 @@ class ResolvedNode(StrictModel):
 
     @property
     def arm_side(self) -> str | None:
-        """Return the side of the arm whose state the node publishes, "left" or "right", or None."""
+        """Return the side of the arm whose state the node publishes: "left", "right" or None."""
         sides = {"arm_left": "left", "arm_right": "right"}
         return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
 
@@ -169,14 +177,14 @@ class ResolvedNode(StrictModel):
 
 @dataclass(frozen=True, slots=True)
 class ResolvedProcess:
-    """A process and its nodes, which have equal niceness, restart policy and heartbeat timeout."""
+    """A process and its nodes, which share niceness, restart policy and heartbeat timeout."""
 
     name: str
     nodes: tuple[ResolvedNode, ...]
 
     @property
     def settings(self) -> ResolvedNode:
-        """Return the first node, whose process settings apply to all nodes of the process."""
+        """Return the first node; its process settings apply to all nodes of the process."""
         return self.nodes[0]
 
     @property
@@ -185,7 +193,7 @@ class ResolvedProcess:
 
 
 class OmittedNode(StrictModel):
-    """A node of the launch file that is not started, with the reason."""
+    """A node of the launch file that is not started, with the reason for this."""
 
     name: str
     type: str
@@ -194,7 +202,8 @@ class OmittedNode(StrictModel):
 
 
 class ResolvedGraph(StrictModel):
-    """A resolved launch file: nodes and hosts with all defaults, and endpoints of all topics."""
+    """A resolved launch file, with all nodes, hosts and defaults, and the endpoints of all
+    topics."""
 
     launch_file: str
     launch_text: str
@@ -216,7 +225,7 @@ class ResolvedGraph(StrictModel):
     hash: str
 
     def writer(self, topic: str, name: str) -> Writer | None:
-        """Return the writer `name` of a topic, or None if that name may not write the topic."""
+        """Return the writer `name` of a topic; None if this name may not write the topic."""
         return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
 
     def endpoints_to_read(self, topic: str) -> tuple[str, ...]:
@@ -224,7 +233,7 @@ class ResolvedGraph(StrictModel):
         return tuple(writer.endpoint_for(MAIN) for writer in self.writers.get(topic, ()))
 
     def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
-        """Return endpoints and writers to which a subscriber of `topic` on `host` connects."""
+        """Return the writers and endpoints to which a subscriber of `topic` on `host` connects."""
         return tuple(writer.source_for(host) for writer in self.writers.get(topic, ()))
 
     def may_reset_estop(self) -> tuple[str, ...]:
@@ -236,20 +245,20 @@ class ResolvedGraph(StrictModel):
         )
 
     def nodes_on(self, host: str | None) -> list[ResolvedNode]:
-        """Return the nodes on one host; None selects all hosts."""
+        """Return the nodes on one host, or all nodes if `host` is None."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
 
     def nodes_of_type(self, node_type: str) -> list[ResolvedNode]:
-        """Return the nodes whose class is that of `node_type`, or derives from it."""
+        """Return the nodes whose class is that of `node_type`, or is derived from it."""
         base = node_class(node_type)
         return [one for one in self.nodes.values() if issubclass(node_class(one.type), base)]
 
     def processes_on(
         self, host: str | None, *, without: Collection[str] = ()
     ) -> list[ResolvedProcess]:
-        """Return the processes on `host`, or on all hosts if it is None, by their first nodes.
+        """Return the processes on `host`, in the order of their first nodes.
 
-        without: names of nodes that are not started.
+        host: name of a host; None for all hosts. without: names of nodes that are not started.
         """
         members: dict[str, list[ResolvedNode]] = {}
         for node in self.nodes_on(host):
@@ -259,7 +268,7 @@ class ResolvedGraph(StrictModel):
         return [ResolvedProcess(name, tuple(nodes)) for name, nodes in members.items()]
 
     def listening_nodes(self, host: str | None) -> list[tuple[str, int]]:
-        """Return (node, TCP port) for each port on which a node of the host listens."""
+        """Return the pairs (node, TCP port) of all ports on which the nodes of a host listen."""
         return [(node.name, port) for node in self.nodes_on(host) for port in node.listen_ports]
 
     def scene_message(self) -> Scene | None:
@@ -270,5 +279,5 @@ class ResolvedGraph(StrictModel):
 
 
 def tools_on(host: str) -> str:
-    """Return the writer name of command-line tools on a host."""
+    """Return the name under which command-line tools on a host publish messages."""
     return TOOLS if host == MAIN else f"{TOOLS}_{host}"

@@ -11,13 +11,14 @@ from flexsheet.nodes.node import find_role
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 COMMON_KEYS = ("host", "nice", "restart", "liveness_s")
-"""The keys of a node that must be equal for all nodes in a process."""
+"""The keys of a node that must be equal for all nodes in one process."""
 
 
 def check_processes(entries: list[NodeEntry], document: Document) -> None:
-    """Check that nodes in one process have equal process settings, and that arm bridges are alone.
+    """Report a problem if the nodes in one process are not allowed to share it.
 
-    Only the simulator of the arm may share the process of its bridge.
+    Their process settings must be equal. Only the simulator of its arm may share the process of an
+    arm bridge, unless the bridge sets `shares_arm_process`.
     """
     names = {entry.name for entry in entries}
     processes: dict[str, list[NodeEntry]] = {}
@@ -50,7 +51,7 @@ def check_processes(entries: list[NodeEntry], document: Document) -> None:
 
 
 def _may_share(bridge: NodeEntry, entry: NodeEntry) -> bool:
-    """Return whether a node may share a process with `bridge`, which may be any node."""
+    """Return whether a node may share a process with the node `bridge`."""
     if bridge.type is None or find_role(bridge.type) is not NodeRole.ARM_BRIDGE:
         return True
     if bridge.spec.shares_arm_process or bridge.parameters is None or entry.parameters is None:

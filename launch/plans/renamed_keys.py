@@ -1,4 +1,5 @@
-"""List renamed keys and values of launch files and scenes, so that errors name the new keys."""
+"""List renamed keys and values of launch files and scenes, so that error texts name the new
+ones."""
 
 from __future__ import annotations
 
@@ -45,14 +46,17 @@ SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
 """The new names of renamed keys of scene files, by former name."""
 
 REMOVED_KEYS = frozenset({"kinematics", "triangulation"})
-"""The keys of scenes and node parameters that were removed, because only one value was left."""
+"""The removed keys of scenes and node parameters, for which only one value was left."""
 
 LAUNCH_KEYS: Mapping[str, str] = {
     "from_tools": "external_topics",
     "also": "include",
     "waits": "start_paused",
 }
-"""The new names of renamed keys of launch files, by former name, including keys below `record`."""
+"""The new names of renamed keys of launch files, by former name.
+
+Keys below `record` are included.
+"""
 
 VALUES: Mapping[str, Mapping[str, str]] = {
     "arming": {"by_command": "manual", "by_itself": "auto"},
@@ -70,4 +74,4 @@ VALUES: Mapping[str, Mapping[str, str]] = {
     "driver": {"mxt_pose": "mxt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }
-"""The new names of renamed methods, patterns and modes, by key and former name."""
+"""The new names of renamed values, such as methods and modes, by key and former name."""

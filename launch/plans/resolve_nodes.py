@@ -1,4 +1,4 @@
-"""Resolve the nodes of a launch file: class, ports with their topics, parameters."""
+"""Resolve the nodes of a launch file to classes, ports with topics, and parameters."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ from flexsheet.nodes.node import (
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")
-"""The names that nodes must not have, because files in the run's directory have these names."""
+"""The names that nodes must not have, because files in the run's folder have these names."""
 
 _PARAMETER_SECTIONS: tuple[Key, ...] = (("record",), ("clocks",))
-"""The keys of a launch file that contain the parameters of a node directly.
+"""The keys of a launch file that directly contain the parameters of a node.
 
 Other nodes have their parameters below the key `parameters`.
 """
 
 
 class NodeEntry:
-    """A node of a launch file that is being resolved.
+    """A node of a launch file during its resolution.
 
-    type, parameters: class and parameters of the node; None until resolved. ports: connected ports
-    with their topics. unconnected: unconnected ports with the topics of their type.
+    type, parameters: class and parameters of the node; None until they are resolved. ports:
+    connected ports with their topics. unconnected: unconnected ports with the topics of their type.
     """
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
@@ -56,16 +56,18 @@ class NodeEntry:
         self.further_inputs: list[Topic] = []
 
     def topics(self, direction: str) -> list[tuple[str, Topic]]:
-        """Return (port name, topic) of all connected ports of a direction, input or output."""
+        """Return (port name, topic) for all connected ports of a direction, which is input or
+        output."""
         found = [(port.name, topic) for port, topic in self.ports if port.direction == direction]
         if direction == "input":
             found += [(further_port(topic.name), topic) for topic in self.further_inputs]
         return found
 
     def disconnect_optional(self, written: Container[str]) -> None:
-        """Disconnect optional inputs without a writer, except inputs named in the launch file.
+        """Disconnect optional inputs whose topic has no writer.
 
-        written: names of the topics that have a writer.
+        Inputs that the launch file names explicitly stay connected. written: names of the topics
+        that have a writer.
         """
         if self.type is None:
             return
@@ -76,7 +78,8 @@ class NodeEntry:
         )
 
     def disconnect(self, ports: Iterable[str]) -> None:
-        """Disconnect the named ports, except those to which the launch file assigns a topic."""
+        """Disconnect the named ports; ports to which the launch file assigns a topic stay
+        connected."""
         names = set(ports) - self.spec.topics.keys()
         for port, topic in [*self.ports]:
             if port.name in names:
@@ -84,7 +87,7 @@ class NodeEntry:
                 self.unconnected.append((port, topic))
 
     def unconnected_ports(self, direction: str) -> tuple[ResolvedPort, ...]:
-        """Return the unconnected ports of a direction, input or output."""
+        """Return the unconnected ports of a direction, which is input or output."""
         return tuple(
             ResolvedPort(port=port.name, topic=topic.name, endpoints=())
             for port, topic in self.unconnected
@@ -93,7 +96,7 @@ class NodeEntry:
 
 
 def collect_entries(spec: LaunchFile, document: Document) -> list[NodeEntry]:
-    """Return the nodes of a launch file, including added recorder and clock nodes.
+    """Return the nodes of a launch file, including automatically added recorder and clock nodes.
 
     Problems are reported to `document`.
     """
@@ -139,7 +142,10 @@ def _clock_entry(host: str, clocks: ClocksSpec) -> NodeEntry:
 
 
 def resolve_entry(entry: NodeEntry, document: Document) -> None:
-    """Find the node's class, connect its ports, check its parameters, and report problems."""
+    """Find the node's class, connect its ports, and check its parameters.
+
+    Problems are reported to `document`.
+    """
     key = entry.key
     type_name = entry.spec.type
     try:
@@ -241,7 +247,7 @@ def _connect_ports(entry: NodeEntry, class_: type[Node], document: Document) -> 
 
 
 def check_device_hosts(entries: list[NodeEntry], spec: LaunchFile, document: Document) -> None:
-    """Check that each device is connected to the host of its node.
+    """Report a problem if a device is not connected to the host of its node.
 
     Device protocols are not encrypted, so their data must not cross the network between hosts.
     """
@@ -267,7 +273,8 @@ CALIBRATION_MARKS = (
 
 
 def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: Document) -> None:
-    """Read the calibration files in node parameters, and check that they fit the scene."""
+    """Report a problem if a calibration file in a node's parameters is invalid or unfit for the
+    scene."""
 
     def check_camera(path: Path) -> None:
         measured = load_calibration(path)
@@ -302,7 +309,8 @@ def check_calibrations(entries: list[NodeEntry], scene: Scene | None, document: 
 def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool) -> dict[str, Any]:
     """Return all parameters of a node as JSON values, including defaults.
 
-    resolve_paths: make paths absolute. Paths in the launch file are relative to its folder.
+    resolve_paths: whether to make paths absolute; paths in the launch file are relative to its
+    folder.
     """
     assert entry.parameters is not None  # otherwise the load has failed
     values = entry.parameters.model_dump(mode="json")
@@ -316,9 +324,9 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
 
 
 def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
-    """Return the JSON form `dumped` of a value, with absolute instead of relative paths.
+    """Return the JSON form of a parameter value with absolute instead of relative paths.
 
-    base: folder to which relative paths refer.
+    value: parameter value. dumped: its JSON form. base: folder to which relative paths refer.
     """
     if isinstance(value, Path):
         return _absolute(value, base)

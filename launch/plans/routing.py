@@ -1,4 +1,5 @@
-"""Determine which nodes write each topic, connect inputs, and assign network endpoints."""
+"""Determine the writers of each topic, connect the inputs of nodes, and assign network
+endpoints."""
 
 from __future__ import annotations
 
@@ -14,13 +15,16 @@ from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.topics import TOPICS
 
 WRITABLE_ON_ALL_HOSTS = ("estop",)
-"""The topics that tools on every host may write, such as the e-stop of the arms."""
+"""The topics that command-line tools may write on every host, such as the e-stop of the arms."""
 
 LAUNCHER_TOPICS = ("host", "estop")
-"""The topics that the launcher on every host publishes."""
+"""The topics that the launchers on all hosts publish."""
 
 FIRST_PORT, PORT_COUNT = 20_000, 10_000
-"""The first TCP port of topics and the number of ports, below Linux's outgoing ports (32768)."""
+"""The first TCP port of topics, and the number of ports.
+
+These ports are below those that Linux uses for outgoing connections (from 32768).
+"""
 
 
 def list_writers(
@@ -33,7 +37,8 @@ def list_writers(
 ) -> dict[str, list[tuple[str, str]]]:
     """Return the (writer, host) pairs of each topic, in the order of the launch file.
 
-    Topics with more writers than allowed are reported to `document`.
+    has_scene, has_apparatus: whether the launcher publishes a scene and an apparatus. Topics with
+    more writers than allowed are reported to `document`.
     """
     writers: dict[str, list[tuple[str, str]]] = {}
     has_editor = any(topic.name == "scene" for one in entries for _, topic in one.topics("output"))
@@ -79,7 +84,10 @@ def list_writers(
 def resolve_further_inputs(
     entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
-    """Add the inputs that depend on parameters, such as those of recorder and console."""
+    """Add the inputs that depend on node parameters, such as the topics of a recorder.
+
+    writers: (writer, host) pairs by topic. Problems are reported to `document`.
+    """
     written = [topic for topic in TOPICS.values() if topic.name in writers]
     for entry in entries:
         if entry.type is None or entry.parameters is None:
@@ -96,9 +104,10 @@ def resolve_further_inputs(
 def check_inputs(
     entries: list[NodeEntry], writers: dict[str, list[tuple[str, str]]], document: Document
 ) -> None:
-    """Check that every input has a writer of its topic; disconnect optional inputs without writer.
+    """Report a problem if a required input has no writer; disconnect optional inputs without
+    writers.
 
-    The check is omitted if a node has an unknown type, because that node could be the writer.
+    The check is omitted if a node has an unknown type, because this node may be the missing writer.
     """
     if any(entry.type is None for entry in entries):
         return
@@ -122,9 +131,11 @@ def check_inputs(
 def make_endpoints(
     writers: dict[str, list[tuple[str, str]]], addresses: dict[str, str]
 ) -> dict[str, tuple[Writer, ...]]:
-    """Return the writers of each topic with their endpoints: ipc on one host, tcp between hosts.
+    """Return the writers of each topic with their network endpoints.
 
-    A topic gets a tcp endpoint only if there are several hosts.
+    writers: (writer, host) pairs by topic. addresses: IP addresses by host. The endpoints are ipc
+    for connections on one host, and tcp for connections between hosts. If there is only one host,
+    topics have no tcp endpoint.
     """
     far = sorted(
         (host, writer, topic)
