@@ -1,1 +1,1 @@
-"""Exchange messages with ROS 2: message types, table of topics, and bridge over DDS."""
+"""Exchange messages with ROS 2: define message types, map topics, and bridge them over DDS."""

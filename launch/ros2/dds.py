@@ -32,12 +32,12 @@ _ARRAY_LIMIT = 65535
 
 
 def mangle_topic(name: str) -> str:
-    """Return the name of the DDS topic for the name of a ROS topic."""
+    """Convert the name of a ROS topic to the name of its DDS topic."""
     return f"rt{name}"
 
 
 def mangle_type(name: str) -> str:
-    """Return the name of the DDS type for the name of a ROS type."""
+    """Convert the name of a ROS type to the name of its DDS type."""
     package, _, short = name.split("/")
     return f"{package}::msg::dds_::{short}_"
 
@@ -68,7 +68,7 @@ def make_configuration(interface: str) -> str:
 
 @dataclass(slots=True)
 class Sample:
-    """A received message as CDR bytes."""
+    """A received message as CDR bytes (the serialization format of DDS)."""
 
     cdr: bytes
     sample_info: Any = None
@@ -76,7 +76,8 @@ class Sample:
 
 @cache
 def make_dds_type(ros_type: str) -> Any:
-    """Make a Cyclone DDS type for a ROS type. Its samples store the CDR bytes in `cdr`."""
+    """Make a Cyclone DDS type for a ROS type; its samples contain the CDR bytes in the field
+    `cdr`."""
     described = _describe(ros_type)
 
     def serialize(self: Any, **_: Any) -> bytes:
@@ -117,8 +118,8 @@ def _describe(ros_type: str) -> Any:
 class RosParticipant:
     """A participant of a DDS domain that publishes and subscribes to ROS topics.
 
-    domain: number of the domain, as in the ROS_DOMAIN_ID of the other participants. interface: name
-        of the network interface to use.
+    domain: number of the domain, which must equal the ROS_DOMAIN_ID of the other participants.
+    interface: name of the network interface to use.
 
     Raises Ros2Error if the participant cannot be created.
     """
@@ -153,11 +154,18 @@ class RosParticipant:
             )
 
     def has_readers(self, topic: RosTopic) -> bool:
-        """Return whether a topic has readers, or is latched for later readers."""
+        """Return whether messages of a topic must be published.
+
+        This is the case if the topic has readers, or if it is latched, so that later readers
+        receive its last message.
+        """
         return topic.latched or bool(self._writers[topic.name].get_matched_subscriptions())
 
     def write(self, topic: RosTopic, cdr: bytes) -> None:
-        """Publish a message (CDR bytes) on an advertised topic. Raises Ros2Error if this fails."""
+        """Publish a message on an advertised topic; raise Ros2Error if this fails.
+
+        cdr: serialized message.
+        """
         from cyclonedds.core import DDSException
 
         kind = make_dds_type(topic.ros_type)
@@ -173,7 +181,8 @@ class RosParticipant:
     def subscribe(self, topic: RosTopic, on_message: Callable[[bytes], None]) -> None:
         """Subscribe to a topic.
 
-        `on_message` is called in the running event loop with each message's CDR bytes.
+        on_message: function that is called in the running event loop with the CDR bytes of each
+        message.
         """
         from cyclonedds.core import InstanceState as State
         from cyclonedds.core import ReadCondition, SampleState, ViewState
@@ -215,10 +224,11 @@ class RosParticipant:
 
 
 def _make_qos(topic: RosTopic) -> Any:
-    """Return the quality of service: reliable, and for a latched topic also transient local.
+    """Return the DDS quality of service: reliable, and transient local for a latched topic.
 
-    A ROS 2 reader may request reliable or best-effort delivery, and a reliable writer serves both.
-    With the hash of the type, ROS 2 Iron and later releases list the topic without a warning.
+    A ROS 2 reader may request reliable or best-effort delivery; a reliable writer serves both. The
+    quality of service contains the hash of the type, so that ROS 2 Iron and later releases list the
+    topic without a warning.
     """
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration

@@ -1,7 +1,7 @@
 """Generate the ROS 2 package `flexsheet_msgs`, whose message types equal those of flexsheet.
 
-Each message type and each named group of fields becomes one ROS type of the same name. Fields are
-converted as follows:
+A message type or a named group of fields becomes a ROS type of the same name. Fields are converted
+as follows:
 
     bool, int, float, text              bool, int64, float64, string
     timestamp                           builtin_interfaces/Time
@@ -10,7 +10,7 @@ converted as follows:
     tuple of values of one type         sequence of the values
     anything else (such as a choice between several types)    string that contains JSON
 
-Images are omitted, because `mapping.VIEWS` contains them as sensor_msgs/Image.
+Images are omitted, because `mapping.VIEWS` converts them to sensor_msgs/Image.
 """
 
 from __future__ import annotations
@@ -33,17 +33,18 @@ from flexsheet.messages.field_types import get_annotation, is_image, split_annot
 
 PACKAGE = "flexsheet_msgs"
 HEADER = "std_msgs/Header header\nstring writer\nuint64 sequence_number\n"
-"""The first fields of each ROS message type. `writer` is the name of the publishing node."""
+"""The first fields of all generated ROS message types; `writer` is the publishing node."""
 
 ELEMENTS = {"<f8": "float64", "<f4": "float32", "<i4": "int32", "<i8": "int64", "|u1": "uint8"}
-"""The ROS element type for each NumPy element type of an array field."""
+"""The ROS element types of array fields, by NumPy element type."""
 
 Make = Callable[[str, dict[str, Any]], Any]
-"""A function that makes a ROS message from the name of its type and its fields."""
+"""The type of a function that makes a ROS message from the name of its type and its fields."""
 
 
 class Ros2Error(FlexsheetError, RuntimeError):
-    """Raised if messages cannot be exchanged with ROS 2. The text gives reason and remedy."""
+    """Raised if messages cannot be exchanged with ROS 2; the text states the reason and the
+    remedy."""
 
     code = "ros2"
     remedy = "Install the packages of the extra `flexsheet[ros2]`, or correct the named value."
@@ -51,7 +52,7 @@ class Ros2Error(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class OwnField:
-    """A field of a ROS type: name, ROS type, and function that converts a value to ROS."""
+    """A field of a generated ROS type: name, ROS type, and function that converts its values."""
 
     name: str
     ros_type: str
@@ -79,7 +80,7 @@ def ros_name(kind: type[BaseModel]) -> str:
 
 @cache
 def list_fields(kind: type[BaseModel]) -> tuple[OwnField, ...]:
-    """List the ROS fields of a message type or group in order of declaration, without images."""
+    """Return the ROS fields of a message type or group in order of declaration, without images."""
     stamps = find_stamp_fields(kind) if issubclass(kind, Message) else ()
     fields = []
     for name, info in kind.model_fields.items():
@@ -92,7 +93,7 @@ def list_fields(kind: type[BaseModel]) -> tuple[OwnField, ...]:
 
 
 def make_definitions(kinds: Iterable[type[Message]]) -> dict[str, str]:
-    """Return the .msg texts of message types and of their groups of fields, by ROS type name."""
+    """Return the .msg texts of message types and their groups of fields, by ROS type name."""
     found: dict[str, str] = {}
     waiting: list[type[BaseModel]] = list(kinds)
     while waiting:
@@ -108,14 +109,17 @@ def make_definitions(kinds: Iterable[type[Message]]) -> dict[str, str]:
 
 
 def convert_fields(value: BaseModel, make: Make) -> dict[str, Any]:
-    """Convert the fields of a message or group to ROS values, by field name."""
+    """Convert the fields of a message or group to ROS values, by field name.
+
+    make: function that makes a ROS message from type name and fields.
+    """
     return {
         one.name: one.convert(getattr(value, one.name), make) for one in list_fields(type(value))
     }
 
 
 def _list_groups(kind: type[BaseModel]) -> list[type[BaseModel]]:
-    """List the groups of fields to which the ROS type of a message or group refers by name."""
+    """Return the groups of fields to which the ROS type of a message or group refers by name."""
     named = {one.ros_type.partition("[")[0] for one in list_fields(kind)}
     groups: list[type[BaseModel]] = []
 
@@ -133,7 +137,7 @@ def _list_groups(kind: type[BaseModel]) -> list[type[BaseModel]]:
 
 
 def _describe(annotation: Any) -> tuple[str, Callable[[Any, Make], Any]]:
-    """Return the ROS type for a Python annotation, and the function that converts its values."""
+    """Return the ROS type of a Python annotation, and a function that converts its values."""
     annotation, spec = split_annotation(annotation)
     if spec is not None:
         return _describe_array(spec)
@@ -158,7 +162,11 @@ def _describe(annotation: Any) -> tuple[str, Callable[[Any, Make], Any]]:
 def _describe_sequence(
     item: Any, suffix: str, split: Callable[[Any], tuple[Any, ...]]
 ) -> tuple[str, Callable[[Any, Make], Any]]:
-    """Return the ROS type of a sequence and its conversion. None becomes an empty sequence."""
+    """Return the ROS type of a sequence, and a function that converts its values.
+
+    item: annotation of an element. suffix: array part of the ROS type, such as "[]". split:
+    function that returns the elements of a value. None becomes an empty sequence.
+    """
     item_type, convert = _describe(item)
     if "[" in item_type:  # ROS does not support sequences of sequences.
         adapter = TypeAdapter(item)
@@ -195,7 +203,7 @@ def _find_scalar(annotation: Any) -> str | None:
 
 
 def _holds_images(annotation: Any) -> bool:
-    """Return whether an annotation is that of an image, a tuple of images or an optional image."""
+    """Return whether an annotation describes an image, a tuple of images or an optional image."""
     inner, spec = split_annotation(annotation)
     if spec is not None:
         return is_image(spec)

@@ -1,8 +1,8 @@
 """Check messages of external ROS nodes, and convert them to messages of flexsheet.
 
 The messages are not trusted: a message is rejected unless its frame, numbers and timestamp are
-    plausible. External fingertips are filtered by the same tracker as those from the camera. No
-    external message commands the arms directly.
+plausible. External fingertips are filtered by the same tracker as those from the camera. No
+external message commands the arms directly.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MAX_FUTURE_S = 0.005
 
 @dataclass(frozen=True, slots=True)
 class RosInput:
-    """A ROS topic whose messages may be converted and published on a topic of flexsheet."""
+    """A ROS topic whose messages can be converted and published on a topic of flexsheet."""
 
     topic: str
     ros_topic: RosTopic
@@ -53,10 +53,10 @@ INPUTS = {
 
 @dataclass(slots=True)
 class ExternalInputs:
-    """A checker and converter of external messages.
+    """A converter of external messages that rejects implausible messages.
 
     noise_m: standard deviation of external fingertip positions. rejected: numbers of rejected
-        messages by reason.
+    messages by reason.
     """
 
     noise_m: float
@@ -75,9 +75,8 @@ class ExternalInputs:
         """Convert a ROS message, and return it with its source timestamp (ns) on the local clock.
 
         decode: function that returns the ROS message, or raises an exception for malformed bytes.
-            now_ns: current time of the local clock. unix_ns: current time since 1970.
-
-        Returns None if the message is rejected.
+        now_ns: current time of the local clock. unix_ns: current time since 1970, ns. Returns None
+        if the message is rejected.
         """
         try:
             if self.scene is None:
@@ -101,7 +100,8 @@ class ExternalInputs:
         return made, at_ns
 
     def _check_header(self, topic: str, header: Any, now_ns: int, unix_ns: int) -> int:
-        """Check the frame and timestamp of a header. Return the timestamp (ns) on the local clock.
+        """Check the frame and timestamp of a header, and return the timestamp (ns) on the local
+        clock.
 
         Raises RejectedError if the frame or the timestamp is invalid.
         """

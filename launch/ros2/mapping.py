@@ -1,7 +1,7 @@
 """Map topics of flexsheet to topics of ROS 2, for exported bags and for the live bridge.
 
-`VIEWS` lists the ROS topics with standard types, and `inputs.INPUTS` those that a ROS node may
-publish for flexsheet. In addition, each topic is published with all its fields as
+`VIEWS` lists the ROS topics with standard types, and `inputs.INPUTS` lists the topics that a ROS
+node may publish for flexsheet. In addition, each topic is published with all its fields as
 `flexsheet/TOPIC`. The module `definitions` generates the types of these topics.
 
 Children of the frame `world`: `object`, `camera_left`, `camera_right`, `projector`, `left_base`,
@@ -62,7 +62,7 @@ _FLOAT32 = 7
 
 
 class RosTypes:
-    """The ROS 2 message types with their CDR codec, including the types of `flexsheet_msgs`.
+    """A codec for ROS 2 messages in the CDR format, which includes the types of `flexsheet_msgs`.
 
     Raises Ros2Error if the package rosbags is not installed.
     """
@@ -80,15 +80,16 @@ class RosTypes:
         self.store.register(own)
 
     def make(self, name: str, fields: dict[str, Any]) -> Any:
-        """Make a ROS message of a type, such as `std_msgs/msg/Bool`, from its field values."""
+        """Make a ROS message of the type `name`, such as `std_msgs/msg/Bool`, from its field
+        values."""
         return self.store.types[name](**fields)
 
     def encode(self, name: str, message: Any) -> bytes:
-        """Serialize a message to CDR, including the encapsulation header of four bytes."""
+        """Serialize a message to CDR bytes, including the encapsulation header of four bytes."""
         return bytes(self.store.serialize_cdr(message, name))
 
     def decode(self, name: str, data: bytes) -> Any:
-        """Deserialize a message from CDR."""
+        """Deserialize a message of the type `name` from CDR bytes."""
         return self.store.deserialize_cdr(data, name)
 
     def stamp(self, at_ns: int) -> Any:
@@ -114,7 +115,7 @@ class RosTypes:
 
 @cache
 def load_ros_types() -> RosTypes:
-    """Load the ROS types on the first call, which takes about half a second."""
+    """Return the ROS types; the first call loads them, which takes about half a second."""
     return RosTypes()
 
 
@@ -135,7 +136,10 @@ class Source:
     flanges: dict[Side, Floats]
 
     def stamped(self, kind: str, name: str, value: Any, frame: str = WORLD) -> Any:
-        """Make a ROS message with a header and one further field, `name`."""
+        """Make a ROS message of type `kind` with a header and the field `name`.
+
+        frame: frame of the header.
+        """
         return self.ros.make(kind, {"header": self.ros.header(self.at_ns, frame), name: value})
 
 
@@ -143,10 +147,9 @@ class Source:
 class View:
     """A ROS topic with a standard type that represents some fields of a message.
 
-    message: type of the message. fields: names of the fields.
-    name: name of the ROS topic without its first slash; {topic} stands for the topic of the
-        message.
-    make: function that converts a message, or returns None if there is nothing to publish.
+    message: type of the message. fields: names of the fields. name: name of the ROS topic without
+    its first slash; {topic} is replaced by the flexsheet topic. make: function that converts a
+    message, or returns None if there is nothing to publish.
     """
 
     message: type[Message]
@@ -159,7 +162,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class RosTopic:
-    """A ROS 2 topic: name, which begins with a slash, ROS type, and whether it is latched.
+    """A ROS 2 topic: name (which begins with a slash), ROS type, and whether the topic is latched.
 
     Later readers of a latched topic receive its last message.
     """
@@ -290,7 +293,7 @@ FORCE_DIRECTIONS = {
     "left_edge": (1.0, 0.0, 0.0),
     "right_edge": (-1.0, 0.0, 0.0),
 }
-"""The direction of a positive measured force in the sheet frame, by the axis of the sensor."""
+"""The direction (3,) of a positive measured force in the sheet frame, by axis of the sensor."""
 
 
 def _measured_force(force: Force, source: Source) -> Any | None:
@@ -366,9 +369,9 @@ def _fingertip_frame(fingertip: Fingertip, source: Source) -> Any | None:
 
 
 def _eye_pose(eye: Eye, source: Source) -> Any | None:
-    """Return the pose of a frame at the midpoint of the eyes, or None if the eyes are not valid.
+    """Return the pose of the midpoint of the eyes; None if the eyes are not valid.
 
-    The x axis of the frame points from the left to the right eye.
+    The x axis of the pose points from the left to the right eye.
     """
     if not eye.valid:
         return None
@@ -413,10 +416,10 @@ def _deformed_points(body: SoftBody, source: Source) -> Any | None:
 
 
 def find_sheet_corners(scene: Scene | None, flanges: dict[Side, Floats]) -> Floats | None:
-    """Return the corners (4, 3), m, of a flat sheet between both clamped edges.
+    """Return the corners (4, 3), in m, of a flat sheet between both clamped edges.
 
-    Their order is lower left, upper left, lower right, upper right. flanges: poses (4, 4) by side.
-        Returns None if the scene or an arm is unknown.
+    The order is lower left, upper left, lower right, upper right. flanges: poses (4, 4) by side.
+    Returns None if the scene or an arm is unknown.
     """
     if scene is None or len(flanges) < 2:
         return None
@@ -536,7 +539,7 @@ VIEWS = (
 
 @cache
 def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
-    """List the ROS topics for a flexsheet topic with their views.
+    """Return the ROS topics for a flexsheet topic, with their views.
 
     Topics with standard types come first. The last topic contains all fields, and its view is None.
     """
@@ -554,7 +557,7 @@ def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
 class Converter:
     """A converter of the messages of one graph to ROS 2.
 
-    It stores the latest scene, skin and flange poses, which later conversions need.
+    The converter stores the latest scene, skin and flange poses, which later conversions need.
     """
 
     ros: RosTypes
@@ -572,8 +575,8 @@ class Converter:
     ) -> Iterator[tuple[RosTopic, Any]]:
         """Convert a message, and yield each resulting ROS message with its ROS topic.
 
-        shift_ns: time since 1970 minus time of the clock in the header. wanted: function that
-            returns whether a ROS topic needs a message.
+        shift_ns: difference between the time since 1970 and the clock of the header. wanted:
+        function that returns whether a ROS topic needs a message.
         """
         match message:
             case Scene():

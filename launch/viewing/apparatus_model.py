@@ -1,9 +1,9 @@
 """Describe the hardware of a scene (arms, camera, projector, sheet) by links and joints, like URDF.
 
 Links of each arm: `SIDE_base`, `SIDE_link_1` to `SIDE_link_6`, `SIDE_flange` and `SIDE_clamp`,
-    where SIDE is `left` or `right`. Other links: `world`, `camera_left`, `camera_right`,
-    `projector` and `screen`. The movable joints are `SIDE_joint_1` to `SIDE_joint_6`. The model
-    contains only geometry, because masses and torques are unknown.
+where SIDE is `left` or `right`. Other links: `world`, `camera_left`, `camera_right`, `projector`
+and `screen`. The movable joints are `SIDE_joint_1` to `SIDE_joint_6`. The model contains only
+geometry, because masses and torques are unknown.
 """
 
 from __future__ import annotations
@@ -34,14 +34,18 @@ LENS: Colour = (0.0, 0.42, 0.58, 1.0)
 SCREEN: Colour = (0.97, 0.93, 0.84, 0.35)
 
 CAMERA_BODY_M: Vector = (0.05, 0.035, 0.045)
-"""The size (x, y, z) of the drawn housing of each camera, which is centred behind the lens."""
+"""The size (x, y, z), in metres, of the drawn housing of a camera, which is centred behind the
+lens."""
 PROJECTOR_BODY_M: Vector = (0.16, 0.07, 0.12)
 LENS_LENGTH_M = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A box of a link: size and centre (m) in the link's frame, and colour as RGBA (0 to 1)."""
+    """A box that represents a part of a link.
+
+    The size and centre are in m in the link's frame; the colour is RGBA (0 to 1).
+    """
 
     size_m: Vector
     centre_m: Vector
@@ -58,7 +62,8 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class JointLimit:
-    """The axis of a revolute joint in the frame of its child link, its range and maximum speed."""
+    """The rotation axis in the frame of the child link, range and maximum speed of a revolute
+    joint."""
 
     axis: Vector
     min_rad: float
@@ -71,7 +76,7 @@ class Joint:
     """A joint between two links.
 
     parent_from_child: pose (4, 4) of the child at joint angle zero. limit: axis and range of a
-        revolute joint; None for a fixed joint.
+    revolute joint; None for a fixed joint.
     """
 
     name: str
@@ -81,7 +86,8 @@ class Joint:
     limit: JointLimit | None = None
 
     def pose(self, angle_rad: float) -> Floats:
-        """Return the pose (4, 4) of the child at a joint angle. A fixed joint ignores the angle."""
+        """Return the pose (4, 4) of the child link at a joint angle; a fixed joint ignores the
+        angle."""
         if self.limit is None:
             return self.parent_from_child
         rotation = rotation_from_vector(angle_rad * np.array(self.limit.axis))
@@ -90,16 +96,17 @@ class Joint:
 
 @dataclass(frozen=True, slots=True)
 class ApparatusModel:
-    """The links and joints of the apparatus. Each parent link precedes its child links."""
+    """The links and joints of the apparatus, sorted so that parent links precede their child
+    links."""
 
     name: str
     links: tuple[Link, ...]
     joints: tuple[Joint, ...]
 
     def poses(self, angles_rad: Mapping[str, float]) -> dict[str, Floats]:
-        """Return the world poses (4, 4) of all links.
+        """Return the world poses (4, 4) of all links, by name.
 
-        The angle of a joint without entry is zero.
+        angles_rad: joint angles by joint name; missing angles are zero.
         """
         found = {WORLD: np.eye(4)}
         for joint in self.joints:
@@ -108,7 +115,7 @@ class ApparatusModel:
 
 
 def make_model(scene: Scene) -> ApparatusModel:
-    """Make the model of both arms with clamps, the stereo camera, the projector and the screen.
+    """Return a model of both arms with clamps, the stereo camera, the projector and the screen.
 
     The screen is the unstretched sheet at the origin of the world. The joint angles of the model
     equal the readings of the encoders.
@@ -125,9 +132,10 @@ def make_model(scene: Scene) -> ApparatusModel:
 
 
 def solve_rest_joints(scene: Scene) -> dict[str, float]:
-    """Return the joint angles (rad), by joint name, at which the arms hold the sheet at the screen.
+    """Return the joint angles (rad), by joint name, with which the arms hold the sheet at the
+    screen.
 
-    For an arm that cannot reach the screen, return the centres of its joint ranges.
+    For an arm that cannot reach the screen, the centres of its joint ranges are returned.
     """
     angles: dict[str, float] = {}
     for side in get_args(Side):
@@ -145,7 +153,7 @@ def solve_rest_joints(scene: Scene) -> dict[str, float]:
 
 
 def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
-    """Yield each link of an arm, from base to clamp, with the joint to its parent."""
+    """Yield the links of an arm, from base to clamp, with the joints to their parents."""
     arm = scene.arms.left if side == "left" else scene.arms.right
     chain = arm.model.chain() if isinstance(arm.model, ClosedFormArm) else arm.model
     numbered = [f"{side}_link_{number}" for number in range(1, 7)]
@@ -183,7 +191,7 @@ def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
 
 
 def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]:
-    """Yield name, world pose (4, 4) and boxes of each camera, the projector and the screen."""
+    """Yield name, world pose (4, 4) and boxes of both cameras, the projector and the screen."""
     left = pose_matrix(scene.camera.world_from_left)
     yield "camera_left", left, _make_device(CAMERA_BODY_M, 0.02)
     right = left @ inverse(np.asarray(scene.camera.right_from_left))
@@ -198,7 +206,11 @@ def _list_devices(scene: Scene) -> Iterator[tuple[str, Floats, tuple[Box, ...]]]
 
 
 def _make_device(body_m: Vector, lens_m: float) -> tuple[Box, ...]:
-    """Make boxes for the housing and lens of a device. The lens is at the origin and faces +z."""
+    """Return boxes for the housing and the lens of a device; the lens is at the origin and faces
+    +z.
+
+    body_m: size of the housing. lens_m: size of the lens.
+    """
     depth_m = body_m[2]
     return (
         Box(body_m, (0.0, 0.0, -0.5 * (depth_m + LENS_LENGTH_M)), DARK),

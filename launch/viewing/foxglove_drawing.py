@@ -1,4 +1,4 @@
-"""Draw poses, surfaces and the finger as messages of Foxglove, in the world frame.
+"""Convert poses, surfaces and the finger to 3D messages of Foxglove, in the world frame.
 
 The package foxglove-sdk is required.
 """
@@ -24,12 +24,15 @@ PATH_WIDTH_M = 0.001
 
 
 def make_stamp(at_ns: int) -> Any:
-    """Make a Foxglove timestamp from a time (ns) since 1970."""
+    """Convert a time (ns since 1970) to a Foxglove timestamp."""
     return fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
 
 
 def make_frame(parent: str, child: str, parent_from_child: Floats, stamp: Any) -> Any:
-    """Make the transform between two frames from the pose (4, 4) of the child."""
+    """Make the Foxglove transform between two frames.
+
+    parent_from_child: pose (4, 4) of the child frame in the parent frame.
+    """
     return fg.FrameTransform(
         timestamp=stamp,
         parent_frame_id=parent,
@@ -42,7 +45,10 @@ def make_frame(parent: str, child: str, parent_from_child: Floats, stamp: Any) -
 def draw_mesh(
     name: str, vertices: NDArray[Any], triangles: NDArray[Any], stamp: Any, rgba: Colour
 ) -> Any:
-    """Draw a surface with vertices (n, 3), m, and triangles (k, 3)."""
+    """Make a Foxglove scene update that draws a triangle mesh.
+
+    vertices: (n, 3), m. triangles: (k, 3), vertex indices.
+    """
     surface = fg.TriangleListPrimitive(
         pose=make_pose(np.eye(4)),
         points=_make_points(vertices),
@@ -53,7 +59,7 @@ def draw_mesh(
 
 
 def draw_finger(message: Fingertip, radius_m: float, stamp: Any) -> Any:
-    """Draw the fingertip as a sphere, and its predicted path as a line."""
+    """Make a Foxglove scene update that draws the fingertip as a sphere and its predicted path."""
     colour = FINGER_COLOUR if message.valid else LOST_COLOUR
     path = fg.LinePrimitive(
         type=fg.LinePrimitiveLineType.LineStrip,
@@ -76,7 +82,7 @@ def make_entity(name: str, stamp: Any, frame: str = WORLD, **shapes: Any) -> Any
 
 
 def make_estop_log(message: EStop, stamp: Any, topic: str) -> Any:
-    """Make a log entry of an e-stop or of its reset."""
+    """Make a Foxglove log entry about an e-stop or its reset."""
     level = fg.LogLevel.Fatal if message.engaged else fg.LogLevel.Info
     text = f"e-stop {'engaged' if message.engaged else 'reset'}: {message.reason}"
     return fg.Log(timestamp=stamp, level=level, message=text, name=topic)

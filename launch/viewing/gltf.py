@@ -1,8 +1,8 @@
 """Write the model of the apparatus as glTF 2.0, for 3D viewers and modelling programs.
 
-Each joint is a glTF node of the same name, and its child link is the node below it. Rotating the
-node of a joint therefore moves all following links. The `extras` of the node contain the axis and
-the range of the joint. As usual in glTF, y points up and z towards the user.
+A joint is a glTF node of the same name, and its child link is the node below it. Rotating the node
+of a joint therefore moves all following links. The `extras` of the node contain the axis and the
+range of the joint. As is usual in glTF, y points up and z points to the user.
 """
 
 from __future__ import annotations
@@ -27,12 +27,18 @@ _visual: Any = trimesh.visual
 
 
 def make_glb(model: ApparatusModel, angles_rad: Mapping[str, float]) -> bytes:
-    """Return the model as binary glTF, at joint angles (rad) given by joint name."""
+    """Return the model as binary glTF at the given joint angles.
+
+    angles_rad: joint angles by joint name.
+    """
     return bytes(_gltf.export_glb(_make_scene(model, angles_rad)))
 
 
 def make_gltf(model: ApparatusModel, angles_rad: Mapping[str, float]) -> str:
-    """Return the model as glTF JSON with embedded meshes, at joint angles (rad) by joint name."""
+    """Return the model as glTF JSON with embedded meshes at the given joint angles.
+
+    angles_rad: joint angles by joint name.
+    """
     scene = _make_scene(model, angles_rad)
     files = _gltf.export_gltf(scene, merge_buffers=True, embed_buffers=True)
     return json.dumps(json.loads(files[GLTF_FILE]), indent=1) + "\n"

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from flexsheet.messages.field_types import get_annotation, split_annotation
 
 MAX_ARRAY = 64
-"""The maximum number of elements of an array in a JSON message. Larger arrays are omitted."""
+"""The maximum number of elements of an array in a JSON message; larger arrays are omitted."""
 
 JsonSchema = dict[str, Any]
 _NUMBER: JsonSchema = {"type": "number"}
@@ -27,13 +27,13 @@ _OMITTED = object()
 
 @cache
 def make_schema(kind: type[BaseModel]) -> JsonSchema:
-    """Return the JSON Schema that describes the output of `to_json` for a message type."""
+    """Return the JSON Schema that describes the result of `to_json` for a message type."""
     fields = {name: _describe(get_annotation(info)) for name, info in kind.model_fields.items()}
     return {"type": "object", "title": kind.__name__, "properties": fields}
 
 
 def to_json(value: Any) -> Any:
-    """Convert a message to JSON types. Arrays of more than `MAX_ARRAY` elements are omitted."""
+    """Convert a message to JSON types; omit arrays with more than `MAX_ARRAY` elements."""
     found = _convert(value)
     return None if found is _OMITTED else found
 
@@ -86,10 +86,10 @@ def _describe_type(kind: type) -> JsonSchema:
 
 
 def _merge(schemas: list[JsonSchema]) -> JsonSchema:
-    """Return one JSON Schema for values of several types.
+    """Return one JSON Schema that describes values of several types.
 
-    If all types are objects, the schema contains the fields of all types. Otherwise it is an array
-    or text.
+    If all types are objects, the schema contains the fields of all types. Otherwise it describes an
+    array or text.
     """
     if not schemas:
         return _TEXT

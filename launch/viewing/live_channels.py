@@ -1,6 +1,6 @@
 """Define the channels that live viewers can display, and make their messages from the graph.
 
-Each topic of the graph becomes a JSON channel of the same name. The other channels are:
+A topic of the graph becomes a JSON channel of the same name. The other channels are:
 
     tf                                   poses of links, sheet target and fingertip
     apparatus, sheet, object, finger     the 3D scene
@@ -8,7 +8,7 @@ Each topic of the graph becomes a JSON channel of the same name. The other chann
     TOPIC/left, TOPIC/right, ...         images as JPEG; .../calibration of the stereo camera
     log                                  e-stops and notes of the nodes
 
-In the frame `viewer` z points up, as viewers expect. In the frame `world` y points up.
+In the frame `viewer`, z points up, as viewers expect. In the frame `world`, y points up.
 """
 
 from __future__ import annotations
@@ -71,15 +71,18 @@ VIEWER_FROM_WORLD = transform(rotation_from_vector((0.5 * np.pi, 0.0, 0.0)), np.
 EYE_COLOUR: Colour = (0.98, 0.98, 0.98, 1.0)
 EYE_RADIUS_M = 0.011
 SHEET_STEP = 2
-"""The step between the rows and columns of the sheet's mesh that are sent to viewers."""
+"""The step between the mesh rows and columns of the sheet that are sent to viewers.
+
+For example, 2 means that every second row and column is sent.
+"""
 JPEG_QUALITY = 80
 
 
 class Pace(Enum):
-    """The rule for how often a channel sends messages.
+    """The rule that determines how often a channel sends messages.
 
-    NUMBERS, IMAGES: at most at the configured rate of numbers or images. EACH: every message.
-        STATIC: when the scene changes, and once per second for viewers that connect later.
+    NUMBERS, IMAGES: at most at the configured rate of numbers or images. EACH: at every message.
+    STATIC: when the scene changes, and once per second for viewers that connect later.
     """
 
     NUMBERS = "numbers"
@@ -90,7 +93,7 @@ class Pace(Enum):
 
 @dataclass(slots=True)
 class LiveState:
-    """The latest message of each topic, with the model of the apparatus and its joints."""
+    """The latest message of each topic, together with the model of the apparatus and its joints."""
 
     latest: dict[str, Message] = field(default_factory=dict)
     model: ApparatusModel | None = None
@@ -113,7 +116,8 @@ class LiveState:
         return found if isinstance(found, Fingertip) else None
 
     def edges(self) -> tuple[Floats, Floats] | None:
-        """Return the world poses (4, 4) of the left and right clamped edge, or None if unknown."""
+        """Return the world poses (4, 4) of the left and right clamped edge; None if they are
+        unknown."""
         scene, found = self.scene, []
         for side in get_args(Side):
             state = self.latest.get(f"arm_{side}")
@@ -126,13 +130,12 @@ class LiveState:
 
 @dataclass(frozen=True, slots=True)
 class LiveChannel:
-    """A channel of the live view.
+    """A channel that viewers can display.
 
-    topics: topics of the graph that the channel needs in addition to the scene.
-    triggers: topics whose messages cause the channel to send.
-    make: function that makes a message of the channel from the state, the received message and its
-        timestamp, or returns None if there is nothing to send.
-    schema: JSON Schema, or None for messages of the Foxglove type `kind`.
+    topics: topics of the graph that the channel needs in addition to the scene. triggers: topics
+    whose messages cause the channel to send. make: function (state, received message, timestamp)
+    that returns a message of the channel, or None if there is nothing to send. schema: JSON Schema,
+    or None for messages of the Foxglove type `kind`.
     """
 
     name: str

@@ -41,16 +41,19 @@ ADDRESS = "127.0.0.1"
 MAX_BACKLOG = 64
 """The maximum number of messages in the queue of one viewer."""
 UPDATE_S = 0.1
-"""The period with which the server checks which channels have viewers."""
+"""The period, in seconds, with which the server checks which channels have viewers."""
 STATIC_S = 1.0
 TIME_S = 1.0 / 30.0
 ALWAYS_READ = frozenset({"scene", "status"})
-"""The topics that the server always reads, because they are small and give poses and parameters."""
+"""The topics that the server always reads.
+
+They are small, and contain the scene and the values of parameters.
+"""
 URDF_PARAMETER = "/robot_description"
 
 
 class ReadOnlyParameters(ServerListener):
-    """A listener that answers requests for parameters.
+    """A listener that answers the viewers' requests for parameters.
 
     It ignores requests to change parameters, and answers them with the present values.
     """
@@ -73,11 +76,11 @@ class ReadOnlyParameters(ServerListener):
 
 
 class LiveServer:
-    """A server that shows one running graph to viewers. It requires a running event loop.
+    """A server that sends the data of one running graph to viewers.
 
-    rate_hz: maximum rate of numbers per channel. image_rate_hz: maximum rate of images and meshes
-        per channel. port: TCP port; 0 selects a free port. on_problem: function that is called with
-        the text of an error.
+    The server requires a running event loop. rate_hz: maximum rate of numbers per channel.
+    image_rate_hz: maximum rate of images and meshes per channel. port: TCP port; 0 selects a free
+    port. on_problem: function that is called with the text of an error.
     """
 
     def __init__(
@@ -139,7 +142,10 @@ class LiveServer:
         return set(self._subscribers)
 
     async def serve(self) -> None:
-        """Serve until the calling task is cancelled. Raises exceptions of the server's tasks."""
+        """Serve viewers until the calling task is cancelled.
+
+        Raises the exceptions of the server's tasks.
+        """
         await asyncio.gather(*self._tasks)
 
     def close(self) -> None:
@@ -168,7 +174,7 @@ class LiveServer:
             await asyncio.sleep(period_s)
 
     def _update_subscribers(self) -> None:
-        """Subscribe to the topics that channels with viewers need, and to no other topics."""
+        """Subscribe only to the topics that channels with viewers need."""
         wanted = set(ALWAYS_READ & self._plan.writers.keys())
         for channel in self.channels:
             if self._sinks[channel.name].has_sinks():
@@ -204,7 +210,10 @@ class LiveServer:
     def _send(
         self, channel: LiveChannel, topic: str, message: Message | None, now_ns: int, source_ns: int
     ) -> None:
-        """Send a message on a channel if the channel has viewers and its period has elapsed."""
+        """Send a message on a channel if the channel has viewers and its period has elapsed.
+
+        now_ns: present time. source_ns: timestamp of the message.
+        """
         sink, key = self._sinks[channel.name], (channel.name, topic)
         if now_ns < self._due_ns.get(key, 0) or not sink.has_sinks():
             return
@@ -223,7 +232,7 @@ class LiveServer:
         self._server.broadcast_time(self._clock.now_ns() + self._epoch_ns)
 
     def _set_parameters(self, values: dict[str, Any]) -> None:
-        """Store parameters, and send those that changed to the subscribed viewers."""
+        """Store parameter values, and send the changed values to the subscribed viewers."""
         plain = {key: _make_plain(value) for key, value in values.items() if value is not None}
         old = self._parameters.values
         changed = {key: value for key, value in plain.items() if old.get(key) != value}
@@ -234,7 +243,10 @@ class LiveServer:
 
 
 def _make_plain(value: Any) -> Any:
-    """Convert a value to a parameter type: numbers to float, other types except bool to text."""
+    """Convert a value to a parameter type of Foxglove.
+
+    Numbers become floats, bool values are unchanged, and all other values become text.
+    """
     if isinstance(value, bool | str):
         return value
     if isinstance(value, int | float):
