@@ -1,1 +1,2 @@
-"""Command line, launch files and scenes, supervision of nodes, experiments, method benchmarks."""
+"""The command line, launch files and scenes, the supervisor of nodes, experiments and
+benchmarks."""

@@ -1,7 +1,7 @@
-"""Entry point of the `flexsheet` command.
+"""Define the entry point of the `flexsheet` command.
 
 The table `COMMANDS` lists all subcommands. The module of a subcommand in `launch.commands` is
-imported only when it is called, so that commands start fast.
+imported only when the subcommand is called, so that commands start fast.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 }
 """The modules of each command in `flexsheet.launch.commands`, in the order of `--help`.
 
-The first module defines the typer app, called `app` or as given after a colon. The other modules
-add commands to it with `register(app)`.
+The first module defines the typer app. Its variable is `app`, or the name after the colon. The
+other modules add commands to the app with `register(app)`.
 """
 
 
@@ -87,7 +87,7 @@ def _import(module: str) -> Any:
 
 
 INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "run", "topic", "arms", "view"})
-"""Commands for which Python's SIGINT handler is not installed.
+"""The commands for which Python's SIGINT handler is not installed.
 
 Before the event loop of such a command handles SIGINT, the signal ends the command without cleanup.
 In all other commands, Python's handler raises KeyboardInterrupt, and the command cleans up.
@@ -103,11 +103,11 @@ ROS_COMMANDS = {
     "rviz2": "`flexsheet view` shows a running graph in Foxglove",
     "tf": "`flexsheet view` shows the transforms in Foxglove",
 }
-"""The commands of ROS 2 that flexsheet does not have, and the command to use instead."""
+"""The commands of ROS 2 that flexsheet does not have, with the commands to use instead."""
 
 
 class CommandTable(Mapping[str, Any]):
-    """A read-only table of commands by name, which imports each command on first use."""
+    """A read-only table of commands by name, which imports a command when it is first used."""
 
     def __getitem__(self, name: str) -> Any:
         return load_command(name)
@@ -120,7 +120,7 @@ class CommandTable(Mapping[str, Any]):
 
 
 class CommandGroup(TyperGroup):
-    """A group of commands that imports each command on first use."""
+    """A command group whose commands are imported when they are first used."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -128,7 +128,11 @@ class CommandGroup(TyperGroup):
         self.commands = CommandTable()  # type: ignore[assignment]  # a read-only mapping
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command, and restore Python's SIGINT handler for commands that need it."""
+        """Return the command that the arguments name.
+
+        Python's SIGINT handler is restored for commands that need it. Raises CommandError for a
+        command of ROS 2 that does not exist here.
+        """
         if args and (instead := ROS_COMMANDS.get(args[0])):
             raise CommandError(f'no command "{args[0]}"; {instead}', BAD_INPUT)
         found = super().resolve_command(ctx, args)
@@ -152,7 +156,7 @@ app = typer.Typer(
 
 
 def _print_version(requested: bool) -> None:
-    """Print the version and exit, if the option --version is given."""
+    """Print the version and exit if the option --version is given."""
     if requested:
         from importlib.metadata import version
 
@@ -173,7 +177,7 @@ def flexsheet(
 
 
 def main() -> None:
-    """Run the command line; print errors that users can correct without a traceback."""
+    """Run the command line; errors that the user can correct are printed without a traceback."""
     try:
         app(prog_name="flexsheet")
     except Exception as error:
@@ -187,14 +191,18 @@ def main() -> None:
 
 
 def error_text(error: Exception) -> str:
-    """Return the text of an error; the text of a disk error also states the path and a remedy."""
+    """Return the text of an error.
+
+    For an error of the operating system, the text also contains the path and a remedy.
+    """
     if not isinstance(error, OSError) or isinstance(error, FileWriteError):
         return str(error)
     return str(make_write_error(Path(error.filename or "standard output"), error))
 
 
 def explained_by(error: Exception) -> str | None:
-    """Return the command that explains an error; None if the error's text contains the remedy."""
+    """Return the command line that explains an error; None if the error's text contains the
+    remedy."""
     if not isinstance(error, FlexsheetError) or isinstance(error, CommandError):
         return None
     if error.exit_code == BAD_INPUT or isinstance(error.__cause__, FileNotFoundError):

@@ -1,4 +1,5 @@
-"""Set up the process of a node: the process ends with its launcher and gets the node's niceness."""
+"""Set up the process of a node, so that it ends with its launcher and has the configured
+niceness."""
 
 from __future__ import annotations
 
@@ -14,16 +15,17 @@ PARENT_VARIABLE = "FLEXSHEET_PARENT"
 LIFELINE_VARIABLE = "FLEXSHEET_LIFELINE"
 """The environment variable with the file descriptor of the lifeline.
 
-The lifeline is a pipe to which nothing is written. A read from the pipe ends when the launcher
+The lifeline is a pipe to which nothing is written. A read from the pipe returns when the launcher
 exits.
 """
 
 NICE_VARIABLE = "FLEXSHEET_NICE"
 
 AUTOGROUP = Path("/proc/self/autogroup")
-"""The file with the niceness of a session, by which Linux shares the processor among sessions.
+"""The file with the niceness of a session; Linux distributes processor time among sessions.
 
-Each node is a separate session, so the niceness of its process alone has little effect."""
+Each node has its own session, so the niceness of its process alone has little effect.
+"""
 
 AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
 """The number of attempts to write AUTOGROUP, and the time (s) between two attempts.
@@ -36,11 +38,11 @@ _PR_SET_PDEATHSIG = 1
 
 
 def exit_with_parent() -> None:
-    """End this process when its launcher exits: SIGTERM first, SIGKILL after `GRACE_S`.
+    """End this process when its launcher exits.
 
     The kernel sends SIGTERM when the launcher exits, even if the event loop of the process hangs.
-    If the process ignores SIGTERM, a thread that reads the lifeline kills the process and its
-    children.
+    If the process has not ended after `GRACE_S`, a thread that reads the lifeline kills the process
+    and its children.
     """
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None:
@@ -62,9 +64,10 @@ def _end_with_lifeline(lifeline: int) -> None:
 
 
 def apply_niceness() -> None:
-    """Add the niceness that the node's configuration requires to the process and its session.
+    """Set the niceness of this process and its session to the value in the node's configuration.
 
-    A negative niceness means higher priority. Raises OSError if the system does not permit it.
+    The value is added to the inherited niceness; a negative value gives higher priority. Raises
+    OSError if the system does not permit this niceness.
     """
     nice = int(os.environ.get(NICE_VARIABLE, "0"))
     if nice == 0:

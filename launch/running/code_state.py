@@ -9,10 +9,10 @@ from pathlib import Path
 
 COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 SOURCE_PATHS = ("messages", "nodes", "launch", "flexsheet", "pyproject.toml")
-"""The paths in the repository that contain all the code of a run."""
+"""The paths in the repository that contain all code of flexsheet."""
 
 SOURCE_SUFFIXES = {".py", ".glsl", ".css", ".js"}
-"""The suffixes of untracked files that count as a change of the code.
+"""The suffixes of untracked files that count as changes of the code.
 
 Other files, such as new scenes and meshes, affect a run only if a launch file names them.
 """
@@ -21,10 +21,10 @@ UNTRACKED = "??"
 
 
 def read_git_state(directory: Path) -> str:
-    """Return a JSON text with the keys `commit` of the code and `changed` for modified files.
+    """Return a JSON text with the git commit of the code, and whether files have changed.
 
-    directory: root of the repository. Outside of a git repository, `commit` is the value of
-    COMMIT_VARIABLE or null, and `changed` is null.
+    directory: root of the repository. The keys are `commit` and `changed`. Outside of a git
+    repository, `commit` is the value of COMMIT_VARIABLE or null, and `changed` is null.
     """
     listed = _git(
         directory, "status", "--porcelain", "-z", "--untracked-files=all", "--", *SOURCE_PATHS
@@ -37,7 +37,10 @@ def read_git_state(directory: Path) -> str:
 
 
 def _has_changed_sources(listed: str) -> bool:
-    """Return whether the output of `git status --porcelain -z` lists changed or new code files."""
+    """Return whether the code has changed, according to the output of `git status --porcelain -z`.
+
+    listed: output of this command, which lists changed and untracked files.
+    """
     entries = [entry for entry in listed.split("\0") if entry]
     return any(
         not entry.startswith(UNTRACKED) or Path(entry).suffix in SOURCE_SUFFIXES
@@ -46,7 +49,7 @@ def _has_changed_sources(listed: str) -> bool:
 
 
 def _git(directory: Path, *arguments: str) -> str | None:
-    """Run git and return its output; None if git fails or is not installed."""
+    """Run git in a directory and return its output; None if git fails or is not installed."""
     try:
         result = subprocess.run(
             # Without this option git refuses a clone that belongs to another user.

@@ -1,9 +1,9 @@
 """Measure how long nodes wait for a processor core, and which programs use the cores.
 
 For each thread, Linux counts the time in which it was ready to run but did not get a core
-(`/proc/PID/schedstat`).  The main thread of a node runs its event loop, so this wait delays the
-whole node.  System-wide counters (load, /proc/pressure) do not show whether nodes are delayed,
-because they include programs of high niceness, which wait by design.
+(`/proc/PID/schedstat`). The main thread of a node runs its event loop, so this wait delays the
+whole node. System-wide counters (load, /proc/pressure) do not show whether nodes are delayed. They
+include programs of high niceness, which are expected to wait.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from pathlib import Path
 from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
-"""The maximum fraction of time that a node may wait for a core on a computer without overload."""
+"""The maximum fraction of time that a node waits for a core on a computer without overload."""
 
 WINDOW_S = 3.0
 BACKGROUND_NICE = 10
-"""The minimum niceness of nodes that wait by design and whose waiting time is ignored."""
+"""The minimum niceness of nodes whose waiting time is ignored, because they are expected to
+wait."""
 
 MAX_PROGRAMS = 3
 MIN_CORES = 0.1
@@ -32,14 +33,14 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Waits:
-    """A sample of the total waiting time (s) of each process id, taken at `time_s`."""
+    """A sample of the total waiting times (s) by process id, taken at the time `time_s`."""
 
     time_s: float
     waited_s: dict[int, float]
 
 
 class CpuWatch:
-    """A measurement of waiting and processor times over the last WINDOW_S.
+    """A monitor of waiting times and processor times over the last WINDOW_S.
 
     Call `update` once a second. proc: folder of the kernel's counters. now_s: function that returns
     the time (s) of the monotonic clock.
@@ -57,13 +58,15 @@ class CpuWatch:
         *,
         measure_programs: bool = False,
     ) -> CpuPressure | None:
-        """Return the CPU pressure on the node that waited longest for the processor.
+        """Return the name and waiting time of the node that waited longest for the processor.
 
-        The wait is measured over the last WINDOW_S. Return None if no waiting time is known.
+        The waiting time is measured over the last WINDOW_S. Returns None if no waiting time is
+        known.
 
-        watched: process ids by node name, of the nodes whose waiting time is measured.
-        named: process ids by node name, of the nodes that are reported by name; None: `watched`.
-        measure_programs: whether to list the programs even if the computer is not overloaded.
+        watched: process ids by node name, of the nodes whose waiting time is measured. named:
+        process ids by node name, of the nodes that are reported by name; None: `watched`.
+        measure_programs: whether to list the running programs even if the computer is not
+        overloaded.
         """
         now_s = self._now_s()
         counted = {pid: self._waited_s(pid) for pid in watched.values()}
@@ -90,7 +93,8 @@ class CpuWatch:
         return next((one for one in self._history if pid in one.waited_s), None)
 
     def _waited_s(self, pid: int) -> float | None:
-        """Return the total waiting time (s) of a process's main thread; None if it is unknown."""
+        """Return the total waiting time (s) of the main thread of a process; None if it is
+        unknown."""
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()
         except OSError:
@@ -98,9 +102,10 @@ class CpuWatch:
         return int(fields[1]) * 1e-9
 
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
-        """Return the programs that used most processor time since the last call.
+        """Return the programs that have used most processor time since the last call.
 
-        Return no programs if the last call is more than WINDOW_S ago.
+        Returns no programs if the last call is more than WINDOW_S ago. named: process ids by node
+        name.
         """
         names = {pid: name for name, pid in named.items()}
         used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}

@@ -1,7 +1,8 @@
 """Store an engaged emergency stop (e-stop) in a file, so that it survives a launcher's restart.
 
 Only a reset of the e-stop removes the file. A file that cannot be read is treated as an e-stop. The
-file name contains a hash of the arms' addresses, so only graphs with the same arms share it.
+file name contains a hash of the arms' addresses, so that only graphs with the same arms share the
+file.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ STATE_VARIABLE = "FLEXSHEET_STATE"
 
 
 def directory() -> Path:
-    """Return the folder in which launchers of this user store state that survives a reboot."""
+    """Return this user's folder for data that must survive a restart of the computer."""
     configured = os.environ.get(STATE_VARIABLE)
     if configured:
         return Path(configured)
@@ -37,7 +38,7 @@ class EStopFile:
         self.path = directory() / f"estop-{host}-{digest}.json"
 
     def read(self) -> EStop | None:
-        """Return the stored e-stop, or None.  An unreadable file also counts as an e-stop."""
+        """Return the stored e-stop, or None; an unreadable file counts as an e-stop."""
         try:
             reason = json.loads(self.path.read_text())["reason"]
         except FileNotFoundError:
@@ -47,7 +48,7 @@ class EStopFile:
         return EStop(engaged=True, reason=str(reason))
 
     def write(self, estop: EStop) -> None:
-        """Store the e-stop durably, so that it survives a power failure.  Raises OSError."""
+        """Store the e-stop so that it survives a power failure; raise OSError if this fails."""
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         part = self.path.with_suffix(".part")
         with part.open("w") as file:
@@ -58,7 +59,7 @@ class EStopFile:
         self._sync_folder()
 
     def remove(self) -> None:
-        """Remove the file after a reset of the e-stop.  Raises OSError."""
+        """Remove the file after a reset of the e-stop; raise OSError if this fails."""
         self.path.unlink(missing_ok=True)
         if self.path.parent.is_dir():
             self._sync_folder()

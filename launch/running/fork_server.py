@@ -1,10 +1,11 @@
 """Start nodes as forks of one process that has already imported their modules.
 
-The imports of a node take longer than the rest of its start.  The fork server is a process with a
-single thread, which imports the modules of a graph once and opens no sockets of the graph.  It
-forks twice: the intermediate process ends at once, so the kernel makes the launcher the parent of
-the node's process (the launcher is a subreaper, prctl(2)).  Signals, exit code, priority and the
-end with the launcher are therefore those of a process that the launcher has started itself.
+The imports of a node take longer than the rest of its start. The fork server is a process with a
+single thread, which imports the modules of a graph once and opens no sockets of the graph.
+
+The fork server forks twice. The intermediate process ends immediately, so the kernel makes the
+launcher the parent of the node's process (the launcher is a subreaper, prctl(2)). Therefore
+signals, exit codes and priorities work as for a process that the launcher has started itself.
 
 If the fork server ends, does not answer, or has started a thread, nodes are started without it.
 """
@@ -33,25 +34,32 @@ REQUEST_BYTES = 65_536
 PID_BYTES = 8
 READY = b"ready"
 ANSWER_S = 1.0
-"""Time within which the fork server must answer a request; it takes a few milliseconds."""
+"""The time (s) in which the fork server must answer a request; it usually takes milliseconds."""
 
 READY_S = 20.0
-"""Time within which the fork server must have imported the modules."""
+"""The time (s) in which the fork server must have imported the modules."""
 
 _PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36
 _ARGUMENTS_START, _ARGUMENTS_END = 45, 46
-"""Indices of the fields in /proc/self/stat after the program's name, see proc(5)."""
+"""The indices of the fields with the address range of the arguments in /proc/PID/stat.
+
+The indices count from the field after the program's name, see proc(5).
+"""
 
 
 class ForkedProcess:
-    """Process that was forked for this one; like `subprocess.Popen` without pipes."""
+    """A process that the fork server has started, with an interface like `subprocess.Popen`.
+
+    Pipes are not supported.
+    """
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
         self.returncode: int | None = None
 
     def wait(self) -> int:
-        """Reap the process; return its exit code, or minus the signal that has ended it."""
+        """Wait for the end of the process; return its exit code, or minus the signal that ended
+        it."""
         if self.returncode is None:
             _, status = os.waitpid(self.pid, 0)
             self.returncode = os.waitstatus_to_exitcode(status)
@@ -59,11 +67,11 @@ class ForkedProcess:
 
 
 class ForkServer:
-    """Launcher's side of the fork server.
+    """The launcher's connection to a fork server, whose process the constructor starts.
 
-    node_types: types of the nodes; modules of types outside this package are not imported, since
-    they may start threads.  config_files: files of all processes that may be started.
-    lifeline: file descriptor that the nodes inherit.  log: file for the server's own output.
+    node_types: types of the nodes. Modules of types outside this package are not imported, since
+    they may start threads. config_files: files of all processes that may be started. lifeline: file
+    descriptor that the nodes inherit. log: file for the server's own output.
     """
 
     def __init__(
@@ -121,10 +129,11 @@ class ForkServer:
     def fork(
         self, config_file: Path, environment: Mapping[str, str], output: int, ready: int
     ) -> ForkedProcess | None:
-        """Start a process with nodes; None if the fork server cannot, then it is closed.
+        """Start a process with nodes; return None if this is not possible, and close the fork
+        server.
 
-        output: descriptor for standard output and error.  ready: descriptor that the configuration
-        names; it has the same number in the process.
+        config_file: configuration of the process. output: descriptor for standard output and error.
+        ready: descriptor that the configuration names; it has the same number in the new process.
         """
         changed = {
             name: value
@@ -155,19 +164,23 @@ class ForkServer:
         self._process.wait()
 
     async def stop(self) -> None:
-        """End the fork server, also while it still imports modules."""
+        """End the fork server, even if it is still importing modules."""
         self._ready.cancel()
         await asyncio.gather(self._ready, return_exceptions=True)
         self.close()
 
     def close(self) -> None:
-        """End the fork server; the nodes' processes continue."""
+        """End the fork server; the processes of the nodes continue."""
         self._end()
         self._socket.close()
 
 
 def serve(socket_fd: int) -> str:
-    """Import modules, then fork; return the path of the configuration in each forked process."""
+    """Import the modules of the nodes, then fork a process for each request of the launcher.
+
+    The function returns only in the forked processes; its result is the path of their
+    configuration. socket_fd: descriptor of the socket to the launcher.
+    """
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != int(os.environ[PARENT_VARIABLE]):
         sys.exit("the launcher has exited")
@@ -202,7 +215,7 @@ def serve(socket_fd: int) -> str:
 
 
 def _import_nodes(types: Iterable[str]) -> None:
-    """Import the modules of those node types that belong to this package."""
+    """Import the modules of the node types that belong to this package."""
     from flexsheet.nodes import NODES, node_class
 
     for name in types:
@@ -217,9 +230,10 @@ def _import_nodes(types: Iterable[str]) -> None:
 
 
 def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
-    """Fork a process whose parent is the launcher; return True in it, False in the fork server.
+    """Fork a process whose parent is the launcher.
 
-    It ends instead if the launcher has not received its process id.
+    Returns True in the new process, and False in the fork server. The new process ends if the
+    launcher has not received its process id. descriptors: files that the process inherits.
     """
     pid_read, pid_write = os.pipe()
     go_read, go_write = os.pipe()
@@ -252,9 +266,11 @@ def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
 
 
 def _write_arguments(arguments: list[str]) -> None:
-    """Replace the arguments of this process in /proc, by which tools find the nodes' processes.
+    """Replace the arguments of this process in /proc, from which tools identify the nodes'
+    processes.
 
-    The space that is left is filled by an argument of spaces before the last two.
+    The remaining space is filled by an argument of spaces before the last two arguments. Raises
+    ValueError if the space is too small.
     """
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     start, end = int(fields[_ARGUMENTS_START]), int(fields[_ARGUMENTS_END])

@@ -47,10 +47,10 @@ from flexsheet.nodes.stop_socket import StopSocket
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
 REASON_LENGTH = 1000
-"""The maximum number of characters of an e-stop's reason, which fits into all messages."""
+"""The maximum number of characters of an e-stop's reason, so that it fits into all messages."""
 
 RESET_WITHIN_S = 5.0
-"""The time within which all arms must confirm the reset of an e-stop."""
+"""The time (s) in which all arms must confirm the reset of an e-stop."""
 
 ARMS = ("arm_left", "arm_right")
 
@@ -63,10 +63,10 @@ Sources = Callable[[list[Source]], tuple[Source, ...]]
 class HostAgent:
     """A part of the launcher that publishes the status of its host and latches e-stops.
 
-    The agent works between `start` and `close`. endpoints, sources: functions that replace the
-    placeholder of the run's directory. code: commit that `HostStatus` reports. run_directory:
-    folder for the socket that receives e-stops; None for no socket. pids: function that returns the
-    process ids of the running nodes by node name.
+    The agent works between the calls of `start` and `close`. endpoints, sources: functions that
+    replace the placeholder of the run's directory. code: git commit that `HostStatus` reports.
+    run_directory: folder for the socket that receives e-stops; None for no socket. pids: function
+    that returns the process ids of the running nodes by node name.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class HostAgent:
         self._nice_denied = bool(list_denied(nodes))
 
     def start(self) -> None:
-        """Subscribe to e-stops and start to publish.  Requires a running event loop."""
+        """Subscribe to e-stops and start to publish; this requires a running event loop."""
         if self._stop_socket is not None:
             self._stop_socket.open()
         stored = None if self._file is None else self._file.read()
@@ -171,7 +171,7 @@ class HostAgent:
             subscriber.renew_keys(change)
 
     async def close(self) -> None:
-        """Stop publishing and close all sockets.  A second call has no effect."""
+        """Stop publishing and close all sockets; further calls have no effect."""
         if self._stop_socket is not None:
             self._stop_socket.close()
         for task in (self._task, self._resetting):
@@ -184,7 +184,8 @@ class HostAgent:
             publisher.close()
 
     def _stop(self, reason: str) -> None:
-        """Engage an e-stop that `flexsheet arms stop` sent through the local socket."""
+        """Engage an e-stop that the command `flexsheet arms stop` has sent through the local
+        socket."""
         writer = tools_on(self._host)
         self._on_problem(f"e-stop of {writer}, {NodeNote.ESTOP_KEPT.phrase}")
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
@@ -222,7 +223,7 @@ class HostAgent:
     async def _reset(self, writer: str, latched: EStop) -> None:
         """Release the e-stop when all arms have confirmed the reset.
 
-        Arms in motion refuse the reset. The result is reported to `on_problem`.
+        Arms in motion refuse the reset. The result is passed to the function `on_problem`.
         """
         stopped = {topic for topic in ARMS if self._plan.writers.get(topic)}
         all_clear = asyncio.Event()
@@ -259,7 +260,7 @@ class HostAgent:
             self._update_file()
 
     def _update_file(self) -> None:
-        """Write or remove the file of the latched e-stop; after an error, retry periodically."""
+        """Write or remove the file of the latched e-stop; if this fails, retry periodically."""
         if self._file is None:
             return
         try:
@@ -355,12 +356,15 @@ class HostAgent:
 
 
 def has_estop(state: ArmState) -> bool:
-    """Return whether an e-stop is engaged in the bridge of an arm."""
+    """Return whether the bridge of an arm has engaged an e-stop."""
     return state.mode == "estop" or state.estop_engaged
 
 
 def list_arms(plan: ResolvedGraph) -> list[str]:
-    """Return the network address of each arm, or "host/node" of its bridge if it has no address."""
+    """Return the network addresses of the arms.
+
+    An arm without an address is represented by "host/node" of its bridge.
+    """
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
@@ -375,7 +379,7 @@ def python_version() -> str:
 
 
 def software() -> str:
-    """Return the versions of the libraries that should be equal on all hosts."""
+    """Return one text with the versions of the libraries that should be equal on all hosts."""
     try:
         own = version("flexsheet")
     except PackageNotFoundError:
@@ -389,9 +393,10 @@ def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
 
 
 def find_recording_folder(nodes: list[ResolvedNode]) -> Path:
-    """Return the folder of the recorder's bag file, whose free disk space is reported.
+    """Return the folder of the recorder's bag file.
 
-    Return the working folder if there is no recorder, or if the recorder's folder does not exist.
+    The free disk space of this folder is reported. If there is no recorder, or if the recorder's
+    folder does not exist, the working folder is returned.
     """
     for node in nodes:
         if node.role is NodeRole.RECORDER:

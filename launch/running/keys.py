@@ -1,8 +1,8 @@
-"""Manage the keys by which the hosts of a graph authenticate each other.
+"""Manage the key pairs with which the hosts of a graph authenticate each other.
 
 The secret key of a host is stored in `directory()`, in a file with the host's name. The public key
-is the value of `hosts.NAME.key` in the launch file. For the processes of a run, a key ring file in
-the run's directory contains the keys that a host needs.
+is the value of `hosts.NAME.key` in the launch file. A key ring file in the run's directory contains
+the keys that the processes of a host need.
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ def secret_file(host: str) -> Path:
 
 
 def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, KeyRing]:
-    """Write the key ring files of a run and load them; return the key rings by host.
+    """Write the key ring files of a run, load them, and return the key rings by host.
 
-    host: write only the file of this host; None for all hosts. Raises BadInputError.
+    host: host whose file is written; None for all hosts. Raises BadInputError if a key is missing
+    or invalid.
     """
     rings = {}
     problems = []
@@ -59,9 +60,10 @@ def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Key
 
 
 class KeyWatch:
-    """A detector of key changes during a run, in the launch file and in the secret key files.
+    """A monitor that detects key changes during a run.
 
-    Changes are written to the key ring files, which the processes of the run read.
+    It reads the launch file and the secret key files, and writes changes to the key ring files,
+    which the processes of the run read.
     """
 
     def __init__(self, plan: ResolvedGraph, run: Run, rings: dict[str, KeyRing]) -> None:
@@ -70,7 +72,7 @@ class KeyWatch:
         self._read_ns = 0
 
     def read_changes(self) -> dict[str, KeyChange]:
-        """Update the key ring files, and return the changes since the last call by host.
+        """Update the key ring files, and return the key changes since the last call, by host.
 
         Raises BadInputError, SecurityError and OSError if a file cannot be read or is invalid.
         """
@@ -87,7 +89,10 @@ class KeyWatch:
 
 
 def install(launch_file: Path, host: str, key: str) -> None:
-    """Write the public key of a host into a launch file.  Raises BadInputError."""
+    """Write the public key of a host into a launch file.
+
+    Raises BadInputError if the launch file does not contain the host, or if the key is invalid.
+    """
     document = read_document(launch_file)
     hosts = document.values.get("hosts")
     if not isinstance(hosts, dict) or not isinstance(hosts.get(host), dict):

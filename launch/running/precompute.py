@@ -1,4 +1,4 @@
-"""Compute tables that the nodes of a graph read from a cache, before the graph starts."""
+"""Compute the tables that the nodes of a graph read from a cache, before the graph starts."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from flexsheet.nodes.renderer import deflection_cache
 Progress = Callable[[str], None]
 
 REPORT_STEP_RATIO = 0.1
-"""The fraction of the total work between two reports of the progress."""
+"""The progress between two reports, as a fraction of the total work."""
 
 
 class NoSoftBodyError(FlexsheetError, RuntimeError):
-    """The error that is raised if the soft body (FEM model) of a scene cannot be computed."""
+    """Raised if the soft body (FEM model) of a scene cannot be computed."""
 
     code = "no-soft-body"
     remedy = "Follow the remedy in the text; see docs/soft-body-reference.md and docs/soft-body.md."
 
 
 def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
-    """Compute the tables that planners and renderers of a graph need and the cache lacks."""
+    """Compute the tables that planners and renderers of a graph need and that the cache lacks."""
     scene = plan.scene_message()
     if scene is None:
         return
@@ -54,7 +54,7 @@ def _uses_deflection_shapes(scene: Scene, requested: SheetShapeMethod | Literal[
 def precompute_deflection_shapes(
     scene: Scene, cache_dir: Path | str | None, progress: Progress
 ) -> Path:
-    """Return the file with the deflection shapes of a scene's sheet; compute the file if missing.
+    """Return the file with the deflection shapes of a scene's sheet; compute it if it is missing.
 
     If the membrane model finds no equilibrium, the reason is reported and no file is written. The
     renderer then approximates the pushed sheet by four triangles.
@@ -72,9 +72,10 @@ def precompute_deflection_shapes(
 
 
 def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
-    """Return a function (done, total) that reports progress and remaining time in steps.
+    """Return a function (done, total) that reports the progress and the remaining time in steps.
 
-    If `total` changes, or `done` decreases, the reports start again.
+    If `total` changes, or `done` decreases, the reports start again. what: name of the computation
+    in the reports.
     """
     from flexsheet.nodes.cache import EtaEstimator
 
@@ -94,7 +95,7 @@ def report_time_left(what: str, progress: Progress) -> Callable[[int, int], None
 
 
 def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
-    """Return the file with the force table of a scene's sheet; compute the file if missing.
+    """Return the file with the force table of a scene's sheet; compute it if it is missing.
 
     Raises NoEquilibriumError if the membrane model finds no equilibrium.
     """
@@ -112,7 +113,7 @@ def precompute_soft_body(
     scheduler: str | None,
     progress: Progress,
 ) -> Path:
-    """Return the file with the nonlinear table of a soft body; compute the file if missing.
+    """Return the file with the nonlinear table of a soft body; compute it if it is missing.
 
     skin_spacing_m: spacing of the nodes at the surface. scheduler: address of a dask.distributed
     scheduler; None computes on this computer. Raises NoSoftBodyError if the scheduler cannot be

@@ -1,4 +1,4 @@
-"""Determine the highest priority (minimum niceness) that the user may give to processes."""
+"""Determine the minimum niceness (highest priority) that the user may give to processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CAP_SYS_NICE = 23
 
 
 def min_nice_step() -> int:
-    """Return the minimum niceness that a child process may have, relative to this process."""
+    """Return the minimum value by which this process may change the niceness of a child process."""
     own = os.getpriority(os.PRIO_PROCESS, 0)
     # The limit RLIMIT_NICE is 20 minus the minimum niceness: 25 permits a niceness of -5.
     soft_limit, _ = resource.getrlimit(resource.RLIMIT_NICE)
@@ -30,18 +30,20 @@ def _has_cap_sys_nice() -> bool:
 
 
 def min_node_nice() -> int:
-    """Return the minimum `nice` of a node that the user may set or that this process has."""
+    """Return the minimum niceness of a node that the user may set or that this process already
+    has."""
     return min(min_nice_step(), os.getpriority(os.PRIO_PROCESS, 0))
 
 
 def list_denied(nodes: Sequence[ResolvedNode]) -> list[str]:
-    """Return the names of the nodes that cannot get their niceness."""
+    """Return the names of the nodes whose configured niceness is not permitted."""
     minimum = min_node_nice()
     return [node.name for node in nodes if node.nice < minimum]
 
 
 def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Describe the nodes whose niceness is not permitted; return None if there are none."""
+    """Return a text about nodes whose niceness is not permitted; None if there are no such
+    nodes."""
     names = list_denied(nodes)
     if not names:
         return None

@@ -1,4 +1,4 @@
-"""Manage the runs of graphs on this computer: their directories and orphaned processes.
+"""Manage the runs of graphs on this computer, with their directories and orphaned processes.
 
 A run is one execution of a graph by a launcher. The name of a run consists of the launcher's
 process id and start time, and a count. The name therefore shows whether the launcher is alive. A
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from flexsheet.messages.bus import Source
 
 RUN_VARIABLE = "FLEXSHEET_RUN"
-"""The environment variable with the run's name, set in every process of the run."""
+"""The environment variable that contains the run's name in every process of the run."""
 
 ROOT_VARIABLE = "FLEXSHEET_RUNS"
 """The environment variable that replaces the default folder of all runs."""
@@ -44,7 +44,7 @@ _count = itertools.count(1)
 
 
 class RunDirectoryError(FlexsheetError, RuntimeError):
-    """The error that is raised if the folder of all runs cannot be used."""
+    """Raised if the folder of all runs cannot be used."""
 
     code = "run-directory"
     remedy = "Set `FLEXSHEET_RUNS` to a folder that belongs to you."
@@ -74,11 +74,11 @@ class Run:
             return None
 
     def is_alive(self) -> bool:
-        """Return whether the run's launcher is alive and has not ended the run."""
+        """Return whether the run's launcher is alive and has not finished the run."""
         return (self.directory / _LAUNCHER_FILE).exists() and launcher_is_alive(self.id)
 
     def end(self) -> None:
-        """Remove the sockets and the launcher's marker; the plan and the logs remain."""
+        """Remove the sockets and the launcher's marker file; the plan and the logs remain."""
         for entry in self.directory.iterdir():
             if stat.S_ISSOCK(entry.lstat().st_mode) or entry.name == _LAUNCHER_FILE:
                 entry.unlink(missing_ok=True)
@@ -90,14 +90,15 @@ def ring_file(run: Run, host: str) -> Path:
 
 
 def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    """Replace the placeholder of the run's directory in endpoints by its path."""
+    """Replace the placeholder of the run's directory in endpoints by the path of the directory."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
 
 
 def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
-    """Replace the placeholder of the run's directory in the sources' endpoints by its path."""
+    """Replace the placeholder of the run's directory in endpoints of sources by the directory's
+    path."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(
@@ -107,7 +108,8 @@ def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
 
 
 def root() -> Path:
-    """Return the folder of this user's runs; its path is short, as socket paths are limited."""
+    """Return the folder of this user's runs; its path is short, because socket paths are
+    limited."""
     return Path(os.environ.get(ROOT_VARIABLE) or f"/tmp/flexsheet-{os.getuid()}")
 
 
@@ -155,14 +157,17 @@ def list_live_runs() -> list[Run]:
 
 
 def launcher_is_alive(run_id: str) -> bool:
-    """Return whether a process has the pid and start time of the run's launcher."""
+    """Return whether the launcher of a run is alive.
+
+    The process is identified by the process id and the start time in `run_id`.
+    """
     pid, _, rest = run_id.partition(".")
     start, _, _ = rest.partition(".")
     return pid.isdigit() and str(_start_ticks(int(pid))) == start
 
 
 def find_orphans() -> list[psutil.Process]:
-    """Return this user's processes that belong to the run of an exited launcher."""
+    """Return this user's processes that belong to runs whose launcher has exited."""
     import psutil
 
     found = []
@@ -182,7 +187,8 @@ def find_orphans() -> list[psutil.Process]:
 
 
 def sweep() -> list[int]:
-    """End orphans and clean up the directories of dead runs; return the ids of the orphans."""
+    """End orphaned processes, clean up the directories of ended runs, and return the process
+    ids."""
     import psutil
 
     found = find_orphans()
@@ -203,7 +209,7 @@ def sweep() -> list[int]:
 
 
 def is_free(address: str, port: int) -> bool:
-    """Return whether a process can listen on a TCP port."""
+    """Return whether a process can listen on a TCP port of an address."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -225,7 +231,7 @@ def _signal(processes: Iterable[psutil.Process], number: int) -> None:
 
 
 def _is_of_our_namespace(run: Run) -> bool:
-    """Return whether the run's launcher is in the PID namespace of this process.
+    """Return whether the run's launcher is in the same PID namespace as this process.
 
     A launcher in a container has its own namespace.
     """
@@ -243,7 +249,8 @@ def _pid_namespace(pid: int | str = "self") -> int:
 
 
 def _start_ticks(pid: int) -> int | None:
-    """Return the start time of a process in clock ticks since boot; None if it has ended."""
+    """Return the start time of a process in clock ticks since boot; None if the process has
+    ended."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
     except (FileNotFoundError, ProcessLookupError):

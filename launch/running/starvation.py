@@ -1,4 +1,4 @@
-"""Distinguish a process that hangs from a process that gets no processor core."""
+"""Distinguish a process that hangs from a process that waits for a processor core."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ RUNNABLE = "R"
 
 @dataclass(frozen=True, slots=True)
 class ProcessorTime:
-    """The kernel counters of a process's main thread since its start.
+    """The kernel counters of the main thread of a process since its start.
 
     run_s: time on a processor core. wait_s: time in which the thread was ready to run but had no
-    core, until the thread last ran. state: letter in /proc/PID/stat (R, S, D, T, ...).
+    core, counted until the thread last ran. state: letter in /proc/PID/stat (R, S, D, T, ...).
     """
 
     run_s: float
@@ -23,7 +23,10 @@ class ProcessorTime:
 
     @classmethod
     def read(cls, process: int) -> Self | None:
-        """Read the counters of a process id; return None if there are none."""
+        """Read the counters of a process; return None if the process has ended.
+
+        process: process id.
+        """
         try:
             run, wait, slices = Path(f"/proc/{process}/schedstat").read_text().split()
             stat = Path(f"/proc/{process}/stat").read_text()
@@ -41,7 +44,7 @@ def compute_starved_s(
     """Return the time (s) that a process waited for a processor core between two readings.
 
     The result is at most `elapsed_s`. The kernel adds a wait to its counter only when the wait
-    ends. For a process that is ready to run now, all time in which it did not run counts as a wait.
+    ends. If the process is still ready to run, all time in which it did not run counts as a wait.
     """
     if before is None or now is None:
         return 0.0

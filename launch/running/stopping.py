@@ -1,14 +1,14 @@
 """Send an emergency stop (e-stop) to running graphs, on paths that no other tool can block.
 
-Each launcher and each arm bridge (node that controls an arm) on this computer has a socket for
-e-stops (`nodes.stop_socket`). The steps are:
+All launchers and arm bridges (nodes that control an arm) on this computer have a socket for e-stops
+(`nodes.stop_socket`). The steps are:
 
-1. All sockets get the request at once.  A launcher stores the stop and publishes it to every host;
-   a bridge stops its own arm.
+1. All sockets get the request simultaneously. A launcher stores the stop and publishes it to all
+   hosts; a bridge stops its own arm.
 2. Receivers that do not answer get SIGCONT, because they may be suspended.
-3. If no launcher has answered, the bridges that do not answer are killed.  The watchdogs of their
+3. If no launcher has answered, the bridges that do not answer are killed. The watchdogs of their
    arms then stop the arms.
-4. If nothing has answered, the nodes that send sheet targets are killed.  Without targets, the
+4. If no receiver has answered, the nodes that send sheet targets are killed. Without targets, the
    bridges on all hosts stop.
 
 This module imports few other modules, so that the stop is sent without delay.
@@ -64,7 +64,11 @@ class StopOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StopAttempt:
-    """An attempt to stop: means, receiver, outcome, and time since the first request (ms)."""
+    """An attempt to stop the arms.
+
+    path: means of sending. receiver: name of the receiver. outcome: result. after_ms: time from the
+    first request to the outcome.
+    """
 
     path: StopPath
     receiver: str
@@ -88,8 +92,8 @@ class _Receiver:
 def send_early(arguments: Sequence[str]) -> None:
     """Send the e-stop of `flexsheet arms stop ARGUMENTS` before the slow import of the command.
 
-    Nothing is sent if the arguments are invalid; the command then reports the error. The attempts
-    are stored in `sent_early` for the command.
+    If the arguments are invalid, nothing is sent, and the command later reports the error. The
+    attempts are stored in `sent_early` for the command.
     """
     options = {"--run": "", "--reason": DEFAULT_REASON}
     rest = [argument for argument in arguments if argument != "--json"]
@@ -104,13 +108,14 @@ def send_early(arguments: Sequence[str]) -> None:
 
 
 sent_early: list[list[StopAttempt]] = []
-"""The attempts of `send_early`, which the command reports later: empty, or one list."""
+"""The attempts of `send_early`, which the command reports later: an empty list, or one list."""
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
-    """Engage the e-stop in the runs with these directories; wait KILL_AFTER_S for answers.
+    """Engage the e-stop in the runs with these directories, and return all attempts.
 
-    The module docstring describes the steps.
+    The function waits at most KILL_AFTER_S for answers before it kills processes. The module
+    docstring describes the steps.
     """
     started_s = time.monotonic()
     attempts: list[StopAttempt] = []
@@ -155,7 +160,10 @@ def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
 
 
 def _send_request(file: Path, request: bytes) -> socket.socket | None:
-    """Send a request and return the connection for the answer; None if no process listens."""
+    """Send a request to the socket `file`, and return the connection for the answer.
+
+    Returns None if no process listens.
+    """
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
     try:
         connection.connect(os.fspath(file))
@@ -167,7 +175,10 @@ def _send_request(file: Path, request: bytes) -> socket.socket | None:
 
 
 def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
-    """Remove and return the receivers that confirm before `until_s` on the monotonic clock."""
+    """Wait for confirmations until `until_s`; remove the receivers that confirm, and return them.
+
+    until_s: time of the monotonic clock, s.
+    """
     confirmed = []
     poll = select.poll()
     by_number = {one.connection.fileno(): one for one in waiting}
@@ -189,7 +200,7 @@ def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
 
 
 def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
-    """Kill the nodes of these runs that publish sheet targets, and return their names."""
+    """Kill the nodes of the runs that publish sheet targets, and return their names."""
     killed = []
     for directory in directories:
         try:

@@ -1,14 +1,14 @@
-"""Start the nodes of a graph, restart failed ones, and clean up at the end.
+"""Start the nodes of a graph, restart failed nodes, and end all processes at the end.
 
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
         ...
 
-Every process is a separate session. It runs one node, or all nodes whose launch file entry names
-the same process, and reports through a pipe that they are set up. When the process exits, its
-restart policy is applied. To stop it, the launcher sends SIGINT, SIGTERM and finally SIGKILL. The
-launcher needs no threads: the event loop reads exits from pidfds, and logs and readiness from
-pipes.
+Every process is a separate session. A process runs one node, or all nodes whose launch file entry
+names the same process. It reports through a pipe that its nodes are ready. When the process exits,
+its restart policy is applied. To stop a process, the launcher sends SIGINT, SIGTERM and finally
+SIGKILL. The launcher needs no threads: the event loop reads exits from pidfds, and logs and
+readiness from pipes.
 """
 
 from __future__ import annotations
@@ -75,19 +75,20 @@ STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
 LIVENESS_PERIOD_S = 0.5
 STACK_DUMP_S = 0.5
-"""The time between the request to a hanging node to log its call stacks and its end by SIGKILL."""
+"""The time (s) from the request to a hanging node to log its call stacks to its end by SIGKILL."""
 
 FORK_SERVER = "fork-server"
 LOG_READ_BYTES = 65_536
 GROUP_REAPS, GROUP_REAP_S = 20, 0.1
-"""Attempts to reap the processes that a node has started, and the time between them, s."""
+"""The number of attempts to reap the child processes of a node, and the time (s) between them."""
 
 Report = Callable[[str, str], None]
-"""The function that is called with (node, line) for each log line; the launcher is "launch"."""
+"""A function that is called with (node, line) for each log line; the launcher has the name
+"launch"."""
 
 
 class NodeFailedError(FlexsheetError, RuntimeError):
-    """The error that is raised if a node fails more often than its restart policy allows."""
+    """Raised if a node fails more often than its restart policy allows."""
 
     code = "node-failed"
     remedy = (
@@ -97,7 +98,7 @@ class NodeFailedError(FlexsheetError, RuntimeError):
 
 
 class Child:
-    """An operating system process that runs one or more nodes, from its start to its exit."""
+    """A process of the operating system that runs one or more nodes."""
 
     def __init__(
         self,
@@ -154,13 +155,16 @@ class Child:
         return self._process.pid
 
     def signal(self, number: int) -> None:
-        """Send a signal to the process and all processes that it started, unless it has exited."""
+        """Send a signal to the process and to all processes that it started.
+
+        If the process has exited, nothing is sent.
+        """
         if not self.exited.done():
             # The process is not reaped yet, so its id cannot belong to another process.
             os.killpg(self.pid, number)
 
     def kill_now(self) -> None:
-        """Kill and reap the process without the event loop, which may be closing."""
+        """Kill and reap the process without the event loop, which may already be closing."""
         self.signal(signal.SIGKILL)
         if not self.exited.done():
             self._process.wait()
@@ -200,13 +204,15 @@ class Child:
                 on_starved(waited_s)
 
     def end_hanging(self) -> None:
-        """Make Python's fault handler write the call stacks to the log, then kill the process."""
+        """Request Python's fault handler to write the call stacks to the log, then kill the
+        process."""
         self._reports = False
         self.signal(signal.SIGABRT)
         self._loop.call_later(STACK_DUMP_S, self.signal, signal.SIGKILL)
 
     def _read_output(self) -> bool:
-        """Copy available output to the log and report its lines; return False if there was none."""
+        """Copy available output to the log, and report its lines; return False if there was no
+        output."""
         try:
             piece = os.read(self._output, LOG_READ_BYTES)
         except BlockingIOError:
@@ -220,7 +226,7 @@ class Child:
         return True
 
     def _handle_line(self, line: bytes) -> None:
-        """Report an output line and write it to the log of its node, or of the process."""
+        """Report an output line, and write it to the log of its node, or of the process."""
         node = self._find_node(line)
         self._logs[node].write(line + b"\n")
         if self._reports:
@@ -240,7 +246,10 @@ class Child:
             log.close()
 
     def _reap(self) -> None:
-        """Handle the exit: kill child processes, read the last output, close pipes."""
+        """Handle the exit of the process.
+
+        Its child processes are killed, the last output is read, and the pipes are closed.
+        """
         if self.exited.done():
             return
         if self._process.returncode is None:
@@ -260,7 +269,10 @@ class Child:
         self.exited.set_result(self._process.wait())
 
     def _reap_group(self, tries: int) -> None:
-        """Reap the killed processes of the group, whose parent this process now is (subreaper)."""
+        """Reap the killed child processes of a node, of which the launcher is now the parent.
+
+        tries: maximum number of further attempts.
+        """
         try:
             while os.waitpid(-self.pid, os.WNOHANG) != (0, 0):
                 pass
@@ -329,14 +341,14 @@ class RunningGraph:
 
     @property
     def run(self) -> Run:
-        """Return the run (directory, logs, id).  Raises RuntimeError before the start."""
+        """Return the run, with its directory, logs and id; raise RuntimeError before the start."""
         if self._run is None:
             raise RuntimeError("the graph has no run before its start; enter its context first")
         return self._run
 
     @property
     def pids(self) -> dict[str, int]:
-        """Return the process id of each running node; nodes in one process share an id."""
+        """Return the process ids of the running nodes; nodes in one process have the same id."""
         return {
             node.name: child.pid
             for name, child in self._children.items()
@@ -345,7 +357,7 @@ class RunningGraph:
         }
 
     def is_ready(self, node: str) -> bool:
-        """Return whether the node's current process has reported that it is set up."""
+        """Return whether the current process of a node has reported that it is ready."""
         return self._ready[node].is_set()
 
     async def __aenter__(self) -> Self:
@@ -360,7 +372,7 @@ class RunningGraph:
         await self.stop()
 
     async def wait_ready(self, timeout_s: float | None = None) -> None:
-        """Wait until every node is set up.
+        """Wait until all nodes are ready.
 
         Raises NodeFailedError if a node fails, and TimeoutError after `timeout_s`.
         """
@@ -400,7 +412,7 @@ class RunningGraph:
             await asyncio.sleep(0.02)
 
     async def wait(self) -> None:
-        """Wait until every node has exited.  Raises NodeFailedError if a node fails."""
+        """Wait until all nodes have exited; raise NodeFailedError if a node fails."""
         pending: set[asyncio.Task[None]] = set(self._supervisors.values())
         while pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
@@ -409,7 +421,7 @@ class RunningGraph:
                     supervisor.result()
 
     def kill(self, node: str, number: int = signal.SIGKILL) -> None:
-        """Send a signal to the process of a node, to simulate a fault."""
+        """Send a signal to the process of a node, in order to simulate a fault."""
         os.kill(self.pids[node], number)
 
     def warn_of_running_nodes(self) -> None:
@@ -420,11 +432,11 @@ class RunningGraph:
             self._report(LAUNCHER, f"the bag {bag} is not closed yet; wait for it")
 
     def kill_all(self) -> None:
-        """Kill all nodes immediately, without the grace periods of `stop`."""
+        """Kill all nodes immediately, without the grace periods of the method `stop`."""
         self._send(signal.SIGKILL, self._children.values())
 
     def _send(self, number: int, children: Collection[Child]) -> None:
-        """Send a signal to processes. Before SIGKILL, report the bags that it may truncate."""
+        """Send a signal to processes; before SIGKILL, report bags that may become incomplete."""
         for bag in self._list_open_bags(children) if number == signal.SIGKILL else ():
             self._report(
                 LAUNCHER,
@@ -435,7 +447,7 @@ class RunningGraph:
             child.signal(number)
 
     def _list_open_bags(self, children: Collection[Child]) -> list[Path]:
-        """Return the bags to which the recorders in these processes write."""
+        """Return the bag files to which recorders in the given processes are writing."""
         pids = {child.pid for child in children}
         recorders = {one.name for one in self.nodes if one.role is NodeRole.RECORDER}
         return [
@@ -446,7 +458,10 @@ class RunningGraph:
         ]
 
     async def stop(self) -> None:
-        """End all nodes by SIGINT, SIGTERM and SIGKILL, and remove sockets; may be called twice."""
+        """End all nodes by SIGINT, SIGTERM and SIGKILL, and remove sockets.
+
+        The method may be called twice.
+        """
         self._stopping = True
         watches = [] if self._keys_watch is None else [self._keys_watch]
         for task in (*self._supervisors.values(), *watches):
@@ -476,8 +491,8 @@ class RunningGraph:
     async def _end_children(self) -> None:
         """End all processes.
 
-        Simulated arms end after their bridges, which command them to stop. Nodes that only read
-        topics end last, to receive final messages.
+        Simulated arms end after their bridges, which send them stop commands. Nodes that only read
+        topics end last, so that they receive the final messages.
         """
         readers = {
             name
@@ -542,9 +557,9 @@ class RunningGraph:
         return source_ns
 
     def _publish_latched(self, topic: str, message: Message | None) -> int | None:
-        """Publish a message, which later subscribers also receive; return its source timestamp, ns.
+        """Publish a message that later subscribers also receive; return its source timestamp (ns).
 
-        Return None if there is no message, or if the launcher is not a writer of the topic.
+        Returns None if there is no message, or if the launcher is not a writer of the topic.
         """
         writer = self.plan.writer(topic, LAUNCHER)
         if message is None or writer is None:
@@ -610,7 +625,8 @@ class RunningGraph:
         )
 
     async def _watch_keys(self) -> None:
-        """Pass key changes in the launch file and the user's key files to the processes."""
+        """Detect key changes in the launch file and the user's key files, and send them to the
+        processes."""
         watch = KeyWatch(self.plan, self.run, self._rings)
         reported = ""
         while True:
@@ -632,7 +648,10 @@ class RunningGraph:
                     self._agents[host].renew_keys(change)
 
     async def _supervise(self, process: ResolvedProcess) -> None:
-        """Run a process and restart it according to its policy.  Raises NodeFailedError."""
+        """Run a process, and restart it according to its policy.
+
+        Raises NodeFailedError if the process fails too often.
+        """
         policy, name = process.settings.restart, process.name
         recent: deque[float] = deque()
         loop = asyncio.get_running_loop()
@@ -661,7 +680,8 @@ class RunningGraph:
                 self.restarts[node.name] += 1
 
     async def _run_once(self, process: ResolvedProcess) -> str | None:
-        """Run a process until it ends; return its failure as text, or None if there is no error."""
+        """Run a process until it ends; return a text about its failure, or None if it did not
+        fail."""
         child = await self._spawn(process)
         late = await self._is_late(child, process)
         if late:
@@ -688,8 +708,8 @@ class RunningGraph:
     async def _is_late(self, child: Child, process: ResolvedProcess) -> bool:
         """Wait until a process is ready, exits, or exceeds its start deadline.
 
-        Return whether it exceeded the deadline. Time in which it waited for a processor core does
-        not count.
+        Returns whether the process exceeded the deadline. Time in which it waited for a processor
+        core does not count.
         """
         on_starved = partial(self._report_starved, f"{process.name} is not ready yet")
         # A process sends its first heartbeat when it is ready.
@@ -708,7 +728,7 @@ class RunningGraph:
         self.exit_codes.update(dict.fromkeys((node.name for node in process.nodes), code))
 
     async def _detect_hang(self, child: Child, process: ResolvedProcess) -> bool:
-        """Watch a process until it hangs or exits; end a hanging process and return True."""
+        """Monitor a process until it exits or hangs; end a hanging process and return True."""
         liveness_s = process.settings.liveness_s
         if liveness_s is None:
             return False
@@ -758,7 +778,7 @@ class RunningGraph:
         return child
 
     def _environment(self) -> dict[str, str]:
-        """Return the environment variables of all processes."""
+        """Return the environment variables of the nodes' processes."""
         assert self._lifeline is not None
         environment = {
             **os.environ,
@@ -785,7 +805,7 @@ class RunningGraph:
             )
 
     def _write_run_files(self) -> None:
-        """Write the files that the recorder stores and the files by which tools find the graph."""
+        """Write the files that the recorder stores, and the files by which tools find the graph."""
         directory = self.run.directory
         write_file(directory / "launch.yaml", self.plan.launch_text)
         write_file(directory / "scene.yaml", self.plan.scene_text)
@@ -799,7 +819,8 @@ class RunningGraph:
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """Write all scenes in the folder of the scene file as JSON, for nodes that publish them."""
+        """Write all scenes in the folder of the scene file as JSON, for the nodes that publish
+        scenes."""
         folder.mkdir()
         own = self.plan.scene_file
         for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
@@ -855,7 +876,7 @@ def list_written_files(pid: int) -> list[Path]:
 
 
 def node_config(plan: ResolvedGraph, node: ResolvedNode, run: Run) -> NodeConfig:
-    """Return the configuration of a node; replace the placeholder of the run's directory."""
+    """Return the configuration of a node in a run, with the run's directory in the endpoints."""
 
     def outputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
@@ -905,7 +926,7 @@ def _clocks_port(plan: ResolvedGraph, host: str, run: Run) -> PortConfig | None:
 
 
 def describe_exit(code: int) -> str | None:
-    """Describe the failure of a process by its exit code; return None for 0."""
+    """Return a text about the failure that an exit code indicates; None for exit code 0."""
     if code == 0:
         return None
     if code < 0:
@@ -943,7 +964,10 @@ def _check_network(plan: ResolvedGraph, host: str | None) -> None:
 
 
 def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
-    """Check that every TCP port on which this launcher's processes listen is free."""
+    """Check that all TCP ports on which this launcher's processes listen are free.
+
+    Raises BadInputError if a port is in use.
+    """
     needed = [
         (f'topic "{topic}" of {writer.name}', *writer.tcp.removeprefix("tcp://").rsplit(":", 1))
         for topic, writers in plan.writers.items()

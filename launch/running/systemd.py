@@ -17,7 +17,7 @@ TEMPLATE = Path(__file__).parent.parent / "systemd" / "flexsheet@.service"
 NETWORK = TEMPLATE.with_name("90-flexsheet.conf")
 SOFTWARE = Path(__file__).resolve().parents[2]
 STATE_FOLDER = Path("/var/lib/flexsheet")
-"""The only folder to which the systemd service has write access."""
+"""The only folder that the systemd service may write to."""
 SOCKET_VARIABLE, WATCHDOG_VARIABLE = "NOTIFY_SOCKET", "WATCHDOG_USEC"
 
 
@@ -42,8 +42,8 @@ def make_files(
 ) -> Iterator[SystemFile]:
     """Yield the systemd unit, the kernel's TCP settings, and the environment file of a host.
 
-    root: root folder of the file system; "/" except in tests.
-    flexsheet: path of the command; None: the command that is installed next to this Python.
+    root: root folder of the file system; "/" except in tests. flexsheet: path of the command; None:
+    the command in the folder of this Python interpreter.
     """
     command = flexsheet or Path(sys.executable).parent / "flexsheet"
     unit = TEMPLATE.read_text()
@@ -60,7 +60,7 @@ def make_files(
 
 
 def notify_systemd(text: str) -> None:
-    """Send a state line to systemd, see sd_notify(3), if the process runs as a service."""
+    """Send a state line to systemd (see sd_notify(3)) if the process runs as a service."""
     address = os.environ.get(SOCKET_VARIABLE)
     if not address:
         return
@@ -70,7 +70,7 @@ def notify_systemd(text: str) -> None:
 
 
 async def beat_watchdog() -> None:
-    """Reset the systemd watchdog three times per watchdog period, until the task is cancelled."""
+    """Reset the systemd watchdog three times per watchdog period, until this task is cancelled."""
     period = os.environ.get(WATCHDOG_VARIABLE)
     if not period:
         return

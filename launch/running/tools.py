@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
-"""The time in which all readers connect to a new writer; a reader retries every 0.5 s."""
+"""The time (s) in which all subscribers connect to a new writer; they retry every 0.5 s."""
 
 
 @dataclass(slots=True)
@@ -39,12 +39,12 @@ class ToolCounts:
 
 
 def tools_host(run: Run) -> str:
-    """Return the name of the host on which this tool runs."""
+    """Return the name of the host on which command-line tools run."""
     return run.host or MAIN
 
 
 def list_tool_topics(plan: ResolvedGraph, host: str = MAIN) -> list[str]:
-    """Return the topics of the graph that a tool on a host may write."""
+    """Return the topics of the graph that command-line tools on a host may write."""
     return [topic for topic in plan.writers if plan.writer(topic, tools_on(host)) is not None]
 
 
@@ -62,9 +62,10 @@ def make_subscriber(
     on_problem: Problem,
     raw: bool = False,
 ) -> Subscriber:
-    """Return a subscriber to all writers of a topic in a running graph, without starting it.
+    """Return a subscriber to all writers of a topic in a running graph; the caller must start it.
 
-    raw: whether `on_message` receives undecoded messages.
+    raw: whether `on_message` receives undecoded messages. on_problem: function that is called with
+    the text of an error.
     """
     definition = find_topic(topic)
     return Subscriber(
@@ -83,9 +84,9 @@ def make_subscriber(
 async def read_topic(
     graph: RunningGraph, topic: str, count: int | None = None
 ) -> AsyncIterator[tuple[Message, Header]]:
-    """Yield the messages of a topic of a running graph with their headers when they arrive.
+    """Yield the messages of a topic of a running graph with their headers as they arrive.
 
-    count: number of messages; None for no limit.  Messages for a slow caller wait in a queue.
+    count: number of messages; None for no limit. If the caller is slow, messages wait in a queue.
     Raises KeyError for a topic that does not exist.
     """
     # Imported here, so that commands that do not call this function start faster.
@@ -108,10 +109,10 @@ async def read_topic(
 
 
 class GraphWriter:
-    """A writer of topics for tools outside the running graph, which needs a running event loop.
+    """A publisher of topics for tools outside the running graph; it requires a running event loop.
 
-    The constructor raises BadInputError for a topic that tools may not write, and BusError for a
-    topic that another tool is writing.
+    The constructor raises BadInputError for a topic that tools may not write. It raises BusError
+    for a topic that another tool is writing.
     """
 
     def __init__(self, plan: ResolvedGraph, run: Run, topics: Iterable[str]) -> None:
@@ -158,7 +159,7 @@ class GraphWriter:
 
 
 def _make_refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
-    """Return the error for a topic that tools on a host may not write."""
+    """Return the error that is raised for a topic that tools on a host may not write."""
     from flexsheet.launch.plans import documents
 
     may = ", ".join(list_tool_topics(plan, host))
