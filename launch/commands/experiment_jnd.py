@@ -197,8 +197,8 @@ def _measure(
     async def run(presenter: PairPresenter) -> None:
         await run_session(session, presenter.present, lambda done, total: None)
 
-    # No spinner, since it would overwrite the operator's input; no bag, since recorded motion can
-    # identify a person.
+    # A spinner would overwrite the operator's input. A bag is not recorded, because recorded motion
+    # can identify a person.
     if session.done < plan.trials:
         run_experiment(launch_file, settings, None, make_jnd_procedure(run), words.print)
     row = session.result()

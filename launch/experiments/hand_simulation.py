@@ -114,7 +114,7 @@ class HeldOffset:
         lead = cases.lead_s / period_s * (1.0 - twice + square)
         self._feedback = np.array([twice, -square])
         self._gains = np.array([1.0 - square + lead, 2.0 * square - twice - lead])
-        # Last two measured and last two filtered depths, newest first.
+        # These are the last two measured and filtered depths; the newest is first.
         self._seen = np.tile(cases.depth_m, (2, 1))
         self._filtered = np.tile(cases.depth_m, (2, 1))
         self._rest_m = offset(cases.depth_m)
@@ -122,7 +122,7 @@ class HeldOffset:
         self._delays = np.round(cases.delay_s / step_s).astype(int)
         self._jitters = np.round(cases.jitter_s / step_s).astype(int)
         self._ring = int((self._delays + self._jitters).max()) + 1
-        # Ring buffer of queued offsets by the step at which they take effect, for each case.
+        # The ring buffer contains the queued offsets by the step at which they take effect.
         self._due = np.zeros((self._ring, len(cases)), dtype=bool)
         self._sampled = np.zeros((self._ring, len(cases)), dtype=int)
         self._newest = np.full(len(cases), -1)

@@ -66,7 +66,7 @@ class StaircaseEstimator:
     def __init__(self) -> None:
         sigmas = np.log1p(WEBER_FRACTIONS) / ndtri(CRITERION)
         steps = np.log1p(INCREMENTS)[:, None] / sigmas
-        # Axes: increment, Weber fraction, and all pairs of bias and lapse rate.
+        # The axes are increment, Weber fraction, and all pairs of bias and lapse rate.
         self._correct: dict[int, Floats] = {}
         for stiffer, sign in ((1, -1.0), (2, 1.0)):
             seen = ndtr(steps[:, :, None] + sign * BIASES)[..., None]

@@ -308,7 +308,7 @@ def compose(
         left = [one for one in combinations if one not in tried]
         proposed = _propose(left, unexplained, allowed)
         if runs and excess(predict(proposed, unexplained), allowed):
-            # Runs may use the margin that predictions leave.
+            # The margin applies only to predictions; a run may use the whole tolerance.
             proposed = _propose(left, unexplained, tolerances)
         latest = run(proposed)
         unexplained = unexplained.learn(proposed, latest.measured)

@@ -73,7 +73,7 @@ class CpuWatch:
         waited_s = {pid: waited for pid, waited in counted.items() if waited is not None}
         while self._history and self._history[0].time_s < now_s - WINDOW_S:
             self._history.popleft()
-        # The kernel counts a wait when it ends, also the part of it before the window.
+        # The kernel counts a wait when it ends, including its part before the window.
         ratios = {
             name: min(1.0, (waited_s[pid] - before.waited_s[pid]) / (now_s - before.time_s))
             for name, pid in watched.items()

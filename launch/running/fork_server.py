@@ -86,7 +86,7 @@ class ForkServer:
         _prctl(_PR_SET_CHILD_SUBREAPER, 1)
         self._environment = dict(environment)
         self._socket, remote = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        # Nodes overwrite the arguments with their own, which need the same space.
+        # Nodes overwrite these arguments with their own arguments, which need the same space.
         space = " " * max(len(os.fsencode(path)) for path in config_files)
         blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
@@ -145,7 +145,7 @@ class ForkServer:
             socket.send_fds(self._socket, [json.dumps(request).encode()], [output, ready])
             answer = self._socket.recv(PID_BYTES)
         except OSError:
-            # After its end no more processes can appear, but it may have reported one before.
+            # The fork server has ended, but it may have reported a process before.
             self._end()
             answer = self._read_last_answer()
         if len(answer) < PID_BYTES:
@@ -258,7 +258,7 @@ def _fork(control: socket.socket, descriptors: Iterable[int]) -> bool:
     # From here on, the launcher is the parent of the node's process.
     os.waitpid(between, 0)
     control.send(os.read(pid_read, PID_BYTES) or b"\0")
-    # Without the process, this raises BrokenPipeError, which ends the fork server.
+    # If the process has ended, this raises BrokenPipeError, which ends the fork server.
     os.write(go_write, b".")
     os.close(pid_read)
     os.close(go_write)

@@ -526,7 +526,7 @@ class RunningGraph:
             self._report(LAUNCHER, f"ended {len(swept)} processes of earlier launchers")
         self._lifeline = os.pipe()
         if self._processes:
-            # It imports modules while this process prepares the run.
+            # The fork server imports modules while this process prepares the run.
             self._start_fork_server()
         _check_ports(self.plan, self._host)
         if self.plan.keys:

@@ -89,7 +89,7 @@ async def read_topic(
     count: number of messages; None for no limit. If the caller is slow, messages wait in a queue.
     Raises KeyError for a topic that does not exist.
     """
-    # Imported here, so that commands that do not call this function start faster.
+    # Import the module here, so that commands that do not call this function start faster.
     import structlog
 
     arrived: asyncio.Queue[tuple[Message, Header]] = asyncio.Queue()

@@ -160,7 +160,7 @@ def _make_arm(scene: Scene, side: Side) -> Iterator[tuple[Joint, Link]]:
     names = [f"{side}_base", *numbered, f"{side}_flange"]
     boxes: list[list[Box]] = [[] for _ in names]
     for piece in make_pieces(arm.model):
-        # The last link of the pieces is the flange.
+        # The pieces of the last link belong to the flange.
         link = piece.link if piece.link < len(numbered) else -1
         boxes[link].append(Box(piece.size_m, piece.centre_m, DARK if piece.dark else LIGHT))
     bracket = np.asarray(arm.flange_from_edge.position_m)
