@@ -649,7 +649,7 @@ class UnfitGeometryError(FlexsheetError, ValueError):
 
     code = "unfit-geometry"
     exit_code = 2
-    remedy = "Choose an object of a supported shape."
+    remedy = "Choose an object of a supported shape and support."
 
 
 def require_cylinder(scene: Scene) -> Cylinder:
