@@ -22,15 +22,20 @@ from flexsheet.launch.running.code_state import read_git_state
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "docs" / "results"
+MISSED_EXIT_CODE = 1
+"""The exit code of a measurement that is complete, but exceeds a limit."""
 
 
 def record(name: str, command: Sequence[str], folder: Path = RESULTS) -> Path:
     """Run a command that prints JSON; return the file with its output and the circumstances.
 
-    Raises CalledProcessError, and JSONDecodeError for an output that is not JSON.
+    The command may exit with 0 or `MISSED_EXIT_CODE`. Raises CalledProcessError for another exit
+    code, and JSONDecodeError for an output that is not JSON.
     """
     load = os.getloadavg()[0]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if done.returncode not in (0, MISSED_EXIT_CODE):
+        done.check_returncode()
     record = {
         "command": shlex.join(command),
         "machine": machine_name(),

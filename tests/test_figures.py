@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -85,3 +86,12 @@ def test_the_output_of_a_command_is_recorded(tmp_path: Path) -> None:
     written = json.loads(path.read_text())
     assert written["results"] == {"rows": [{"deg": 3, "at": 1}]}
     assert set(written) == {"command", "machine", "load", "code", "date", "results"}
+
+
+def test_a_measurement_that_exceeds_a_limit_is_recorded(tmp_path: Path) -> None:
+    path = record("load", [sys.executable, "-c", "print('{}'); exit(1)"], tmp_path)
+    assert json.loads(path.read_text())["results"] == {}
+    with pytest.raises(subprocess.CalledProcessError):
+        record("load", [sys.executable, "-c", "print('{}'); exit(2)"], tmp_path)
+    with pytest.raises(json.JSONDecodeError):
+        record("load", [sys.executable, "-c", "exit(1)"], tmp_path)
