@@ -1,1 +1,1 @@
-"""Provide models that several nodes need, as functions of arrays without sockets or files."""
+"""Provide models that several nodes use: functions of arrays that open no sockets or files."""

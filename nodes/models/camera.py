@@ -13,7 +13,9 @@ from flexsheet.nodes.arrays import Floats
 
 
 def camera_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> Floats:
-    """Return the matrix (3, 3) of a pinhole camera with these focal lengths and principal point."""
+    """Return the matrix (3, 3) of a pinhole camera with the given focal lengths and principal
+    point, px.
+    """
     return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
 
 
@@ -21,7 +23,8 @@ MAX_ITERATIONS = 20
 
 
 def distort(normalized: Floats, distortion: Floats) -> Floats:
-    """Apply lens distortion to normalized image coordinates (..., 2).
+    """Apply lens distortion to normalized image coordinates (..., 2), and return the distorted
+    ones.
 
     distortion: coefficients k1, k2, p1, p2, k3 (Brown 1966, in OpenCV's order).
     """
@@ -39,12 +42,13 @@ def distort(normalized: Floats, distortion: Floats) -> Floats:
 
 
 def undistort(distorted: Floats, distortion: Floats) -> Floats:
-    """Remove lens distortion from normalized image coordinates (..., 2) by fixed-point iteration.
+    """Remove lens distortion from normalized image coordinates (..., 2) by a fixed-point iteration.
 
     distortion: coefficients k1, k2, p1, p2, k3, as for `distort`.
 
-    The iteration stops when no coordinate changes by more than 1e-13, or after `MAX_ITERATIONS`. It
-    converges where the distortion changes slowly, as it does inside the image of usual lenses.
+    The iteration stops when no coordinate changes by more than 1e-13, or after `MAX_ITERATIONS`.
+    The iteration converges where the distortion changes slowly. This is the case inside the image
+    of usual lenses.
     """
     k1, k2, p1, p2, k3 = distortion
     point = distorted.copy()

@@ -1,4 +1,6 @@
-"""Define the frame of a finger: origin at the pad, x towards the hand, z out of the nail."""
+"""Define the frame of a finger: its origin is at the finger pad, x points to the hand, and z points
+out of the nail.
+"""
 
 from __future__ import annotations
 

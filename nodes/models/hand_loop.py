@@ -1,19 +1,20 @@
-"""Predict from the sampled closed loop whether a hand that touches the sheet is stable.
+"""Predict whether a hand that touches the sheet is stable in the sampled closed loop.
 
 A finger pushes into the sheet. The planner moves the sheet along its normal by `slope` times the
 measured depth. If slope > 0, the sheet moves away from the finger (a retreat, for soft objects). If
-slope < 0, it moves towards the finger (an advance, for stiff objects). The camera measures the
-depth once per period T. The sheet follows after a delay, so it can add energy. The hand has the
-mass m, damping b and stiffness k, the sheet the stiffness ks. With the depth x and the sheet's
-offset s:
+slope < 0, the sheet moves towards the finger (an advance, for stiff objects). The camera measures
+the depth once per period T. The sheet follows after a delay, so the control loop can add energy.
+The hand has the mass m, damping b and stiffness k. The sheet has the stiffness ks. With the depth x
+and the sheet's offset s:
 
     m x'' + b x' + k x + ks (x - s) = 0
     s(t) = slope (y_j + y'_j (t - j T - delay))
 
-Here y_j is the filtered depth of measurement j, and y'_j is its change per period. The filter is an
-alpha-beta filter: it estimates the depth and its rate, so it does not lag behind a depth that
-changes at a constant rate. The state changes over one period by an exact linear map. The control
-loop is stable if all eigenvalues of this map are inside the unit circle.
+Here y_j is the filtered depth of measurement j, and y'_j is the filter's estimate of the rate of
+the depth. The alpha-beta filter estimates the depth and its rate. Its depth does not lag behind a
+depth that changes at a constant rate. The state changes over one period by a linear map, which is
+computed exactly. The control loop is stable if all eigenvalues of this map are inside the unit
+circle.
 """
 
 from __future__ import annotations
@@ -27,14 +28,16 @@ import scipy
 from flexsheet.nodes.arrays import Floats
 
 MIN_DECAY_PER_S = 0.5
-"""The minimum decay rate of the slowest mode at which the control loop counts as stable."""
+"""The minimum decay rate (1/s) of the slowest mode at which the control loop counts as stable."""
 
 GAIN_MARGIN = 1.5
 DELAY_MARGIN_S = 0.02
-"""The required stability margins: factor on the gain, and additional delay (s)."""
+"""The additional delay (s) that the control loop must tolerate. `GAIN_MARGIN` is the required
+margin of the gain, as a factor."""
 
 MAX_SLOPE = 20.0
-"""The upper limit of the search for the critical slope, far above any slope in use."""
+"""The upper limit of the slope in the search for the critical slope. Slopes in use are much
+smaller."""
 
 SLOPES = 32
 """The number of slopes at which the search evaluates the decay rate."""
@@ -42,10 +45,12 @@ SLOPES = 32
 DELAYS_S = (0.02, 0.04, 0.06, 0.08, 0.1, 0.13, 0.17)
 BANDWIDTHS_RAD_PER_S = (4.5, 5.5, 6.5, 8.0, 10.0, 12.5, 16.0, 20.0)
 SHEET_STIFFNESSES_N_PER_M = (50.0, 120.0, 300.0)
-"""The grid of `OffsetBoundsTable`: delays, filter bandwidths and stiffnesses of the sheet."""
+"""The sheet stiffnesses (N/m) of the grid of `OffsetBoundsTable`. The other two axes of the grid
+are `DELAYS_S` and `BANDWIDTHS_RAD_PER_S`."""
 
 FILTER_DAMPING_RATIO = 0.5
-"""The damping ratio of the depth's filter. A larger ratio permits smaller offsets per depth."""
+"""The damping ratio of the filter of the finger's depth. With a larger ratio, the control loop is
+unstable at smaller sheet offsets."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,19 +72,20 @@ HANDS = {
     "arm": Hand(1.0, 15.0, 600.0),
     "arm of low damping": Hand(1.5, 5.2, 100.0),
 }
-"""The hands that cover the range of measurements in the literature.
+"""Models of hands that cover the range of the measurements in the literature.
 
 Finger: Hajian and Howe 1997. Wrist: from its resonance of 6 to 12 Hz, Lakie 2015. Arm:
-    Mussa-Ivaldi, Hogan and Bizzi 1985. Damping ratios of wrist and arm: 0.15 to 0.4.
+Mussa-Ivaldi, Hogan and Bizzi 1985. The damping ratios of wrist and arm are 0.15 to 0.4.
 """
 
 LIMITING_HANDS = tuple(hand for name, hand in HANDS.items() if "low damping" in name)
-"""The hands with low damping, which become unstable first and therefore determine the bounds."""
+"""The hands with low damping. These hands become unstable first, so only they determine the bounds.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class SampledLoop:
-    """The timing and filter of the path from the finger's depth to the sheet's offset.
+    """The timing and the filter in the computation of the sheet's offset from the finger's depth.
 
     period_s: time between two measurements.
     delay_s: time from a measurement until the sheet reaches the position computed from it.
@@ -96,8 +102,8 @@ class SampledLoop:
 def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[float, float]:
     """Return the gains (alpha, beta) of the depth's filter for a step of `step_s`.
 
-    The poles are those of a continuous filter with `FILTER_DAMPING_RATIO`. With an infinite
-    bandwidth, the estimates are the measured depth and its last change.
+    The filter has the poles of a continuous filter with the damping ratio `FILTER_DAMPING_RATIO`.
+    With an infinite bandwidth, it returns the measured depth and the last change of this depth.
     """
     if math.isinf(bandwidth_rad_per_s):
         return 1.0, 1.0
@@ -112,9 +118,9 @@ def make_loop_matrices(
 ) -> Floats:
     """Return the matrices (k, n, n) that map the state over one period, for slopes (k,).
 
-    The state contains depth and speed, the filter's estimates of both, the offsets that have not
-    yet taken effect, and the last two offsets that have taken effect. The newest offset comes
-    first.
+    The state contains depth and speed, and the filter's estimates of both. It also contains the
+    sheet offsets that have not yet taken effect, and the last two offsets that have taken effect.
+    The offsets are sorted from newest to oldest.
     """
     whole, fraction = divmod(loop.delay_s / loop.period_s, 1.0)
     waiting = int(whole) + 1
@@ -140,8 +146,8 @@ def make_loop_matrices(
     measure[:, 5:, 4:] = np.eye(1 + waiting)
 
     # `move` moves the hand for one period: for its `fraction` with the oldest offset, then with
-    # the next one.  The oldest offset took effect (1 - fraction) T before this period.  Its rate
-    # is its difference from the offset before it.
+    # the next one.  The oldest offset took effect (1 - fraction) T before this period.  The rate
+    # of an offset is its difference from the preceding offset.
     start = np.zeros((4, size + 1))
     start[:2, :2] = np.eye(2)
     start[2, -2:] = 2.0 - fraction, fraction - 1.0
@@ -159,7 +165,7 @@ def make_loop_matrices(
 def compute_decays_per_s(
     hand: Hand, loop: SampledLoop, *, sheet_stiffness_n_per_m: float, slopes: Floats
 ) -> Floats:
-    """Return the decay rate (k,) of the slowest mode for slopes (k,), 1/s.
+    """Return the decay rate (k,) of the slowest mode (1/s) for slopes (k,).
 
     A negative rate means that the mode grows.
     """
@@ -178,12 +184,13 @@ def compute_critical_slope(
     towards_finger: bool,
     max_slope: float = MAX_SLOPE,
 ) -> float:
-    """Return the smallest slope magnitude with an unstable control loop, at most `max_slope`.
+    """Return the smallest magnitude of a slope with an unstable control loop, at most `max_slope`.
 
-    towards_finger: whether the slopes are negative, which moves the sheet to the finger.
+    towards_finger: whether the slopes are negative. With a negative slope, the sheet moves towards
+        the finger.
 
-    The decay rate is interpolated between slopes on a grid. Stability at even larger slopes is
-    ignored.
+    The decay rate is interpolated between slopes on a grid. Larger slopes are not evaluated, even
+    if the loop is stable there.
     """
     magnitudes = np.concatenate([[0.0], np.geomspace(0.01 * max_slope, max_slope, SLOPES)])
     decays = compute_decays_per_s(
@@ -217,11 +224,19 @@ class OffsetBounds:
     max_retreats: Floats
 
     def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) towards the finger for sheet stiffnesses (n,), N/m."""
+        """Return the maximum slopes (n,) of a motion of the sheet towards the finger.
+
+        A slope is the sheet offset divided by the finger depth. stiffnesses_n_per_m (n,):
+        stiffnesses of the sheet.
+        """
         return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) away from the finger for sheet stiffnesses (n,), N/m."""
+        """Return the maximum slopes (n,) of a motion of the sheet away from the finger.
+
+        A slope is the sheet offset divided by the finger depth. stiffnesses_n_per_m (n,):
+        stiffnesses of the sheet.
+        """
         return self._interpolate(self.max_retreats, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def _interpolate(
@@ -235,9 +250,9 @@ class OffsetBounds:
 
 @dataclass(frozen=True, slots=True)
 class OffsetBoundsTable:
-    """A table of `OffsetBounds` over delays (d,), for one camera period.
+    """A table of `OffsetBounds` over the delays (d,) of the control loop, for one camera period.
 
-    The slopes are (d, f, k).
+    The arrays of slopes have the shape (d, f, k), as in `OffsetBounds`.
     """
 
     delays_s: Floats
@@ -247,7 +262,10 @@ class OffsetBoundsTable:
     max_retreats: Floats
 
     def at_delay(self, delay_s: float) -> OffsetBounds:
-        """Return the bounds at the next longer delay of the table; bounds of 0 if there is none."""
+        """Return the bounds at the smallest delay of the table that is not below `delay_s`.
+
+        The bounds are 0 if all delays of the table are smaller.
+        """
         row = int(np.searchsorted(self.delays_s, delay_s - 1e-9))
         axes = self.bandwidths_rad_per_s, self.sheet_stiffnesses_n_per_m
         if row == len(self.delays_s):
@@ -257,13 +275,13 @@ class OffsetBoundsTable:
 
 
 def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBoundsTable:
-    """Compute the maximum slopes at which every hand is stable with margins of gain and delay.
+    """Compute the maximum slopes at which all hands are stable with margins of gain and delay.
 
     advance_limit: upper limit of the slopes towards the finger.
 
     For an advance, the gain margin divides the critical slope. For a retreat, it multiplies the
-    sheet's stiffness instead, because a slope cannot exceed 1: the sheet never retreats by more
-    than the finger moves.
+    sheet's stiffness instead, because a retreat slope cannot exceed 1. The sheet never retreats by
+    more than the finger moves.
     """
     shape = len(DELAYS_S), len(BANDWIDTHS_RAD_PER_S), len(SHEET_STIFFNESSES_N_PER_M)
     advances, retreats = np.empty(shape), np.empty(shape)
@@ -295,13 +313,15 @@ def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBou
         np.array(DELAYS_S),
         np.array(BANDWIDTHS_RAD_PER_S),
         np.array(SHEET_STIFFNESSES_N_PER_M),
-        # Bounds must not rise with stiffness or delay.  They then also hold between grid points.
+        # Bounds must not rise with stiffness or delay, so that they are valid between grid points.
         _descend(advances),
         _descend(retreats),
     )
 
 
 def _descend(slopes: Floats) -> Floats:
-    """Reduce slopes (d, f, k) so that they never increase with the delay or the stiffness."""
+    """Reduce slopes (d, f, k) so that they never increase with the delay (d) or the stiffness
+    (k).
+    """
     result = np.minimum.accumulate(np.minimum.accumulate(slopes, axis=0), axis=2)
     return np.asarray(result)

@@ -1,6 +1,6 @@
 """Interpolate between two values, and between the points of predicted paths.
 
-The points of a predicted path are at the times 0, step, 2 step, ... after its start.
+The points of a path with the time step s are at the times 0, s, 2 s, ... after its start.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ def smoothstep(t: Real) -> Real:
 
 
 def interpolate_path(path: Floats, step_s: float, time_s: float) -> tuple[Floats, Floats]:
-    """Return position (3,), m, and velocity (3,), m/s, on a path at a time after its start.
+    """Return the position (3,), m, and velocity (3,), m/s, of a path at `time_s` after its start.
 
     path (n, 3): positions, m, at intervals of `step_s`.
 
-    The interpolation is cubic with central differences as slopes (Catmull and Rom 1974), and linear
-    beyond both ends. Raises ValueError for a path of fewer than two points.
+    The interpolation is cubic with central differences as slopes (Catmull and Rom 1974). The
+    extrapolation beyond both ends is linear. Raises ValueError for a path of fewer than two points.
     """
     count = len(path)
     if count < 2:
@@ -59,7 +59,7 @@ def interpolate_path(path: Floats, step_s: float, time_s: float) -> tuple[Floats
 
 
 def _slope(path: Floats, i: int) -> Floats:
-    """Return the slope (3,) per step at point `i` of a path, by second-order differences."""
+    """Return the slope (3,) of a path at point `i`, in m per step, by second-order differences."""
     last = len(path) - 1
     if last == 1:
         return np.asarray(path[1] - path[0])

@@ -1,4 +1,4 @@
-"""Measure the period of messages whose rate is that of the camera."""
+"""Measure the period of messages that are published at the rate of the camera."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from statistics import median
 INTERVALS = 15
 MIN_INTERVALS = 8
 MAX_PERIOD_S = 0.1
-"""The maximum period. Longer intervals between messages count as interruptions."""
+"""The maximum measured period, s. Longer intervals between messages count as interruptions."""
 
 TOLERANCE_RATIO = 0.2
-"""The maximum relative deviation from the scene's period at which the scene's period is used."""
+"""The relative deviation up to which the scene's camera period is used instead of the measured
+period."""
 
 
 class MeasuredPeriod:
-    """An estimator of the period of messages.
+    """An estimator of the period of messages that are published once per camera image.
 
-    scene_period_s: camera period in the scene, s. It is returned until enough messages have been
-        added, and while the measured period is close to it.
+    scene_period_s: camera period in the scene, s. It is used until enough messages have been added,
+        and while the measured period is close to it.
     """
 
     def __init__(self, scene_period_s: float) -> None:
@@ -27,9 +28,9 @@ class MeasuredPeriod:
         self._last_ns = 0
 
     def add(self, source_ns: int) -> float:
-        """Add a message, and return the period (s).
+        """Add a message, and return the estimated period (s).
 
-        source_ns: source timestamp of the message, which is the time of its camera exposure.
+        source_ns: source timestamp of the message, which is the time of the camera exposure.
         """
         interval_s = (source_ns - self._last_ns) * 1e-9
         self._last_ns = source_ns

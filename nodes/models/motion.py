@@ -1,7 +1,7 @@
-"""Follow a moving target with bounded speed and acceleration.
+"""Compute the motion of a point that follows a moving target with bounded speed and acceleration.
 
-The velocity of the target is fed forward, so a follower that has reached the target does not lag
-behind it. Before that, the follower approaches without overshoot if the target's velocity is
+The velocity of the target is fed forward. Therefore a point that has reached the target does not
+lag behind it. Before that, the point approaches without overshoot if the target's velocity is
 constant.
 """
 
@@ -21,9 +21,9 @@ from flexsheet.nodes.models.rigid import (
 )
 
 BRAKE_FRACTION = 1.0 / 3.0
-"""The fraction of the acceleration that is used to brake towards the target.
+"""The fraction of the maximum acceleration that is used to brake near the target.
 
-The remaining acceleration is used to follow the target.
+The remaining acceleration is used to follow changes of the target's velocity.
 """
 
 
@@ -31,8 +31,8 @@ def closing_speed(distance: Floats | float, deceleration: Floats | float, step_s
     """Return the maximum speeds (n,) at which a point can stop within distances (n,) >= 0 (m).
 
     In each step, the point moves by speed * step_s, and then its speed decreases by deceleration *
-    step_s. Therefore w^2/(2 a) + w dt/2 = distance, with speed w, deceleration a and step dt. A
-    shorter distance takes one step.
+    step_s. The speed w fulfils w^2/(2 a) + w dt/2 = distance, with deceleration a and step dt. It
+    is at most distance / dt.
     """
     half = 0.5 * deceleration * step_s
     speed = np.sqrt(half * half + 2.0 * deceleration * distance) - half
@@ -48,11 +48,11 @@ def follow(
     max_acceleration: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """Return the displacement (n,) in a step towards a moving target, and the velocity (n,) after
-    it.
+    """Return the displacement (n,) in one step towards a moving target, and the new velocity (n,).
 
-    error (n,): target at the end of the step minus the current point. `max_acceleration` bounds the
-        change of the mean velocity from one step to the next.
+    error (n,): target at the end of the step minus the current point.
+    velocity, target_velocity (n,): current velocities of the point and of the target.
+    max_acceleration: limit of the change of the mean velocity from one step to the next, per time.
     """
     target_velocity = _clamp_length(target_velocity, max_speed)
     desired = desired_velocity(
@@ -80,10 +80,10 @@ def desired_velocity(
     max_acceleration: float,
     step_s: float,
 ) -> Floats:
-    """Return the fastest velocity (n,) towards the target at which the point can still stop there.
+    """Return the fastest velocity (n,) towards a moving target from which the point can stop there.
 
-    error (n,): target at the end of the step minus the current point. The units are those of
-        `error` and s.
+    error (n,): target at the end of the step minus the current point, in any unit u. Velocities
+        have the unit u/s.
     """
     offset = error - target_velocity * step_s
     distance = measure_length(offset)
@@ -95,7 +95,9 @@ def desired_velocity(
 
 
 def measure_length(vector: Floats) -> float:
-    """Return the norm of a small vector, five times as fast as `numpy.linalg.norm`."""
+    """Return the Euclidean norm of a small vector (n,). This function is faster than
+    `numpy.linalg.norm`.
+    """
     return sqrt(float(vector @ vector))
 
 
@@ -106,7 +108,11 @@ def _clamp_length(vector: Floats, longest: float) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SheetMotion:
-    """The motion state of the sheet: pose, twist (m/s, rad/s), stretch ratio and its rate (1/s)."""
+    """The state of the sheet's motion.
+
+    world_from_sheet: pose (4, 4), m. twist_world: linear and angular velocity (6,), m/s and rad/s.
+    stretch_ratio, stretch_rate_per_s: stretch ratio and its rate of change.
+    """
 
     world_from_sheet: Floats
     twist_world: Floats
@@ -128,18 +134,22 @@ class SheetBounds:
 
 @dataclass(frozen=True, slots=True)
 class EdgeBound:
-    """The limit of the speed of all points of the clamped edges.
+    """The limit of the speed of all points of the sheet's clamped edges.
 
-    reach_m: half the length of an edge. Translation and rotation are scaled by the same factor. If
-        each arm limited the speed of its edge separately, the edges would leave the sheet's path
-        and their distance would change.
+    reach_m: half the length of an edge.
+
+    Translation and rotation are scaled by the same factor. If each arm limited the speed of its
+    edge separately, the distance of the edges would change.
     """
 
     speed_m_per_s: float
     reach_m: float
 
     def speed_scale(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
-        """Return the factor (0 to 1) on both speeds that keeps the limit of the edges."""
+        """Return the factor (0 to 1) by which both speeds of the sheet must be multiplied.
+
+        With this factor, no point of the edges exceeds the limit.
+        """
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge
 
@@ -147,7 +157,10 @@ class EdgeBound:
 def follow_sheet(
     now: SheetMotion, target: SheetMotion, *, bounds: SheetBounds, edges: EdgeBound, step_s: float
 ) -> SheetMotion:
-    """Return the sheet's motion after a step towards its target at the end of the step."""
+    """Return the sheet's motion after one step towards `target`.
+
+    target: motion of the target at the end of the step. step_s: duration of the step.
+    """
     away = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(
         target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T
@@ -210,7 +223,10 @@ def follow_sheet(
 
 
 def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> SheetMotion:
-    """Return the sheet's motion after a step of the fastest deceleration within the bounds."""
+    """Return the sheet's motion after one step of maximum deceleration.
+
+    bounds: limits of the deceleration. step_s: duration of the step.
+    """
     linear = _decelerate(now.twist_world[:3], bounds.acceleration_m_per_s2 * step_s)
     angular = _decelerate(now.twist_world[3:], bounds.turn_acceleration_rad_per_s2 * step_s)
     rate = _decelerate(
@@ -226,7 +242,9 @@ def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> Shee
 
 
 def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
-    """Return the motion after `duration_s` (positive or negative) of constant velocity."""
+    """Return the motion after a time `duration_s` with constant velocity. A negative time is
+    permitted.
+    """
     return replace(
         motion,
         world_from_sheet=moved(motion.world_from_sheet, motion.twist_world, duration_s),
@@ -237,9 +255,10 @@ def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
 def follow_trajectory(
     motion: SheetMotion, time_s: float, *, keep_s: float, brake_s: float
 ) -> SheetMotion:
-    """Return the motion `time_s` later.
+    """Return the motion after the time `time_s`, if no further target arrives.
 
-    The twist is constant for `keep_s`, and then decreases uniformly to zero within `brake_s`.
+    The twist is constant for `keep_s`, and then decreases uniformly to zero within `brake_s`. The
+    stretch ratio is constant.
     """
     braked_s = min(max(time_s - keep_s, 0.0), brake_s)
     travelled_s = min(time_s, keep_s) + braked_s - 0.5 * braked_s * braked_s / brake_s
@@ -257,7 +276,7 @@ def _decelerate(velocity: Floats, change: float) -> Floats:
 
 
 def _orthonormal(pose: Floats) -> Floats:
-    """Return the pose (4, 4) without the rounding errors of its rotation (Gram-Schmidt on x, y)."""
+    """Return a pose (4, 4) whose rotation is made orthonormal again (Gram-Schmidt on x and y)."""
     (ax, bx, _, px), (ay, by, _, py), (az, bz, _, pz), last = pose.tolist()
     length = sqrt(ax * ax + ay * ay + az * az)
     ax, ay, az = ax / length, ay / length, az / length

@@ -1,4 +1,4 @@
-"""Define the 1 euro filter (Casiez, Roussel and Vogel, "1 € Filter", CHI 2012)."""
+"""Implement the 1 euro filter (Casiez, Roussel and Vogel, "1 € Filter", CHI 2012)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ class OneEuro:
         measured_velocity: Floats,
         step_s: float,
     ) -> tuple[Floats, Floats, float]:
-        """Return the filtered value (n,), the filtered velocity (n,) and the weight of `value`.
+        """Return the new filtered value (n,), the new filtered velocity (n,) and the weight of
+        `value`.
 
         filtered, velocity: results (n,) of the previous step.
         value, measured_velocity: new value (n,) and its unfiltered rate of change (n,).

@@ -14,20 +14,22 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats
 
 MAX_GAP_S = 1.0
-"""The maximum time between two residuals that is added to the weight of the mean."""
+"""The maximum weight of a residual in the mean, s. The weight is the time since the previous
+residual."""
 
 CLEAR_RATIO = 0.8
-"""The fraction of the threshold below which a suspicion ends.
+"""The fraction of the threshold below which an error is no longer suspected.
 
-It is below 1, so that the suspicion does not start and end repeatedly.
+The fraction is below 1 (hysteresis), so that the result does not change repeatedly near the
+threshold.
 """
 
 
 class ResidualMonitor:
-    """A monitor of the mean of a residual vector.
+    """A monitor that reports an error if the mean of a residual vector stays large.
 
     mean: weighted mean of the residuals, in their unit; zeros before the first residual.
-    suspected: whether the mean has exceeded the threshold for long enough.
+    suspected: whether the mean has exceeded the threshold for the required time.
     """
 
     def __init__(
@@ -35,9 +37,10 @@ class ResidualMonitor:
     ) -> None:
         """Set the parameters of the monitor.
 
-        components: length of the residual vector. threshold: maximum magnitude of the mean, in the
-            unit of the residuals. memory_s: time constant of the mean. confirm_s: time above the
-            threshold after which an error is suspected.
+        components: length of the residual vector.
+        threshold: maximum magnitude of the mean, in the unit of the residuals.
+        memory_s: time constant of the exponential weights of the mean.
+        confirm_s: time for which the mean must exceed the threshold until an error is suspected.
         """
         self.mean, self.suspected, self.threshold = np.zeros(components), False, threshold
         self._memory_s, self._confirm_s = memory_s, confirm_s
@@ -46,12 +49,14 @@ class ResidualMonitor:
 
     @property
     def has_data(self) -> bool:
-        """Return whether the mean covers enough time to be compared with the threshold."""
+        """Return whether the residuals cover enough time to compare their mean with the
+        threshold.
+        """
         return self._weight_s >= 0.5 * self._memory_s
 
     @property
     def deviation(self) -> float:
-        """Return the magnitude of the mean."""
+        """Return the magnitude of the mean residual, in the unit of the residuals."""
         return float(np.linalg.norm(self.mean))
 
     def add(self, residual: Floats, at_ns: int) -> None:

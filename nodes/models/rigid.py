@@ -1,4 +1,4 @@
-"""Compute with rigid transforms.
+"""Compute with rigid transforms, which consist of a rotation and a translation.
 
 A transform `a_from_b` is a homogeneous matrix (4, 4) that maps coordinates in frame b to frame a. A
 twist is a vector (6,) in the world frame: linear velocity (m/s), then angular velocity (rad/s).
@@ -126,7 +126,7 @@ def transform_from_rpy(position_m: ArrayLike, rpy_rad: ArrayLike) -> Floats:
 
 
 class Pose(Protocol):
-    """The interface of the poses in scenes: position (m) and roll, pitch, yaw (rad)."""
+    """The interface of objects that describe a pose: position (m) and roll, pitch, yaw (rad)."""
 
     @property
     def position_m(self) -> ArrayLike: ...
@@ -136,7 +136,7 @@ class Pose(Protocol):
 
 
 def pose_matrix(pose: Pose) -> Floats:
-    """Return the transform (4, 4) of a pose."""
+    """Return the transform (4, 4) of a pose, such as world_from_object."""
     return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
@@ -147,12 +147,13 @@ def inverse(a_from_b: Floats) -> Floats:
 
 
 def apply(a_from_b: Floats, points_b: Floats) -> Floats:
-    """Return points (..., 3) of frame b in frame a."""
+    """Transform points (..., 3) from frame b to frame a."""
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
 def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
-    """Return whether a matrix is a finite rigid transform (4, 4) with the last row (0 0 0 1).
+    """Return whether a matrix is a rigid transform: finite, of shape (4, 4), with the last row (0 0
+    0 1).
 
     tolerance: maximum magnitude of the dot product of two different rows of the rotation matrix.
     """
@@ -178,7 +179,7 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
 
 
 def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Floats:
-    """Return a body's pose (4, 4) after it has moved for `duration_s` with a constant twist.
+    """Return the pose (4, 4) of a body after a motion of `duration_s` with a constant twist.
 
     twist_world (6,): velocity of the body's origin (m/s), then angular velocity (rad/s).
     """

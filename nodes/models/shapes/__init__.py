@@ -1,4 +1,4 @@
-"""Provide the shapes of virtual objects; `surface.Shape` is their common interface."""
+"""Provide the shapes of virtual objects. The class `surface.Shape` is their common interface."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from flexsheet.nodes.models.shapes.triangles import MeshError
 
 
 def make_shape(geometry: Mapping[str, Any]) -> Shape:
-    """Make the shape that a geometry describes, as in `make_shape(dict(scene.object.geometry))`.
+    """Make a shape from a description such as `dict(scene.object.geometry)`.
 
     geometry: the key `shape` is the name of the shape, the key `origin` is ignored, and the other
         keys are the dimensions.

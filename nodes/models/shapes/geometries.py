@@ -25,17 +25,18 @@ from flexsheet.nodes.models.shapes.solids import (
 from flexsheet.nodes.models.shapes.surface import Shape
 
 INNER_RATIO = 0.8
-"""The size of the undistorted lattice inside the mesh of a round solid, over the solid's size."""
+"""The ratio of the size of the undistorted inner lattice of a round solid's mesh to the solid's
+size."""
 
 
 @dataclass(frozen=True, slots=True)
 class CuboidMap:
     """A map from the surface of the cube [-1, 1]^3 to the surface of a solid, used for meshing.
 
-    half_m: half extents (3,) of the solid. inner_m: half extents (3,) of the whole lattice if no
-    part of it were distorted. surface: function that maps points (n, 3) on the cube to points (n,
-    3), in m, on the solid. is_round: whether the whole surface is curved, as on an ellipsoid; false
-    if it has flat faces.
+    half_m: half extents (3,) of the solid. inner_m: half extents (3,) that the mesh's lattice has
+    before it is distorted. surface: function that maps points (n, 3) on the cube to points (n, 3),
+    in m, on the solid. is_round: whether the whole surface is curved, as on an ellipsoid; false if
+    it has flat faces.
     """
 
     half_m: Floats
@@ -51,9 +52,9 @@ class GeometryDescription:
     make_shape: function that makes the shape; the dimensions are its keyword arguments.
     bounds_m: function that returns the lower and upper corner (3,) of the bounding box of the
         solid. For a half-space, it is the bounding box of the rectangle that can be touched.
-    extent_m: function that returns how far the touchable surface extends from the origin along a
-        unit vector.
-    scale: function that returns the changed dimensions if the geometry is scaled by a ratio.
+    extent_m: function that returns the extent of the touchable surface from the origin along a unit
+        vector, m.
+    scale: function that returns the dimensions of the geometry after scaling by a ratio.
     cuboid_map: function that returns the map for meshing, given dimensions and shape; None if the
         shape is meshed by another method.
     """
@@ -71,7 +72,8 @@ def map_round_solid(half_m: Floats) -> CuboidMap:
 
 
 def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
-    """Return the map for meshing that moves points on a box to their nearest points on `shape`.
+    """Return a map for meshing. It moves points on the surface of a box to their nearest points on
+    `shape`.
 
     half_m (3,): half extents of the box.
     """
@@ -99,7 +101,7 @@ def _cylinder_bounds(cylinder: Any) -> tuple[Floats, Floats]:
 
 
 def _cylinder_extent(cylinder: Any, direction: Floats) -> float:
-    """Return the extent (m) of the side of a cylinder, whose end caps cannot be touched."""
+    """Return the extent (m) of a cylinder's lateral surface from the origin along a unit vector."""
     return float(cylinder.radius_m * np.hypot(direction[1], direction[2]))
 
 
@@ -173,4 +175,7 @@ GEOMETRIES: dict[str, GeometryDescription] = {
         scale=_scale_mesh,
     ),
 }
-"""The descriptions of the geometries, by the name in `object.geometry.shape` of scene files."""
+"""The descriptions of all kinds of geometry.
+
+The keys are the values of `object.geometry.shape` in scene files.
+"""

@@ -1,22 +1,22 @@
 """Represent a closed triangle mesh as a smooth implicit surface.
 
-A sheet that is tangent to flat facets would change its orientation in jumps. The surface is
-therefore smoothed over the smoothing length `rho` (m), in two steps:
+A sheet that is tangent to flat facets would change its orientation abruptly. Therefore the surface
+is smoothed over the smoothing length `rho` (m), in two steps:
 
 1. Local quadratic fits, called jets (Cazals and Pouget, Estimating Differential Quantities Using
-Polynomial Fitting of Osculating Jets, 2005): a quadratic is fitted by least squares around selected
-vertices. Jet i has a centre p_i, a unit normal n_i and a shape operator A_i (the derivative of the
-normal along the surface). With d = x - p_i, the signed distance of a point x to second order is
-s_i(x) = n_i d + d A_i d / 2.
+    Polynomial Fitting of Osculating Jets, 2005): a quadratic is fitted by least squares around
+    selected vertices. Jet i has a centre p_i, a unit normal n_i and a shape operator A_i (the
+    derivative of the normal along the surface). With d = x - p_i, the signed distance of a point x
+    to second order is s_i(x) = n_i d + d A_i d / 2.
 2. Blending (partition of unity; Ohtake et al., Multi-level Partition of Unity Implicits, 2003):
-f(x) = sum w_i s_i / sum w_i. The weights are w_i = (1 - t_i)^4 with t_i = (d d + 3 (n_i d)^2) /
-rho^2, and w_i = 0 for t_i > 1. The surface is f = 0. The support of a jet is the region t_i < 1, in
-which its weight is not zero.
+    f(x) = sum w_i s_i / sum w_i. The weights are w_i = (1 - t_i)^4 with t_i = (d d + 3 (n_i d)^2) /
+    rho^2, and w_i = 0 for t_i > 1. The surface is f = 0. The support of a jet is the region t_i <
+    1, in which its weight is not zero.
 
 f is three times continuously differentiable, so the normal has a continuous second derivative along
 a path. Supports are half as thick along the normal as across it, so the two sides of a thin part do
-not affect each other. Edges sharper than `rho` are rounded over about that length. `deviation_m`
-measures the resulting distance between surface and mesh.
+not affect each other. Edges sharper than `rho` are rounded over about that length. `deviation_m` is
+the resulting maximum distance between surface and mesh.
 """
 
 from __future__ import annotations
@@ -48,51 +48,64 @@ from flexsheet.nodes.models.shapes.triangles import (
 )
 
 FLATNESS = 3.0
-"""The flatness of a jet's support.
+"""The flatness of the support (region of influence) of a jet, which is a local quadratic fit.
 
-The support extends 1 / sqrt(1 + FLATNESS) as far along the jet's normal as across it.
+The ratio of the support's extents along the jet's normal and across it is 1 / sqrt(1 + FLATNESS).
 """
 FIT_RATIO = 1.25
-"""The radius around a jet within which vertices are used for its fit, divided by `rho`."""
+"""The radius of the neighbourhood in which vertices are used for a local quadratic fit, divided by
+the smoothing length `rho`."""
 SPACING_RATIO = 1.0 / 3.0
-"""The minimum distance between jets on the same side of the surface, divided by `rho`."""
+"""The minimum distance between jets (local quadratic fits) on the same side of the surface, divided
+by the smoothing length `rho`."""
 MIN_NORMAL_COSINE = 0.2
-"""The minimum cosine of the angle between the normals of a jet and of a vertex used for its fit."""
+"""The minimum cosine of the angle between the normal of a local quadratic fit (jet) and that of a
+vertex that is used for the fit."""
 MAX_CURVATURE_RATIO = 2.0
-"""The maximum curvature of a jet (1/m), multiplied by `rho`."""
+"""The maximum curvature (1/m) of a local quadratic fit (jet), multiplied by the smoothing length
+`rho` (m)."""
 EDGE = 1.5
-"""The curvature above which a point counts as an edge, divided by a jet's maximum curvature."""
+"""The curvature above which a surface point counts as an edge, divided by the maximum curvature of
+a local quadratic fit (jet)."""
 OFF_ONE, FAR_OFF_ONE = 0.35, 0.6
-"""The limits of | |grad f| - 1 |, which is 0 where neighbouring jets agree.
+"""The limits of | |grad f| - 1 | for the level set f. The value is 0 where adjacent local quadratic
+fits (jets) agree.
 
-Above the first limit, jets with different normals meet at an edge. Above the second limit, the
-point with f = 0 is an artefact beyond the rim of a thin part, and not on the surface.
+Above the first limit, a surface point counts as an edge, where jets with different normals meet.
+Above the second limit, a point with f = 0 does not represent the mesh. Such points occur beyond the
+rim of a thin part.
 """
 MIN_SUPPORT = 0.1
-"""The minimum sum of the weights w_i on the surface. The sum is smaller only beyond a rim."""
+"""The minimum sum of the jets' weights w_i on the surface. The sum is smaller only beyond the rim
+of a thin part."""
 MEMBERS_KNOWN = 0.1
-"""The distance that a point may move before its list of nearby jets is updated, over `rho`."""
+"""The distance, divided by `rho`, by which a point moves before its list of nearby local quadratic
+fits (jets) is updated."""
 STRIDE_RATIO = 0.4
-"""The maximum step of the projection, divided by `rho`. It keeps the iteration in the supports."""
-REST_RATIO = 1e-3
-"""The step, divided by `rho`, below which the projection has converged.
+"""The maximum step of the projection onto the surface, divided by `rho`.
 
-The remaining error is some nanometres and about 1e-5 rad.
+Longer steps could leave the region in which the surface is defined.
+"""
+REST_RATIO = 1e-3
+"""The step of the projection, divided by `rho`, below which it counts as converged.
+
+The remaining error is some nanometres in position and about 1e-5 rad in the normal.
 """
 APART_RATIO = 0.4
-"""The distance above which two nearest points count as distinct, divided by `rho`."""
+"""The distance above which two surface points count as distinct, divided by `rho`."""
 MAX_DEVIATION_RATIO = 0.22
-"""The maximum distance between the surface and the mesh, divided by `rho`."""
+"""The maximum permitted distance between the smooth surface and the mesh, divided by `rho`."""
 MAX_EXTENT_FRACTION = 1.0 / 3.0
 MAX_STARTS = 6
 """The maximum number of additional starting points in the search for the global nearest point."""
 MIN_CURVATURE_FACTOR = 0.1
-"""The lower bound on the eigenvalues of I + h A (h: height above the jet, A: shape operator).
+"""The lower bound on the eigenvalues of I + h A (h: height above a surface point, A: shape
+operator).
 
-These eigenvalues vanish at a centre of curvature.
+An eigenvalue is 0 at a centre of curvature.
 """
 RIM_FRACTION = 0.8
-"""The fraction of the radius beyond which `rise_m` reduces the weight of heights."""
+"""The fraction of the maximum distance beyond which `rise_m` reduces the weight of heights."""
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
@@ -103,10 +116,10 @@ if TYPE_CHECKING:
 def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
     """Return the default smoothing length (m) of a mesh: 1.75 times its median edge length.
 
-    vertices (v, 3), m; triangles (t, 3).
+    vertices (v, 3): positions, m. triangles (t, 3): indices of vertices.
 
-    With a shorter length, the facets would still be noticeable. With a longer length, curved parts
-    would be flattened. `benchmarks.shapes` measures both effects.
+    With a shorter length, users would feel the facets. With a longer length, curved parts would be
+    flattened. `benchmarks.shapes` measures both effects.
     """
     run = half_edges(triangles)
     length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)
@@ -114,15 +127,15 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
 
 
 class SmoothMeshShape:
-    """A closed mesh that is smoothed over the length `smoothing_m`."""
+    """The shape of a closed mesh whose edges are smoothed over the length `smoothing_m`."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
         """Fit the local quadratics (jets) that define the smooth surface of a closed mesh.
 
-        vertices_m (v, 3), triangles (t, 3): mesh. smoothing_m: smoothing length.
+        vertices_m (v, 3), triangles (t, 3): mesh. smoothing_m: smoothing length, m.
 
-        Raises MeshError for a mesh that does not bound a solid or is too small for the smoothing
-        length, and ValueError for a smoothing length that is not positive.
+        Raises MeshError for a mesh that does not bound a solid, or that is too small for the
+        smoothing length. Raises ValueError for a smoothing length that is not positive.
         """
         check_positive(smoothing_m=smoothing_m)
         vertices = np.asarray(vertices_m, dtype=np.float64)
@@ -158,8 +171,8 @@ class SmoothMeshShape:
     def deviation_m(self) -> float:
         """Return the maximum distance (m) between the mesh and the smooth surface.
 
-        It is evaluated at vertices, edge midpoints and triangle centres. Raises MeshError if it
-        exceeds `MAX_DEVIATION_RATIO` times `smoothing_m`.
+        The distance is evaluated at vertices, edge midpoints and triangle centres. Raises MeshError
+        if the maximum exceeds `MAX_DEVIATION_RATIO` times `smoothing_m`.
         """
         deviation = float(np.abs(self.closest(self._samples).height_m).max())
         if deviation > MAX_DEVIATION_RATIO * self.smoothing_m:
@@ -170,11 +183,11 @@ class SmoothMeshShape:
         return deviation
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the nearest points, as specified by `Shape.closest`.
+        """Find the surface points nearest to `points` (n, 3) or (3,), as `Shape.closest` specifies.
 
         `on_edge` is true where the curvature exceeds `EDGE * MAX_CURVATURE_RATIO / smoothing_m`.
-        This happens at rims thinner than `smoothing_m` and at rounded edges, over which a sheet
-        cannot roll. `undecided` is true where two distinct surface points are equally near.
+        This happens at rims thinner than `smoothing_m` and at rounded edges. A sheet cannot roll
+        over such edges. `undecided` is true where two distinct surface points are equally near.
         """
         queries = check_points(points)
         before = check_previous(previous, queries)
@@ -210,11 +223,11 @@ class SmoothMeshShape:
         )
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Return the signed distances, as specified by `Shape.signed_distance`."""
+        """Return the signed distances (m) of points to the solid, which are negative inside."""
         return self.closest(points).height_m
 
     def _continue_from(self, query: Floats, before: Floats) -> Nearest | None:
-        """Find the nearest point of a query (3,), starting at the previous nearest point `before`
+        """Find the nearest surface point of a query (3,), starting from the previous one, `before`
         (3,).
 
         Return None if the projection does not converge.
@@ -234,8 +247,7 @@ class SmoothMeshShape:
         )
 
     def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
-        """Return the nearest points of queries (n, 3), and whether each nearest point is ambiguous
-        (n,).
+        """Return the nearest surface points of queries (n, 3), and whether they are ambiguous (n,).
 
         before: nearest points (n, 3) of the previous queries, or None.
         """
@@ -250,13 +262,13 @@ class SmoothMeshShape:
         return feet, undecided
 
     def _find_global_nearest(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
-        """Return the global nearest points of queries (n, 3), and whether each of them is ambiguous
-        (n,).
+        """Return the globally nearest surface points of queries (n, 3), and whether they are
+        ambiguous (n,).
 
-        Each query is projected from its nearest jet, which gives a point at a distance D. Any
-        nearer point has a jet within the radius `_cover` = c. Because curvature is bounded, that
-        jet is at most sqrt(D^2 + c^2 (1 + 4 D / rho)) from the query. Among the jets in this
-        radius, `_select_starts` chooses the starting points of further projections.
+        Each query is projected from its nearest jet (local quadratic fit), which gives a point at a
+        distance D. Any nearer point has a jet within the radius `_cover` = c. Because curvature is
+        bounded, that jet is at most sqrt(D^2 + c^2 (1 + 4 D / rho)) from the query. Among the jets
+        in this radius, `_select_starts` chooses the starting points of further projections.
         """
         nearest, rho = self._tree.query(queries)[1], self.smoothing_m
         start = self._centre[nearest]
@@ -295,11 +307,12 @@ class SmoothMeshShape:
         """Choose further starting points for the search for a nearer surface point.
 
         lists: indices of the candidate jets (local quadratic fits) of each query. feet (n, 3),
-        distance (n,): nearest points found so far, and their distances, in m.
+            distance (n,): nearest surface points found before, and their distances from the
+            queries, in m.
 
         Return k pairs: indices of the queries (k,) and of the jets (k,) at which to start. A jet is
-            chosen if the nearest point on its quadratic is close to the jet and not much farther
-            than `distance`. Jets within `rho` of `feet` or of a chosen jet are omitted.
+        chosen if the nearest point on its quadratic is close to the jet and not much farther than
+        `distance`. Jets within `rho` of `feet` or of a chosen jet are omitted.
         """
         rows = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
         jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
@@ -362,7 +375,10 @@ class SmoothMeshShape:
         return float((height[within] * np.minimum(weight, 1.0)).max())
 
     def _on_jet(self, queries: Floats, jet: Indices) -> Floats:
-        """Return the approximate nearest points (n, 3) of queries (n, 3) on the jets (n,)."""
+        """Return the approximate nearest points (n, 3) of queries (n, 3) on the jets (n,).
+
+        jet (n,): index of the jet (local quadratic fit) for each query.
+        """
         normal, operator = self._normal[jet], self._operator[jet]
         offset = queries - self._centre[jet]
         height = (offset * normal).sum(1)[:, None]
@@ -376,13 +392,13 @@ class SmoothMeshShape:
         return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
 
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
-        """List, for each jet, the jets whose weight is not zero in its neighbourhood.
+        """List, for each jet (local quadratic fit), the jets whose weights are not zero in its
+        neighbourhood.
 
         cover (j,): radius (m) of the neighbourhood of each jet.
 
         Return a table (j, k) of jet indices, and the number (j,) of valid entries in each row. Rows
-        are padded with the index of a far-away jet without influence, which this method appends to
-        the jets.
+        are padded with the index of an additional jet without influence, which this method appends.
         """
         reach = self.smoothing_m + cover + MEMBERS_KNOWN * self.smoothing_m
         lists = self._tree.query_ball_point(self._centre, reach)
@@ -398,7 +414,8 @@ class SmoothMeshShape:
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Evaluate f at points (n, 3) near the surface. This implements a `LevelSet`.
 
-        The last result (n,) is the sum of the weights w_i.
+        Return the values of f (n,), gradients (n, 3), Hessians (n, 3, 3) and sums of the weights
+        w_i (n,).
         """
         nearest = self._tree.query(points)[1]
         members = self._table[nearest, : self._counts[nearest].max()]
@@ -438,11 +455,11 @@ class SmoothMeshShape:
         return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
 
     def surroundings(self, point: Floats) -> tuple[int, Indices, Floats, Floats, Floats]:
-        """Return the index of the jet nearest to a point (3,), and the k jets with weight near the
-        point.
+        """Return the index of the jet (local quadratic fit) nearest to a point (3,), and nearby
+        jets.
 
-        The k jets are given as indices (k,), centres (k, 3), normals (k, 3) and shape operators (k,
-        3, 3).
+        The k jets with a weight near the point are given by indices (k,), centres (k, 3), normals
+        (k, 3) and shape operators (k, 3, 3).
         """
         nearest = int(self._tree.query(point)[1])
         members = self._table[nearest, : self._counts[nearest]]
@@ -456,7 +473,8 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """A function (`LevelAt`) that evaluates f of a `SmoothMeshShape` along one projection.
+    """A function (`LevelAt`) that evaluates the level set f of a `SmoothMeshShape` along the path
+    of one projection.
 
     To save time, the list of nearby jets is updated only when the point has moved by
     `MEMBERS_KNOWN` times `rho`.
@@ -504,7 +522,7 @@ class _LevelNear:
 def _on_surface_only(feet: SurfaceProjections) -> SurfaceProjections:
     """Clear `is_nearest` for projections that ended beyond the rim of a thin part.
 
-    Beyond a rim, f = 0 does not represent the surface.
+    Beyond a rim, the points with f = 0 do not represent the surface of the mesh.
     """
     beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
     feet.is_nearest[beyond_rim | (feet.support < MIN_SUPPORT)] = False
@@ -517,7 +535,10 @@ def _put(
     other: SurfaceProjections,
     chosen: Bools | slice = slice(None),
 ) -> None:
-    """Replace the given rows of `feet` by the chosen rows of `other`, in place."""
+    """Replace rows of `feet` by rows of `other`, in place.
+
+    rows: indices of the replaced rows. chosen: selects the rows of `other`.
+    """
     feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
     feet.shape_operator[rows] = other.shape_operator[chosen]
     feet.steepness[rows], feet.support[rows] = other.steepness[chosen], other.support[chosen]
@@ -525,9 +546,9 @@ def _put(
 
 
 def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Floats, Floats]:
-    """Fit the jets of a mesh. Return centres (j, 3), normals (j, 3) and shape operators (j, 3, 3).
+    """Fit the jets (local quadratics) of a mesh with the smoothing length `rho` (m).
 
-    rho: smoothing length, m.
+    Return centres (j, 3), normals (j, 3) and shape operators (j, 3, 3).
     """
     rough = vertex_normals(vertices, triangles)
     from scipy.spatial import cKDTree
@@ -549,10 +570,10 @@ def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Flo
 
 
 def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
-    """Return the indices of vertices that are at least `spacing` (m) apart on each side of the
-    surface.
+    """Select vertices that are at least `spacing` (m) apart on each side of the surface; return
+    their indices.
 
-    Every other vertex has a selected vertex within that distance on the same side.
+    Every vertex that is not selected has a selected vertex within that distance on the same side.
     """
     selected, covered = [], np.zeros(len(vertices), dtype=bool)
     for vertex in range(len(vertices)):
@@ -565,7 +586,10 @@ def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) 
 
 
 def _connected(start: int, allowed: set[int], ring: list[Indices]) -> list[int]:
-    """Return the allowed vertices that are connected to `start` through allowed vertices."""
+    """Return the allowed vertices that are connected to `start` through allowed vertices.
+
+    ring: indices of the neighbours of each vertex.
+    """
     found, edge = [start], [start]
     left = allowed - {start}
     while edge:
@@ -581,9 +605,9 @@ def _jet(
 ) -> tuple[Floats, Floats, Floats]:
     """Fit a quadratic z(x, y) to the points `around` (m, 3) by weighted least squares.
 
-    origin, rough (3,): vertex and approximate normal, which is the z axis. Lengths are scaled by
-        the radius of the fit. If there are too few points, the solution of minimum norm is used.
-        Return the centre (3,), the normal (3,) and the shape operator (3, 3).
+    origin, rough (3,): vertex, and approximate normal at this vertex, which defines the z axis.
+        Lengths are scaled by the radius of the fit. If there are too few points, the solution of
+        minimum norm is used. Return the centre (3,), the normal (3,) and the shape operator (3, 3).
     """
     reach = FIT_RATIO * rho
     first = np.cross(rough, _IDENTITY[np.abs(rough).argmin()])

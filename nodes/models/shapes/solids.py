@@ -1,6 +1,6 @@
 """Define the virtual objects with simple formulas: cylinder, sphere, plane, ellipsoid and box.
 
-Each class implements the interface `Shape` of the module `surface`, which defines the terms.
+Each class implements the interface `Shape` of the module `surface`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ _IDENTITY = np.eye(3)
 class CylinderShape(Convex):
     """A circular cylinder about the x axis, centred on the origin.
 
-    Only the side can be touched, because the sheet is clamped along x. For a finger beyond an end
-    cap, the nearest point is on the rim of the side, and `on_edge` is true.
+    Only the lateral surface can be touched, because the sheet is stretched along x. For a finger
+    beyond an end cap, the nearest point is on the rim of the lateral surface, and `on_edge` is
+    true.
     """
 
     radius_m: float
@@ -42,9 +43,10 @@ class CylinderShape(Convex):
         check_positive(radius_m=self.radius_m, length_m=self.length_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the nearest points, as specified by `Shape.closest`.
+        """Find the points of the lateral surface nearest to `points` (n, 3) or (3,), as
+        `Shape.closest` specifies.
 
-        They are ambiguous on the axis.
+        The nearest point is ambiguous for points on the axis.
         """
         queries = check_points(points)
         radial = queries * np.array([0.0, 1.0, 1.0])
@@ -81,9 +83,9 @@ class SphereShape(Convex):
         check_positive(radius_m=self.radius_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the nearest points, as specified by `Shape.closest`.
+        """Find the surface points nearest to `points` (n, 3) or (3,), as `Shape.closest` specifies.
 
-        They are ambiguous at the centre.
+        The nearest point is ambiguous at the centre.
         """
         queries = check_points(points)
         normal, radius, undecided = _directions(queries, previous, queries, across=(0, 1, 2))
@@ -107,7 +109,8 @@ class PlaneShape(Convex):
         check_positive(width_m=self.width_m, height_m=self.height_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the nearest points, as specified by `Shape.closest`.
+        """Find the points of the rectangle nearest to `points` (n, 3) or (3,), as `Shape.closest`
+        specifies.
 
         `on_edge` is true beyond the rectangle, whose width is along x and whose height is along y.
         """
@@ -139,9 +142,9 @@ class EllipsoidShape(Convex):
             check_positive(**{f"semi_axes_m ({axis})": length})
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the nearest points, as specified by `Shape.closest`.
+        """Find the surface points nearest to `points` (n, 3) or (3,), as `Shape.closest` specifies.
 
-        `_undecided` defines where they are ambiguous.
+        The method `_undecided` detects ambiguous nearest points.
         """
         queries = check_points(points)
         before = check_previous(previous, queries)
@@ -197,7 +200,9 @@ class EllipsoidShape(Convex):
     def _level_at(
         self, point: Triple
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
-        """Evaluate the function of `_level` at a single point, as a `LevelAt`."""
+        """Evaluate the function of `_level` at a single point with Python numbers, as a
+        `LevelAt`.
+        """
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
         value = 0.5 * (x * x * p + y * y * q + z * z * r - 1.0)
@@ -206,9 +211,9 @@ class EllipsoidShape(Convex):
     def _undecided(self, queries: Floats) -> Bools:
         """Return whether each query (n, 3) has several equally near surface points.
 
-        Such queries are in the plane through the centre, perpendicular to the shortest axis. They
-        are inside the ellipse whose vertices are the centres of curvature at the ends of the other
-        axes.
+        Such queries are in the plane through the centre, perpendicular to the shortest axis. There
+        they are inside the ellipse whose vertices are the centres of curvature at the ends of the
+        other axes.
         """
         axes = np.array(self.semi_axes_m)
         shortest = np.flatnonzero(axes <= axes.min() * (1.0 + 1e-9))
@@ -219,14 +224,15 @@ class EllipsoidShape(Convex):
         return np.asarray(on_plane & inside)
 
     def _nearest(self, queries: Floats, sides: Floats) -> Floats:
-        """Return the global nearest surface points (n, 3) of queries (n, 3).
+        """Return the globally nearest surface points (n, 3) of queries (n, 3).
 
         With the semi-axes e_i, the nearest point to a query q is x_i = e_i^2 q_i / (t + e_i^2). t
         is the largest root of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to
         an Ellipsoid, 2013). Newton's method is applied to the reciprocal of the square root of this
         sum, which is concave in t, so the method converges monotonically (Conn, Gould, Toint,
-        Trust-Region Methods, sec. 7.3). On a plane of symmetry the terms have poles. Queries there
-        are therefore moved by a billionth of the shortest axis in the directions `sides` (n, 3).
+        Trust-Region Methods, sec. 7.3). On a plane of symmetry, the terms have poles. Therefore
+        queries on such a plane are moved by a billionth of the shortest axis in the directions
+        `sides` (n, 3).
         """
         axes = np.array(self.semi_axes_m)
         nudge = 1e-9 * axes.min()
@@ -254,10 +260,10 @@ class RoundedBoxShape(Convex):
     """A box centred on the origin, with rounded edges and corners.
 
     size_m: full extents along x, y and z, including the rounding. edge_radius_m: radius of edges
-        and corners, at most half of the smallest extent.
+    and corners, at most half of the smallest extent.
 
     The normal is continuous along the surface, but the curvature is not. The core is the box that
-    contains all centres of the edge radius.
+    contains the centres of curvature of all edges and corners.
     """
 
     size_m: tuple[float, float, float]
@@ -274,9 +280,9 @@ class RoundedBoxShape(Convex):
             )
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """Find the nearest points, as specified by `Shape.closest`.
+        """Find the surface points nearest to `points` (n, 3) or (3,), as `Shape.closest` specifies.
 
-        They are ambiguous inside the box where two faces are equally near.
+        The nearest point is ambiguous inside the box where two faces are equally near.
         """
         queries = check_points(points)
         before = check_previous(previous, queries)
@@ -319,7 +325,7 @@ class RoundedBoxShape(Convex):
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Return the half extents (3,), in m, of the core."""
+        """Return the half extents (3,), m, of the box without its rounding (the core)."""
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(
@@ -327,9 +333,9 @@ class RoundedBoxShape(Convex):
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
         """Return the face of the core that is nearest to each query (n, 3) inside the core.
 
-        before: previous nearest points (n, 3), or None. If given, only faces at these points are
-            considered. Otherwise, among equally near faces, the first in the order z, y, x, -z, -y,
-            -x is chosen.
+        before: previous nearest points (n, 3), or None. If they are given, only faces at these
+            points are considered. Otherwise, among equally near faces, the first in the order z, y,
+            x, -z, -y, -x is chosen.
 
         Return the axis (n,) and the sign (n,) of the face's normal, the distance from the face
         (n,), m, and whether the choice is ambiguous (n,).
@@ -362,7 +368,7 @@ def _directions(
     """Return unit directions and lengths of offsets (..., 3), and whether each offset is zero.
 
     across: indices of the coordinates in which the offsets may differ from zero. For a zero offset,
-        the direction is that of the previous point, or else `FRONT`.
+        the direction is that of the previous point, or `FRONT` if there is none.
     """
     before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)

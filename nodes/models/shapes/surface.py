@@ -1,11 +1,11 @@
-"""Define the interface of shapes: nearest surface points with normals and curvature.
+"""Define the interface of shapes, which return nearest surface points with normals and curvatures.
 
 Points are arrays (3,) or (n, 3), in m, in the frame of the object. Results have the same leading
-shape. A query is a point for which the nearest surface point is searched. Normals point out of the
-object. The curvature is given as the shape operator W, a symmetric matrix (3, 3). For a small
-displacement dp along the surface, the unit normal n changes by dn = W dp, and W n = 0. The two
-other eigenvalues of W are the principal curvatures, positive where the object is convex (do Carmo,
-Differential Geometry of Curves and Surfaces, ch. 3).
+shape. A query is a point whose nearest surface point is searched. Normals point out of the object.
+The curvature is given as the shape operator W, a symmetric matrix (3, 3). For a small displacement
+dp along the surface, the unit normal n changes by dn = W dp, and W n = 0. The two other eigenvalues
+of W are the principal curvatures, positive where the object is convex (do Carmo, Differential
+Geometry of Curves and Surfaces, ch. 3).
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ MAX_QUERY_M = 1e6
 FRONT = np.array([0.0, 0.0, 1.0])
 """The direction in which the nearest point is chosen if several surface points are equally near.
 
-It is used if there is no previous point. It points to the user if the object is not rotated.
+This direction is used if there is no previous point. It points to the user if the object is not
+rotated.
 """
 
 
@@ -41,10 +42,10 @@ class Nearest:
     height_m: height (...) of the query above the tangent plane at `point`, negative below it. The
         height equals the signed distance, except past an end of the surface.
     shape_operator: shape operator (..., 3, 3) at `point`, 1/m.
-    on_edge: whether `point` is on the rim of the touchable surface and the query is past that rim,
-        or `point` is on an edge of a mesh. A sheet can be tangent there but cannot roll over it.
-    undecided: whether another surface point is equally near, so the previous point or `FRONT`
-        determined the choice.
+    on_edge: whether `point` is on an edge of a mesh, or on the rim of the touchable surface with
+        the query beyond the rim. A sheet can touch such a point but cannot roll over it.
+    undecided: whether another surface point is equally near. Then the previous point or `FRONT`
+        determines the choice.
     """
 
     point: Floats
@@ -62,9 +63,9 @@ class Shape(Protocol):
         """Find the touchable surface points that are nearest to `points`.
 
         previous: nearest points of the previous queries, with the shape of `points`; None for a new
-            contact. They make the results continuous over time: the local nearest point that
-            continues a previous point is returned as long as it exists, even if another point is
-            equally near or, inside the object, nearer.
+            contact. They make the results continuous over time. The locally nearest point that
+            continues a previous point is returned as long as it exists. It is returned even if
+            another point is equally near, or nearer inside the object.
 
         Raises ValueError for points that are not finite, not of shape (3,) or (n, 3), or beyond
         `MAX_QUERY_M`.
@@ -74,7 +75,7 @@ class Shape(Protocol):
     def signed_distance(self, points: ArrayLike) -> Floats:
         """Return the signed distances (m) of points to the solid, which are negative inside.
 
-        Raises ValueError for invalid points, like `closest`.
+        Raises ValueError for points that `closest` does not accept.
         """
         ...
 
@@ -91,7 +92,7 @@ class Shape(Protocol):
 
 
 class Convex:
-    """The base class of convex solids."""
+    """The base class of convex solids, which never rise above their tangent planes."""
 
     __slots__ = ()
 
@@ -137,7 +138,7 @@ def projection_jacobian(found: Nearest) -> Floats:
 
 
 def check_points(points: ArrayLike, name: str = "points") -> Floats:
-    """Return points as a float array. Raises ValueError if they are invalid.
+    """Convert points to a float array (3,) or (n, 3). Raises ValueError if they are invalid.
 
     name: name of the argument in error texts.
     """
@@ -154,7 +155,9 @@ def check_points(points: ArrayLike, name: str = "points") -> Floats:
 
 
 def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
-    """Return previous points as floats. Raises ValueError if their shape differs from `points`."""
+    """Convert previous points to a float array. Raises ValueError if its shape differs from
+    `points`.
+    """
     if previous is None:
         return None
     array = check_points(previous, "previous")
@@ -173,8 +176,8 @@ def check_positive(**lengths_m: float) -> None:
 LevelSet = Callable[[Floats], tuple[Floats, Floats, Floats, Floats]]
 """A function f of points (n, 3) that describes a surface by f = 0 and increases outwards.
 
-It returns values (n,), gradients (n, 3), Hessians (n, 3, 3) and support (n,). The support is a
-measure of how well f is defined at a point; 0 means that the surface is far away.
+It returns values (n,), gradients (n, 3), Hessians (n, 3, 3) and supports (n,). The support measures
+how well f is defined at a point. It is 0 far away from the surface.
 """
 
 
@@ -198,11 +201,11 @@ class SurfaceProjections:
 
 MAX_STEPS = 25
 MIN_EIGENVALUE = 0.02
-"""The lower bound on the absolute eigenvalues of the reduced Hessian, which are 1 on a flat
-surface.
+"""The lower bound on the absolute eigenvalues of the reduced Hessian in the search for nearest
+points.
 
-The eigenvalues approach 0 near a centre of curvature, where a Newton step would be too long. Beyond
-it, they are negative.
+The eigenvalues are 1 on a flat surface, and approach 0 near a centre of curvature, where a Newton
+step would be too long. Beyond this centre, they are negative.
 """
 
 
@@ -215,9 +218,9 @@ def descend(
 
     Newton's method minimises |x - q|^2 for each query q on the surface f(x) = 0 (Nocedal and
     Wright, Numerical Optimization, ch. 18). A step has a part along the gradient, towards the
-    surface, and a part along the surface. The latter solves the reduced system with the Hessian of
-    the Lagrangian, I + lambda H (H: Hessian of f, lambda: multiplier). Its eigenvalues are made
-    positive, so that each step reduces the distance.
+    surface, and a part along the surface. The second part solves the reduced system with the
+    Hessian of the Lagrangian, I + lambda H (H: Hessian of f, lambda: multiplier). The eigenvalues
+    of this Hessian are made positive, so that each step reduces the distance.
     """
     count = len(queries)
     point = np.array(starts, dtype=np.float64)
@@ -272,8 +275,8 @@ def descend_one(
 ) -> SurfaceProjections:
     """Project one query (3,) by the method of `descend`. The results have length one.
 
-    The method is written out for the two tangent directions with Python numbers, which is faster
-    than operations on small arrays.
+    The code computes the two tangent directions with Python numbers, which is faster than
+    operations on small arrays.
     """
     qx, qy, qz = query.tolist()
     x, y, z = start.tolist()
@@ -335,10 +338,10 @@ def _tangents(x: float, y: float, z: float) -> tuple[Triple, Triple]:
 def _downhill(
     b11: float, b12: float, b22: float, slope: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """Solve the symmetric 2x2 system of a Newton step, whose eigenvalues are made positive.
+    """Solve the symmetric 2x2 system of a Newton step, after its eigenvalues are made positive.
 
     b11, b12, b22: entries of the matrix. slope: right-hand side. Return the two components of the
-        step and the smaller eigenvalue of the original matrix.
+    step and the smaller eigenvalue of the original matrix.
     """
     middle, spread = 0.5 * (b11 + b22), hypot(0.5 * (b11 - b22), b12)
     angle = 0.5 * atan2(2.0 * b12, b11 - b22)

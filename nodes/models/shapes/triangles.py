@@ -19,13 +19,14 @@ Indices32 = NDArray[np.int32]
 
 MAX_TRIANGLES = 100_000
 MIN_HEIGHT_RATIO = 1e-6
-"""The ratio of its height to its longest edge below which a triangle counts as degenerate."""
+"""The ratio of height to longest edge below which a triangle counts as degenerate."""
 MAX_DIHEDRAL_RAD = np.radians(175.0)
-"""The angle between the normals of neighbouring triangles above which they count as folded."""
+"""The angle (rad) between the normals of adjacent triangles above which the mesh counts as folded.
+"""
 
 
 class MeshError(FlexsheetError, ValueError):
-    """Raised for a mesh that does not bound a solid."""
+    """Raised for a mesh that is not the surface of a solid."""
 
     code = "mesh"
     remedy = (
@@ -36,12 +37,12 @@ class MeshError(FlexsheetError, ValueError):
 def check_mesh(vertices: Floats, triangles: Indices) -> None:
     """Raise MeshError unless a mesh is the closed, consistently wound surface of a solid.
 
-    vertices (v, 3), m; triangles (t, 3).
+    vertices (v, 3): positions, m. triangles (t, 3): indices of vertices.
 
     The check covers array shapes, size and vertex indices, degenerate and repeated triangles, and
     holes. It also covers edges of more than two triangles, inconsistent winding, parts that share a
-    single vertex, folded neighbours, and wrong orientation. It does not search for intersections,
-    because that is slow; see `count_intersections`.
+    single vertex, folded neighbours, and wrong orientation. It does not search for intersections of
+    triangles, which `count_intersections` counts.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise MeshError(
@@ -110,7 +111,9 @@ def half_edges(triangles: Indices) -> Indices:
 
 
 def _check_edges(triangles: Indices) -> None:
-    """Raise MeshError unless every edge has two triangles that use it in opposite directions."""
+    """Raise MeshError unless every edge belongs to two triangles, which use it in opposite
+    directions.
+    """
     run = half_edges(triangles)
     edges, uses = np.unique(np.sort(run, axis=1), axis=0, return_counts=True)
     open_edges, crowded = int((uses == 1).sum()), int((uses > 2).sum())
@@ -133,7 +136,7 @@ def _check_edges(triangles: Indices) -> None:
 def _check_fans(triangles: Indices) -> None:
     """Raise MeshError unless the triangles around each vertex form a single closed fan.
 
-    Otherwise, parts of the surface touch each other only at that vertex.
+    If they form several fans, parts of the surface touch each other only at that vertex.
     """
     count = len(triangles)
     first, second = _neighbours(triangles)
@@ -155,10 +158,10 @@ def _check_fans(triangles: Indices) -> None:
 
 
 def unify_winding(triangles: Indices) -> Indices:
-    """Reverse triangles (t, 3) where necessary so that neighbours have the same winding.
+    """Reverse triangles (t, 3) where necessary so that adjacent triangles have the same winding.
 
-    In each connected part, the winding of the majority is kept. If no consistent winding exists, as
-    on a Möbius strip, `check_mesh` fails afterwards.
+    In each connected part, the result has the winding of the majority of the triangles. If no
+    consistent winding exists, as on a Möbius strip, `check_mesh` fails afterwards.
     """
     count = len(triangles)
     run = half_edges(triangles)
@@ -193,7 +196,10 @@ def unify_winding(triangles: Indices) -> Indices:
 
 
 def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
-    """Return the two half-edges of each edge, as two arrays (e,) of row indices of `half_edges`."""
+    """Return the two half-edges (directed edges) of each edge, as two arrays (e,).
+
+    The arrays contain row indices of the result of `half_edges`.
+    """
     run = half_edges(triangles)
     span = int(triangles.max()) + 1
     forward, backward = run[:, 0] * span + run[:, 1], run[:, 1] * span + run[:, 0]
@@ -246,10 +252,11 @@ def volume_m3(vertices: Floats, triangles: Indices) -> float:
 
 
 def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
-    """Divide triangles (t, 3) until no edge is longer than `longest_m`.
+    """Divide triangles (t, 3) until no edge is longer than `longest_m`; return the new vertices and
+    triangles.
 
-    A long edge is halved in both adjacent triangles, so a closed mesh remains closed. Return the
-    new vertices and triangles. Raises MeshError if there are more than `MAX_TRIANGLES`.
+    A long edge is halved in both adjacent triangles, so a closed mesh remains closed. Raises
+    MeshError if there are more than `MAX_TRIANGLES`.
     """
     while True:
         run = np.sort(half_edges(triangles), axis=1)
@@ -302,9 +309,9 @@ def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
 def count_intersections(vertices: Floats, triangles: Indices) -> int:
     """Count the pairs of triangles that intersect.
 
-    A pair intersects if an edge of one triangle passes through the interior of the other triangle,
-    and the ends of this edge are not vertices of the other triangle. Triangles that only touch, or
-    overlap in one plane, are not counted.
+    A pair intersects if an edge of one triangle passes through the interior of the other triangle.
+    Edges with an end that is a vertex of the other triangle are not considered. Triangles that only
+    touch, or overlap in one plane, are not counted.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)
@@ -327,10 +334,10 @@ def count_intersections(vertices: Floats, triangles: Indices) -> int:
 
 
 def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indices]]:
-    """Yield the pairs of overlapping balls in batches, as two arrays of ball indices.
+    """Yield the pairs of overlapping spheres in batches, as two arrays of sphere indices.
 
-    centre (n, 3), radius (n,): balls, m. Balls of similar size are searched together, because the
-        search radius must be that of the largest ball.
+    centre (n, 3), radius (n,): spheres, m. Spheres of similar size are searched together, because
+    the search radius must be that of the largest sphere.
     """
     from scipy.spatial import cKDTree
 
@@ -351,9 +358,9 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
 
 def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Return whether each segment (n,) passes through the interior of its triangle.
+    """Return whether each segment passes through the interior of its triangle, as an array (n,).
 
-    start, end (n, 3): ends of the segments. corners (n, 3, 3): one triangle for each segment.
+    start, end (n, 3): end points of the segments. corners (n, 3, 3): one triangle for each segment.
 
     Source: Möller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997.
     """
@@ -374,9 +381,10 @@ def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
-    """Return the point of a triangle that is nearest to a given point, for n points (n, 3).
+    """Return the barycentric coordinates (n, 3) of the points in triangles nearest to `points` (n,
+    3).
 
-    corners (n, 3, 3): one triangle for each point. The results are barycentric coordinates (n, 3).
+    corners (n, 3, 3): one triangle for each point.
 
     Source: Ericson, Real-Time Collision Detection, sec. 5.1.5.
     """

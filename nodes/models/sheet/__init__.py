@@ -1,7 +1,7 @@
 """Provide models of the rubber sheet: poses of its edges, shape and forces.
 
-The sheet frame has its origin at the centre, x from the left to the right clamped edge, y along the
-edges, and z towards the user.
+The sheet frame has its origin at the centre. The x axis points from the left to the right clamped
+edge, y points along the edges, and z points towards the user.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Compute the force of the pushed sheet with interchangeable models.
 
 A model receives depths of a fingertip below the flat sheet, and a `SheetPush`: the stretch ratio,
-the position on the stretched sheet (x, y from its centre, m) and the fingertip's radius. It returns
-the normal force, the derivative of this force with respect to depth, and the force on each clamp.
+the position on the stretched sheet (x, y from its centre, m) and the fingertip's radius. A model
+returns the normal force, its derivative with respect to depth, and the force on each clamp.
 
 In order of increasing computing time, the models are `ScaledSheetModel`,
 `nodes.models.sheet.tabulated.TabulatedSheetModel` and `MembraneSheetModel`.
@@ -27,7 +27,7 @@ CENTRE: SheetPosition = (0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class SheetPush:
-    """The conditions of a push, apart from its depth.
+    """The conditions of a push on the sheet, apart from its depth.
 
     position_m: (x, y) of the fingertip on the stretched sheet, from its centre.
 
@@ -59,7 +59,7 @@ class SheetForce:
 
 
 class SheetForceModel(Protocol):
-    """The interface of the sheet's force models."""
+    """The interface of models of the force on a sheet that a fingertip pushes."""
 
     @property
     def name(self) -> str: ...
@@ -75,12 +75,14 @@ class SheetForceModel(Protocol):
         ...
 
     def invalid_reason(self, push: SheetPush, depth_m: float) -> str:
-        """Return why the model is inaccurate for a push, or "" if the push is in its range."""
+        """Return the reason why the model is inaccurate for a push, or "" if the model is valid for
+        the push.
+        """
         ...
 
 
 def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
-    """Return the force (N) on each clamp of a sheet that nothing touches."""
+    """Return the force (N) on each clamp of a stretched sheet that nothing touches."""
     return edge_force_n(stretch_ratio, rubber, mooney_ratio=rubber.mooney_ratio)
 
 
@@ -104,7 +106,8 @@ def relative_position(
 
 
 MAX_RELATIVE_X = 0.98
-"""The upper limit of the relative x in closed-form models, whose force is infinite at the clamp."""
+"""The maximum relative x that closed-form models use. At x = 1 (the clamp), their force is
+infinite."""
 
 
 MAX_STRETCH_RATIO = 1.13
@@ -120,7 +123,8 @@ def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
 
 
 CUBIC_FACTOR = 2.43
-"""The factor c of the force F = c E t W (d/W)^3 of a slack square sheet under a fingertip of 7 mm.
+"""The factor c of the force F = c E t W (d/W)^3 of a slack square sheet on a fingertip with a
+radius of 7 mm.
 
 E is Young's modulus, t the thickness, W the width and d the depth.
 """
@@ -148,9 +152,10 @@ def _slack_position_factor(x: float, y: float) -> float:
 def _push_tension(
     rubber: Rubber, stretch_ratio: float, depths: Floats, relative: tuple[float, float]
 ) -> tuple[Floats, float]:
-    """Return the additional force (n,), in N, on each clamp due to a push, and E t W, in N.
+    """Return the additional force (n,), N, on each clamp due to a push, and the factor E t W, N.
 
-    depths (n,), m. relative: relative coordinates (x, y) of the push.
+    depths (n,): depths of the push, m. relative: coordinates (x, y) of the push, from 0 (centre) to
+    1 (edge).
     """
     modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
     depth_ratio = depths / rubber.width_m
@@ -166,7 +171,8 @@ def _push_tension(
 
 @dataclass(frozen=True, slots=True)
 class ScaledSheetModel:
-    """A closed-form model: a power of the scaled depth due to the tension, plus a cubic term.
+    """A closed-form model of the sheet's force: a power of the scaled depth due to the tension,
+    plus a cubic term.
 
     With the symbols of CUBIC_FACTOR, the stretch ratio s, e = `strain_measure`(s), w = d/W and u =
     w/sqrt(e) (the scaling of a membrane at small strains):
@@ -176,8 +182,8 @@ class ScaledSheetModel:
     a, b, c, g, p, q, r and A are fitted. A and c depend on position, fingertip radius and height.
 
     cubic_ratio: ratio of the calibrated cubic term to that of ideal rubber.
-    stretch_scale: ratio of the calibrated to the nominal stretch ratio, which corrects the slack
-        width.
+    stretch_scale: ratio of the calibrated to the nominal stretch ratio. It corrects the sheet's
+        slack width.
     """
 
     rubber: Rubber
@@ -240,7 +246,7 @@ class ScaledSheetModel:
 
 @dataclass(frozen=True, slots=True)
 class MembraneSheetModel:
-    """The most accurate model, a finite-element model of the membrane.
+    """A finite-element membrane model of the sheet's force, which is the most accurate force model.
 
     One evaluation takes seconds. cells: number of elements along each side of the sheet.
     """
@@ -274,14 +280,18 @@ class MembraneSheetModel:
 
 
 _SLOPE_FRACTION = 0.96
-"""The fraction of the depth at which a second force is computed, to determine the stiffness."""
+"""The ratio of a second, smaller depth to the depth of a push.
+
+The force at both depths determines the stiffness.
+"""
 
 
 def depth_for_force(
     model: SheetForceModel, push: SheetPush, forces_n: Floats, *, max_depth_m: float
 ) -> Floats:
-    """Return the depths (n,), m, at which a model gives these forces (n,), N, at most
-    `max_depth_m`.
+    """Return the depths (n,), m, at which a model gives the forces `forces_n` (n,).
+
+    The depths are at most `max_depth_m`.
 
     The model is evaluated once on a geometric grid, and the logarithm of the force is interpolated
     linearly over the logarithm of the depth. The relative error is below 1e-3.
@@ -297,10 +307,10 @@ _INVERSE_GRID = np.geomspace(1e-3, 1.0, 160)
 def interpolate_inverse(grid: Floats, values: Floats, targets: Floats) -> Floats:
     """Return the arguments (n,) at which an increasing function reaches the values `targets` (n,).
 
-    values: function values at the arguments `grid`. Both are positive.
+    grid, values: arguments, and function values at these arguments. All are positive.
 
-    The logarithms are interpolated linearly. Below the grid, the power law of the first interval is
-    extrapolated. Above it, the result is the last grid point.
+    The logarithms are interpolated linearly. For targets below all values, the power law of the
+    first interval is extrapolated. For targets above all values, the result is the last grid point.
     """
     logs = np.log(np.maximum(np.maximum.accumulate(values), 1e-300))
     keep = np.concatenate([[True], np.diff(logs) > 1e-12])
@@ -326,9 +336,10 @@ def make_model(
     cubic_ratio: float,
     mooney_ratio: float,
 ) -> ScaledSheetModel:
-    """Make the scaled model from calibrated parameters.
+    """Make the closed-form force model from calibrated parameters.
 
-    nominal: sheet of the scene. Stretch ratios given to the model refer to its width.
+    nominal: sheet of the scene. The stretch ratios that the model receives refer to the width of
+        this sheet.
     """
     rubber = replace(
         nominal,

@@ -1,4 +1,4 @@
-"""Compute poses of the sheet, its edges and the flanges from one another."""
+"""Compute the poses of the sheet, of its edges and of the arms' flanges from one another."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ def edge_poses(world_from_sheet: Floats, edge_distance_m: float) -> tuple[Floats
 
 
 def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats) -> Floats:
-    """Return the sheet's pose world_from_sheet (4, 4) between two edges, which need not be
-    parallel.
+    """Return the pose world_from_sheet (4, 4) of the sheet between two edges.
 
-    The origin is midway, x points from left to right, and y is the mean of the edges' y axes, made
-    perpendicular to x. The result is not finite if the edges coincide.
+    The edges need not be parallel. The origin is midway, and x points from left to right. The y
+    axis is the mean of the edges' y axes, made perpendicular to x. The result is not finite if the
+    edges coincide.
     """
     left, right = world_from_left_edge, world_from_right_edge
     x_axis = right[:3, 3] - left[:3, 3]
@@ -50,5 +50,9 @@ def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_
 
 
 def flange_pose(world_from_edge: Floats, flange_from_edge: Floats) -> Floats:
-    """Return the pose world_from_flange (4, 4) for a pose of the edge that the flange holds."""
+    """Return the pose world_from_flange (4, 4) of an arm's flange from the pose of its clamped
+    edge.
+
+    flange_from_edge (4, 4): pose of the edge in the frame of the flange.
+    """
     return world_from_edge @ inverse(flange_from_edge)

@@ -2,10 +2,10 @@
 
 Finite-element solutions are precomputed over stretch, position and depth of the push. A proper
 orthogonal decomposition reduces the shapes to a dozen modes, and polynomials through Chebyshev
-points interpolate their coefficients. Computing a shape then takes about 0.1 ms.
+points interpolate their coefficients. The computation of a shape then takes about 0.1 ms.
 
 The grid moves with the finger and is densest at the finger, so the tip of the indentation is always
-at the same nodes. Solutions are computed for positions in one quadrant; those in the other
+at the same nodes. Solutions are computed for positions in one quadrant. Solutions for the other
 quadrants follow by symmetry.
 """
 
@@ -25,10 +25,11 @@ HALF_CELLS = 14
 """The number of grid cells from the finger to each side of the sheet."""
 
 GRADING = 3.2
-"""The grading of the grid: distances from the finger are proportional to sinh(GRADING a)."""
+"""The grading of the grid. The grid line at the fraction a of the cells between finger and side has
+a distance proportional to sinh(GRADING a)."""
 
 MAX_TRUNCATION_RMS_M = 2e-5
-"""The maximum truncation error of the modes (root mean square)."""
+"""The maximum error (m, root mean square) due to the truncation of the modes."""
 
 MAX_FRACTION_X, MAX_FRACTION_Y = 0.36, 0.40
 """The maximum |x| and |y| of a precomputed push, as fractions of the sheet's width and height."""
@@ -55,7 +56,8 @@ class IndentationRange:
 class IndentationBasis:
     """A reduced-order model of the pushed sheet.
 
-    stretches, xs_m, ys_m, roots: interpolation nodes; roots are sqrt(depth / maximum depth).
+    stretches, xs_m, ys_m, roots: interpolation nodes over stretch, position and depth. `roots` are
+        sqrt(depth / maximum depth).
     modes: displacement modes (modes, rows, columns, 3), m.
     coefficients: coefficients (stretches, xs, ys, roots, modes) of the modes at the interpolation
         nodes.
@@ -74,7 +76,8 @@ class IndentationBasis:
     def offsets(
         self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
     ) -> Floats:
-        """Return the displacement (rows, columns, 3), m, from the flat, uniformly stretched sheet.
+        """Return displacements (rows, columns, 3), m, relative to the flat, uniformly stretched
+        sheet.
 
         position_m: (x, y) of the fingertip in the sheet frame. Rows are along y and columns along
             x. Inputs outside the precomputed range are clamped to this range.
@@ -97,7 +100,7 @@ class IndentationBasis:
         return np.asarray(shape)
 
     def grid(self, stretch_ratio: float, position_m: tuple[float, float]) -> Floats:
-        """Return the points (rows, columns, 2), m, of the flat sheet that `offsets` displaces.
+        """Return the points (rows, columns, 2), m, of the flat sheet to which `offsets` refers.
 
         position_m: (x, y) of the fingertip in the sheet frame.
         """
@@ -110,7 +113,8 @@ class IndentationBasis:
     def invalid_reason(
         self, stretch_ratio: float, position_m: tuple[float, float], depth_m: float
     ) -> str:
-        """Return why a push is outside the precomputed range, or "" if the push is inside.
+        """Return the reason why a push is outside the precomputed range, or "" if the push is
+        inside.
 
         position_m: (x, y) of the fingertip in the sheet frame.
         """
@@ -130,7 +134,9 @@ class IndentationBasis:
 
 @dataclass(frozen=True, slots=True)
 class IndentationCase:
-    """The inputs of one finite-element solution: a position (m) and ascending depths (n,), m."""
+    """The inputs of one finite-element solution of a push: a position (m) and ascending depths
+    (n,), m.
+    """
 
     rubber: Rubber
     stretch_ratio: float
@@ -155,8 +161,8 @@ def solve_indentation_basis(
 ) -> IndentationBasis:
     """Compute the membrane at all interpolation nodes, and reduce the shapes to modes.
 
-    solve_all: function that solves the cases, in this or in other processes. On one core, it takes
-        45 s.
+    solve_all: function that solves the cases, in this process or in other processes. The solutions
+        take 45 s on one core.
 
     Raises NoEquilibriumError if a solution does not converge.
     """
@@ -193,7 +199,8 @@ def solve_indentation_basis(
 
 
 def solve_indentation(push: IndentationCase) -> Floats:
-    """Return finite-element displacements (depths, rows, columns, 3), m, at the model's grid.
+    """Return the finite-element displacements (depths, rows, columns, 3), m, of a push on the
+    model's grid.
 
     Raises NoEquilibriumError if a solution does not converge.
     """
@@ -216,9 +223,10 @@ def solve_indentation(push: IndentationCase) -> Floats:
 
 
 def _decompose(samples: Floats) -> tuple[Floats, Floats]:
-    """Decompose samples (n, size) into modes (m, size) with coefficients (n, m).
+    """Decompose samples (n, size) into modes (m, size), and return these with their coefficients
+    (n, m).
 
-    The number of modes is the smallest number at which the error is below `MAX_TRUNCATION_RMS_M`.
+    The number m of modes is the smallest number at which the error is below `MAX_TRUNCATION_RMS_M`.
     """
     left, values, modes = np.linalg.svd(samples, full_matrices=False)
     lost = np.sqrt(np.cumsum(values[::-1] ** 2)[::-1] / samples.size)
@@ -239,7 +247,7 @@ def _grade_coordinates(focus_m: float, half_m: float) -> Floats:
 
 
 def _linear_weights(nodes: Floats, at: Floats) -> Floats:
-    """Return the weights (k, n) of linear interpolation at points (k,) between nodes (n,)."""
+    """Return the weights (k, n) of the nodes (n,) in a linear interpolation at points (k,)."""
     upper = np.clip(np.searchsorted(nodes, at), 1, len(nodes) - 1)
     fraction = np.clip((at - nodes[upper - 1]) / (nodes[upper] - nodes[upper - 1]), 0.0, 1.0)
     result = np.zeros((len(at), len(nodes)))
@@ -255,7 +263,9 @@ def _chebyshev_points(low: float, high: float, count: int) -> Floats:
 
 
 def _barycentric_weights(nodes: Floats, at: float) -> Floats:
-    """Return the weights (n,) of polynomial interpolation at a point clamped to the nodes' range.
+    """Return the weights (n,) of the nodes (n,) in a polynomial interpolation at `at`.
+
+    The point `at` is limited to the range of the nodes.
 
     Source: the barycentric form of Berrut and Trefethen, SIAM Review 46, 2004, equation (5.4).
     """

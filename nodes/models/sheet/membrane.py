@@ -38,15 +38,18 @@ MIN_CELL_RADII = 0.3
 STEP_RADII = 0.4
 """The maximum step of the finger's depth, as a multiple of its radius."""
 PENALTY_PER_MODULUS = 2e5
-"""The stiffness of the contact penalty (pressure per penetration), in units of E t / width^2.
+"""The stiffness of the contact penalty (pressure divided by penetration), in units of E t /
+width^2.
 
 E is Young's modulus and t is the sheet's thickness.
 """
 MAX_ITERATIONS = 120
 GAUSS = 0.5 / np.sqrt(3.0)
-"""The distance of the integration points from a cell's centre, as a fraction of its side."""
+"""The distance of the integration points from a cell's centre along each axis, divided by the
+cell's side."""
 TOLERANCE = 1e-7
-"""The maximum residual force of a solution, in units of E t width."""
+"""The maximum residual force of a solution, in units of E t width (Young's modulus, thickness,
+width)."""
 
 
 class NoEquilibriumError(FlexsheetError, ArithmeticError):
@@ -212,7 +215,11 @@ class _Grid:
         self._diagonal = np.searchsorted(self._keys, np.arange(size) * (size + 1))
 
     def strain(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return F (points, 3, 2) and C (points, 2, 2) at four integration points per cell."""
+        """Return the tensors F (points, 3, 2) and C (points, 2, 2) at four integration points per
+        cell.
+
+        F is the deformation gradient, and C = F'F is the Cauchy-Green tensor.
+        """
         at_corners = np.repeat(positions[self.cells].transpose(0, 2, 1), 4, axis=0)
         deformed = at_corners @ self.shape_gradients
         return deformed, deformed.transpose(0, 2, 1) @ deformed
@@ -223,7 +230,9 @@ class _Grid:
         return float(self.volume @ relaxed_energy(large, small, self.c1, self.c2)[0])
 
     def gradient(self, positions: Floats) -> Floats:
-        """Return the gradient (3 nodes,) of the elastic energy: the nodal forces (N)."""
+        """Return the gradient (3 nodes,) of the elastic energy, which contains the nodal forces
+        (N).
+        """
         deformed, c = self.strain(positions)
         stress, _ = stress_and_tangent(c, self.c1, self.c2, tangent=False)
         volume = self.volume[:, None, None]
@@ -237,7 +246,9 @@ class _Grid:
         return np.asarray(sums, dtype=np.float64)
 
     def _scatter(self, blocks: Floats) -> Floats:
-        """Sum the stiffnesses (points, ...) of the integration points to matrix entries."""
+        """Sum the stiffnesses (points, ...) of the integration points to entries of the sparse
+        stiffness matrix.
+        """
         by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
         sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
         return np.asarray(sums, dtype=np.float64)
@@ -245,10 +256,11 @@ class _Grid:
     def system(
         self, positions: Floats, added: Floats, free: Bools, damping: float
     ) -> tuple[Floats, scipy.sparse.csc_array]:
-        """Return the energy gradient (3 nodes,), N, and the stiffness (N/m) of free coordinates.
+        """Return the energy gradient (3 nodes,), N, and the sparse stiffness matrix (N/m) of the
+        free coordinates.
 
         added (nodes, 3, 3): stiffness of the contact, N/m. free (3 nodes,): whether each coordinate
-            may move. damping: value (N/m) that is added to the diagonal.
+        may move. damping: value (N/m) that is added to the diagonal.
         """
         deformed, c = self.strain(positions)
         stress, tangent = stress_and_tangent(c, self.c1, self.c2, tangent=True)
@@ -282,10 +294,9 @@ class _Grid:
 
 
 def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the larger and smaller eigenvalues (n,) of C (n, 2, 2), and the larger one's
-    directions.
+    """Return the larger and the smaller eigenvalues (n,) of C (n, 2, 2), and directions (n, 2).
 
-    The directions (n, 2) are unit vectors.
+    The directions are the unit eigenvectors of the larger eigenvalues.
     """
     middle, half = 0.5 * (c[:, 0, 0] + c[:, 1, 1]), 0.5 * (c[:, 0, 0] - c[:, 1, 1])
     spread = np.hypot(half, c[:, 0, 1])
@@ -334,8 +345,8 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
     """Return the second Piola-Kirchhoff stress (n, 2, 2), Pa, and its tangent (n, 3, 3), Pa.
 
     c (n, 2, 2): Cauchy-Green tensors. c1, c2: material constants, Pa. tangent: whether the tangent
-        is computed; otherwise it is empty. Its rows and columns belong to the strains [E11, E22, 2
-        E12].
+    is computed; if false, it is empty. The rows and columns of the tangent belong to the strains
+    [E11, E22, 2 E12].
     """
     large, small, direction = principal(c)
     _, first, second = relaxed_energy(large, small, c1, c2)
@@ -362,7 +373,9 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 
 
 class _FingerContact:
-    """A penalty contact of nodes with the fingertip. Nodes that stick to it have no penalty."""
+    """A penalty model of the contact of mesh nodes with the fingertip. Sticking nodes have no
+    penalty.
+    """
 
     def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
         self.centre, self.radius, self.sticking = centre, radius_m, sticking
@@ -381,7 +394,9 @@ class _FingerContact:
         return 0.5 * float(self._penalty @ self._penetration(positions)[0] ** 2)
 
     def gradient(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Return the gradient (nodes, 3) and a positive Hessian (nodes, 3, 3) of `energy`."""
+        """Return the gradient (nodes, 3) and a positive semidefinite Hessian (nodes, 3, 3) of the
+        penalty energy.
+        """
         inside, outward = self._penetration(positions)
         stiff = np.where(inside > 0.0, self._penalty, 0.0)
         return -(stiff * inside)[:, None] * outward, np.einsum(
@@ -398,7 +413,8 @@ def _make_flat_state(grid: _Grid, stretch_ratio: float) -> Floats:
 def _predict_state(
     grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """Predict the next equilibrium by scaling the indentation to the new depth, or first as a cone.
+    """Predict the next equilibrium by scaling the indentation to the new depth. The first one is a
+    cone.
 
     push: current depth and its increase in this step (m).
     """
@@ -415,7 +431,8 @@ def _predict_state(
 
 
 def _solve_equilibrium(grid: _Grid, start: Floats, finger: _FingerContact | None) -> Floats:
-    """Compute the equilibrium near the positions `start`, with clamped and sticking nodes fixed.
+    """Compute the equilibrium near the positions `start`, while clamped and sticking nodes are
+    fixed.
 
     Raises NoEquilibriumError if the iteration does not converge.
     """

@@ -12,8 +12,8 @@ class Rubber:
     """The dimensions and material of an unstretched sheet that is clamped along two edges.
 
     width_m: distance between the clamped edges. height_m: length of an edge. mooney_ratio: C2 / (C1
-        + C2) of incompressible Mooney-Rivlin rubber with E = 6 (C1 + C2), from 0 (neo-Hookean) to
-        below 1.
+    + C2) of incompressible Mooney-Rivlin rubber, from 0 (neo-Hookean) to below 1. Young's modulus
+    is E = 6 (C1 + C2).
 
     Raises ValueError for a value outside its range.
     """

@@ -1,4 +1,6 @@
-"""Correct the scaled force model by a table of ratios of measured or computed to modelled force.
+"""Correct the closed-form force model of the sheet by a table of force ratios.
+
+A ratio is the measured or computed force divided by the force of the model.
 
 The ratio varies slowly, so a coarse table is sufficient. The table is also used for fingertips of
 other radii.
@@ -102,7 +104,7 @@ class TabulatedSheetModel:
 def _interpolate_linear(axis: Floats, value: float, entries: Floats) -> Floats:
     """Interpolate entries (n, ...) linearly along their first axis.
 
-    They are constant beyond its ends.
+    The results are constant beyond the ends of the axis.
     """
     if len(axis) == 1:
         return np.asarray(entries[0])
@@ -123,7 +125,7 @@ def make_tabulated_model(
     finger_radius_m: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> TabulatedSheetModel:
-    """Make the table of a model from the forces that `measure` returns.
+    """Make a tabulated model from the forces that `measure` returns.
 
     progress: function that is called with the number of finished calls of `measure`, and the total.
     """

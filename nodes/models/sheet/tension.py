@@ -1,4 +1,6 @@
-"""Compute the force and sag of a sheet that nothing touches, and its stiffness for small pushes."""
+"""Compute the edge force and the sag of a sheet that nothing touches, and the stiffness of small
+pushes.
+"""
 
 from __future__ import annotations
 
@@ -11,36 +13,35 @@ from numpy.typing import NDArray
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 CLAMP_FACTOR, CLAMP_FACTOR_PER_ASPECT = 1.004, 0.0735
-"""The ratio of the edge force to that of uniaxial tension is linear in height / width.
+"""The coefficients a, b of the factor a + b height / width on the edge force of uniaxial tension.
 
-The first value is its offset and the second its slope. The ratio is above 1 because the clamps
-prevent the sheet from narrowing. The formula is within 0.3 % of membrane finite elements for height
-/ width from 0.5 to 1.5 and stretch ratios up to 1.12.
+The factor is above 1 because the clamps prevent the sheet from narrowing. The formula is within 0.3
+% of membrane finite elements for height / width from 0.5 to 1.5 and stretch ratios up to 1.12.
 """
 
 SAG_PROFILE = (0.9635, 0.23, 1.96)
 """The coefficients a, b, c of the profile a + b v^2 + c v^4 of the sag over v = y / height.
 
-The profile is the ratio to the sag of a sheet with uniform tension. Free edges sag more than the
-centre. It is within 1 % of membrane finite elements for a square sheet with stretch ratios from
-1.02 to 1.08 and |v| up to 0.25.
+The profile is the ratio of the sag to that of a sheet with uniform tension. Free edges sag more
+than the centre. The formula is within 1 % of membrane finite elements for a square sheet with
+stretch ratios from 1.02 to 1.08 and |v| up to 0.25.
 """
 
 GRAVITY_M_PER_S2 = 9.81
-"""The acceleration towards the negative y axis of the world."""
+"""The gravitational acceleration, m/s^2. It acts along the negative y axis of the world."""
 
 PUSH_FACTOR = 0.95
-"""The ratio of the stiffness of a small push to the edge force per width.
+"""The factor on edge force / width that gives the stiffness of a small push.
 
-Its value is 0.9 to 1.0 for a fingertip with a radius of 10 mm.
+The factor is 0.9 to 1.0 for a fingertip with a radius of 10 mm.
 """
 
 
 def strain_measure(stretch_ratio: float, mooney_ratio: float = 0.0) -> float:
-    """Return the ratio of nominal stress to Young's modulus in uniaxial tension.
+    """Return the ratio of the nominal stress to Young's modulus in uniaxial tension of rubber.
 
-    It is (s - s^-2)/3 (1 - m + m/s) with the stretch ratio s and the Mooney ratio m of `Rubber`,
-    and 0 for a slack sheet.
+    The ratio is (s - s^-2)/3 (1 - m + m/s) with the stretch ratio s and the Mooney ratio m. It is 0
+    for a slack sheet.
     """
     s = max(stretch_ratio, 1.0)
     return (s - s**-2) / 3.0 * (1.0 - mooney_ratio + mooney_ratio / s)
@@ -66,12 +67,14 @@ class SlackSheet(Protocol):
 
 
 def edge_force_n(stretch_ratio: float, sheet: SlackSheet, *, mooney_ratio: float = 0.0) -> float:
-    """Return the force (N) on each clamped edge if nothing touches the sheet; 0 if it is slack."""
+    """Return the force (N) on each clamped edge if nothing touches the sheet; 0 for a slack
+    sheet.
+    """
     return _area_modulus_n(sheet) * strain_measure(stretch_ratio, mooney_ratio)
 
 
 def stretch_for_edge_force(force_n: float, sheet: SlackSheet) -> float:
-    """Return the stretch ratio of a neo-Hookean sheet at an edge force (N), by Newton's method."""
+    """Return the stretch ratio at which the force on a neo-Hookean sheet's edge is `force_n`."""
     target = max(force_n, 0.0) / (_area_modulus_n(sheet) / 3.0)
     stretch = 1.0 + target / 3.0
     for _ in range(20):
@@ -91,12 +94,17 @@ def _clamp_factor(sheet: SlackSheet) -> float:
 
 
 def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
-    """Return the stiffness (N/m) of a small push at the sheet's centre for an edge force (N)."""
+    """Return the stiffness (N/m) that a small push at the sheet's centre feels.
+
+    edge_force: force on each clamp, N. width_m: distance of the clamps.
+    """
     return PUSH_FACTOR * edge_force / width_m
 
 
 def edge_force_for_stiffness(stiffness_n_per_m: float, *, width_m: float) -> float:
-    """Return the edge force (N) at which small pushes at the centre have a stiffness (N/m)."""
+    """Return the edge force (N) at which a small push at the sheet's centre has a given
+    stiffness.
+    """
     return stiffness_n_per_m * width_m / PUSH_FACTOR
 
 
@@ -116,9 +124,10 @@ def compute_sag_m(
     along: positions along the clamps as fractions of the height, from -0.5 to 0.5, of the same
         shape.
 
-    The sheet is a parabola, z = 4 sag u (1 - u), with u = `across`. Equilibrium over the edges'
-    distance L requires 8 N sag / L^2 = load. The tension N per length grows with the length L (1 +
-    8/3 (sag/L)^2) of the parabola, so a slack sheet has a finite sag, too.
+    The shape of the sheet is the parabola z = 4 sag u (1 - u), with u = `across`. Equilibrium over
+    the edges' distance L requires 8 N sag / L^2 = load per area. The tension N per length increases
+    with the length L (1 + 8/3 (sag/L)^2) of the parabola. Therefore a slack sheet has a finite sag,
+    too.
     """
     stretch = edge_distance_m / rubber.width_m
     load_pa = -GRAVITY_M_PER_S2 * density_kg_per_m3 * rubber.thickness_m / stretch * normal[1]
