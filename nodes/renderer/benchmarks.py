@@ -1,9 +1,10 @@
-"""Measure time and image error of the correction methods.
+"""Measure the time and the image error of the methods that correct the projected image.
 
 The measured time is the time for drawing a stereo frame, without reading its pixels. The method
-`floor` gives a lower bound of this time. It clears the frame and draws the same triangles once for
-each eye, with the same number of samples. The error is measured at each point that the eye sees on
-a reference sheet. The caller provides this reference, which shares no code with the renderer.
+`floor` gives a lower bound of this time. This method clears the frame and draws the same triangles
+once for each eye, with the same number of samples. The error is measured at each point that the eye
+sees on a reference sheet. The caller provides this reference, which is computed independently of
+the renderer.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 SHAPES: dict[str, Callable[[SheetPose], SheetMesh]] = {
     "two_pass_triangles": pyramid_mesh,
 }
-"""The variants of two_pass that use an approximate shape of the sheet."""
+"""The functions that make an approximate mesh of the sheet, by variant of the correction method
+two_pass."""
 FLOOR = "floor"
 METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
 WITHOUT_SHAPES = tuple(method for method in METHODS if method != "two_pass")
@@ -48,7 +50,7 @@ CASES: tuple[tuple[float, float], ...] = (
     *((tilt, 0) for tilt in (-50, -30, 30, 50)),
     *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
 )
-"""The tilts of the sheet (degrees) and the push depths (mm)."""
+"""The cases of the benchmark: pairs of the sheet's tilt (degrees) and the push depth (mm)."""
 LARGE_CASES: tuple[tuple[float, float], ...] = ((-30, 0), (0, 30))
 SIZES_PX = ((800, 600), (1280, 720))
 STRETCH = 1.05
@@ -56,7 +58,7 @@ SPACING_M = 0.0025
 
 
 def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Return the benchmark of all correction methods for tilted and pushed sheets.
+    """Return the benchmark of all image correction methods for tilted and pushed sheets.
 
     The cases are those of figures 11 and 13 in Furukawa et al. 2007, and the limits of the scene's
     working range. solved: whether to include methods that need precomputed deflection shapes.
@@ -72,11 +74,11 @@ def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Fa
 
 
 def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
-    """Return whether a method is specified for a tilt and push depth of the sheet.
+    """Return whether a correction method is specified for a tilt (degrees) and push depth (mm).
 
-    `none` requires the sheet on the imaginary screen, `one_plane` a sheet without a push, and
-    `four_triangles` a push depth of at most `MAX_TRIANGLES_DEPTH_M`. All methods except `none` are
-    specified for tilts of up to 50 degrees.
+    The method `none` requires a sheet without tilt and push. `one_plane` requires a sheet without a
+    push. `four_triangles` requires a push depth of at most `MAX_TRIANGLES_DEPTH_M`. All methods
+    except `none` are specified for tilts of up to 50 degrees.
     """
     max_triangles_mm = 1e3 * MAX_TRIANGLES_DEPTH_M
     if method == "none":
@@ -95,9 +97,9 @@ def roll_sheet(
 ) -> Floats:
     """Return the pose world_from_sheet (4, 4) of a tilted sheet that touches the object.
 
-    contact_m: contact point (x, y) on the sheet. If it is None, the sheet has rolled on a cylinder
-    without slip from zero tilt. The centre of the sheet touches any other object at the point
-    nearest to the user.
+    contact_m: contact point (x, y) on the sheet, m. If it is None, the sheet has rolled on a
+    cylinder without slip from zero tilt. For other objects, the centre of the sheet touches the
+    point nearest to the user.
     """
     if not isinstance(scene.object.geometry, Cylinder):
         return _lay_sheet(scene, tilt_rad, contact_m or (0.0, 0.0))
@@ -128,7 +130,9 @@ def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
 
 
 def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
-    """Return the scene with another projector resolution and the same illuminated width."""
+    """Return a copy of the scene whose projector has another resolution and illuminates the same
+    width.
+    """
     projector = require_projector(scene)
     lens, scale = projector.lens, width_px / projector.width_px
     cut = 0.5 * (projector.height_px * scale - height_px)
@@ -197,7 +201,9 @@ def _make_situation(
 
 
 def draw_stereo(scene_renderer: SceneRenderer, method: str, sheet: SheetPose) -> None:
-    """Draw one stereo frame by a correction method, or by the lower bound `FLOOR`."""
+    """Draw one stereo frame by a correction method, or by the method `FLOOR`, which gives a lower
+    bound of the time.
+    """
     display = Display(correction=_correction_name(method), stereo="side_by_side")
     look = DrawStyle(flat=False, pattern="object")
     if method == FLOOR:
@@ -236,7 +242,7 @@ def _error_mm(
     get_measure: Callable[[], ErrorMeasure],
     _drawn: None,
 ) -> float:
-    """Return the root mean square error of all visible points, in mm.
+    """Return the root mean square position error of all visible object points, in mm.
 
     The error is infinite if no point is visible.
     """

@@ -2,8 +2,8 @@
 
 A mark is a square of projector pixels with a known ray. If the poses of projector and camera in the
 scene are correct, the camera must see the mark on this ray. If the poses of the arms are correct,
-the mark must be on the sheet. Near a pushing finger, the sheet follows the finger in a known ratio,
-which shows the true depth of the finger.
+the mark must be on the sheet. Near a pushing finger, the displacement of the sheet is a known
+fraction of the finger's displacement. Therefore the marks show the true depth of the finger.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
 SIDE_M = 0.0053
-"""The side of a mark, whose area equals that of a marker of 3 mm radius."""
+"""The side length of a projected mark. Its area equals that of a round marker with a radius of 3
+mm."""
 
 FINGER_STEP_M = 0.001
 """The displacement of the fingertip for which the displacements of the marks are computed."""

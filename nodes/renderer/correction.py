@@ -1,19 +1,20 @@
 """Correct the projected image for a moved or pushed sheet (Furukawa et al. 2007, eq. (1)-(6)).
 
-The image is drawn for the imaginary screen, the fixed plane z = 0, but projected onto the actual
-screen, the sheet. V is the eye, P the projector and A a point of the object. C is the intersection
-of the line V-A with the actual screen. C' is the intersection of the line C-P with the imaginary
-screen. A' is the point of the line V-C' at the depth of A. If the point is drawn at A', the eye
-sees it at A.
+The image is drawn for the imaginary screen, which is the fixed plane z = 0. It is projected onto
+the actual screen, which is the sheet. V is the eye, P the projector and A a point of the object. C
+is the intersection of the line V-A with the actual screen. C' is the intersection of the line C-P
+with the imaginary screen. A' is the point of the line V-C' at the depth of A. If the point is drawn
+at A', the eye sees it at A.
 
 The actual screen is one plane, or the four triangles between the pushed point and the sheet's
-corners. All points are in the world frame, in m. Points are invalid and not moved if
+corners. All points are in the world frame, in m. A point is invalid and is not moved in two cases:
 
-- the eye or the projector sees the screen edge-on, within `GRAZING_SINE`, or from the other side;
-- the point is not in front of the eye, or its C is behind the eye or the projector.
+- The eye or the projector sees the screen from the other side, or at an angle whose sine is below
+    `GRAZING_SINE`.
+- The point is not in front of the eye, or its point C is behind the eye or the projector.
 
-The plane of the sheet replaces triangles without area. It replaces all four triangles if the push
-is too shallow.
+The plane of the sheet is used instead of triangles without area. It is used instead of all four
+triangles if the push is too shallow.
 """
 
 from __future__ import annotations
@@ -50,9 +51,10 @@ class ScreenPlane:
 class ProjectionScreen:
     """The actual screen, which consists of four triangles with a common vertex, or of one plane.
 
-    point (3,): common vertex, m (r_s in the paper). normals (4, 3): unit normals towards the user
-    (n_si), which are equal for a plane. corners (4, 3): corners, m, counter-clockwise as seen by
-    the user; None for a plane. Triangle i is between corner i and the next corner.
+    point (3,): common vertex, m (r_s in Furukawa et al. 2007). normals (4, 3): unit normals towards
+    the user (n_si in the paper). They are equal for a plane. corners (4, 3): corners, m,
+    counter-clockwise as seen by the user; None for a plane. Triangle i is between corner i and the
+    next corner.
     """
 
     point: Floats
@@ -89,8 +91,8 @@ def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
 
     As seen from the eye, the lines from the pushed point to the corners divide the image into one
     sector for each triangle. A direction d is in sector i if d . normal_i >= 0 > d . normal_(i+1).
-    Normals are zero for a screen of one plane, and for a line that points to the eye. eye (3,):
-    position, m.
+    The normals are zero for a screen of one plane. A single normal is zero if its line points to
+    the eye. eye (3,): position of the eye, m.
     """
     if screen.corners is None:
         return np.zeros((4, 3))
@@ -112,7 +114,9 @@ def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
 
 
 def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
-    """Return the points (n, 2) at which lines from the eye to points (n, 3) intersect z = 0."""
+    """Return the points (n, 2) at which lines from the eye to points (n, 3) intersect the plane z =
+    0.
+    """
     fraction = eye[2] / (eye[2] - points[:, 2])
     crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * fraction[:, None]
     return crossings

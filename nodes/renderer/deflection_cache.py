@@ -1,7 +1,7 @@
 """Compute and cache the deflection shapes of the pushed sheet.
 
 The computation takes half a minute. Shapes are stored for a few finger radii and sheet widths.
-For other radii they are interpolated, and for other widths they are scaled.
+For other radii, the stored shapes are interpolated. For other widths, they are scaled.
 """
 
 from __future__ import annotations
@@ -28,10 +28,12 @@ from flexsheet.nodes.models.sheet.indentation import (
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 VERSION = 2
-"""The version of the computation. Increase it when results for the same inputs change."""
+"""The version of the computation, which is part of the cache key. Increase it when results for the
+same inputs change."""
 
 STRETCH_SLACK = 0.01
-"""The margin by which the range of stretch ratios in the computation exceeds the scene's limits."""
+"""The margin by which the computed range of stretch ratios exceeds the limits of the scene at each
+end."""
 
 FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
 """The fields of `IndentationBasis` that the cache file contains."""
@@ -91,9 +93,10 @@ def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
 
 
 def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
-    """List the scenes whose stored shapes are interpolated to those of a scene, with weights.
+    """List pairs (weight, scene) whose stored deflection shapes are interpolated for a given scene.
 
-    The listed scenes have a stored finger radius and a stored sheet width.
+    The listed scenes are copies of the given scene with a stored finger radius and a stored sheet
+    width.
     """
     width_m = WIDTH_STEP_M * max(round(scene.sheet.width_m / WIDTH_STEP_M), 1)
     sheet = scene.sheet.model_copy(update={"width_m": round(width_m, 6)})
@@ -110,7 +113,7 @@ def list_stored(scene: Scene) -> list[tuple[float, Scene]]:
 
 
 def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> IndentationBasis:
-    """Interpolate the deflection shapes of a scene from stored shapes with weights."""
+    """Return the deflection shapes of a scene as the weighted sum of stored shapes."""
     rubber, _ = required_shapes(scene)
     stored = parts[0][1]
     wider = rubber.width_m / stored.rubber.width_m

@@ -9,23 +9,25 @@ HISTORY = 31
 """The number of recent frames from which latencies are computed: half a second at 60 Hz."""
 
 VSYNC_MARGIN_S = 0.0005
-"""The minimum time between the end of drawing and the swap that shows the frame."""
+"""The minimum time (s) between the end of drawing and the buffer swap that shows the frame."""
 
 ON_TIME_FRACTION = 0.85
-"""The fraction of frames that must be ready in time for their predicted swap."""
+"""The fraction of frames that must be drawn before the swap (buffer exchange) that is predicted for
+them."""
 
 
 class DisplayLatencyEstimator:
     """An estimator of the display time of a frame.
 
     The display time is the middle of the interval in which the frame is projected. All times are ns
-    of one clock. The display time follows the swap that shows the frame or, without a window, the
-    end of drawing after a constant latency. If swaps wait for the projector's refresh, the
-    prediction is based on the next swap for which the frame will be ready.
+    of one clock. With a window, the display time is the time of the swap (exchange of the window's
+    buffers) plus a constant latency. Without a window, it is the end of drawing plus this latency.
+    If swaps wait for the projector's refresh, the prediction is based on the next swap for which
+    the frame will be ready.
     """
 
     def __init__(self, *, first_s: float, display_latency_s: float, period_s: float = 0.0) -> None:
-        """Set the latencies.
+        """Create an estimator without recorded frames.
 
         first_s: time from the start of drawing to the display time, used for the first frame.
         display_latency_s: time from the swap, or the end of drawing, to the display time. period_s:
@@ -62,7 +64,8 @@ class DisplayLatencyEstimator:
     def record_shown(self, begun_ns: int, drawn_ns: int, swapped_ns: int) -> int:
         """Record a frame that a window has shown, and return its display time (ns).
 
-        begun_ns, drawn_ns: start and end of drawing. swapped_ns: time of the swap.
+        begun_ns, drawn_ns: start and end of drawing. swapped_ns: time of the buffer swap that
+        showed the frame.
         """
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(swapped_ns - begun_ns)

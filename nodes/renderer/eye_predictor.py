@@ -1,4 +1,4 @@
-"""Predict the positions of the tracked eyes at the display time of a frame."""
+"""Predict the positions of the user's tracked eyes at the display time of a frame."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from flexsheet.nodes.node import Input
 from flexsheet.nodes.renderer.max_age import MaxAge
 
 WINDOW_S = 0.15
-"""The duration over which the velocity is measured, which covers a few frames of a head tracker."""
+"""The duration over which the eyes' velocity is measured, in seconds. It covers a few frames of a
+head tracker."""
 
 MIN_MESSAGES = 3
-"""The minimum number of positions for the measurement of a velocity. With fewer positions, the
+"""The minimum number of positions from which a velocity is computed. With fewer positions, the
 newest position is used."""
 
 MAX_SPEED_M_PER_S = 1.0
@@ -30,9 +31,10 @@ MAX_SHIFT_M = 0.03
 
 
 class EyePredictor:
-    """A predictor of the eyes' position, with the velocity of a line fitted to recent positions.
+    """A predictor of the eyes' position. Its velocity is the slope of a line that is fitted to
+    recent positions.
 
-    max_age: maximum age of a message. If the last message is older, the eyes are not tracked.
+    max_age: maximum age of a message. If the last message is older, the predictor returns None.
     """
 
     def __init__(self, max_age: MaxAge) -> None:
@@ -41,7 +43,9 @@ class EyePredictor:
         self._clock: tuple[str, int] | None = None
 
     def add(self, eye: Eye, header: Header) -> None:
-        """Add a message. After an invalid message, a gap or a change of clock, restart the fit."""
+        """Add a message with eye positions. After an invalid message, a gap or a change of clock,
+        delete earlier positions.
+        """
         clock, at_ns = (header.clock_id, header.epoch), header.source_ns
         known = self._positions
         if not eye.valid:

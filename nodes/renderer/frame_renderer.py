@@ -1,4 +1,4 @@
-"""Draw a frame for the projector from the newest messages, and make a message about the frame."""
+"""Draw frames for the projector from the newest messages, and make a message about each frame."""
 
 from __future__ import annotations
 
@@ -33,16 +33,17 @@ VISIBLE_CHANGE_M = 1e-4
 """The motion of the sheet that makes a new frame necessary, about a fifth of a pixel."""
 
 FLANGE_TO_SHEET_M = 0.15
-"""The maximum distance of a point of a sheet's edge from the flange that holds the edge."""
+"""The maximum distance (m) between a point on the sheet's edge and the flange of the arm that holds
+the edge."""
 
 CHECK_MARKS_PERIOD_NS = 200_000_000
-"""The period with which the projected check marks are placed on the moving sheet. It limits their
-cost to 1 % of a processor core."""
+"""The period with which the projected check marks are placed on the moving sheet. This period
+limits the computing time to 1 % of a processor core."""
 
 
 @dataclass(frozen=True, slots=True)
 class RendererInputs:
-    """The inputs of the renderer node whose newest messages define a frame."""
+    """The inputs of the renderer node. Their newest messages determine the next frame."""
 
     skin: Input[Skin]
     soft_body: Input[SoftBody]
@@ -54,7 +55,9 @@ class RendererInputs:
 
 
 class FrameRenderer:
-    """A renderer that draws a scene's frames, and counts late and superseded frames."""
+    """A renderer that draws the frames of a scene, and counts late frames and frames that were
+    never shown.
+    """
 
     def __init__(
         self,
@@ -82,7 +85,7 @@ class FrameRenderer:
             self.extrapolator.add(ports.soft_body.message, ports.soft_body.header)
 
     def is_unchanged(self, shown: Display) -> bool:
-        """Return whether a new frame would equal the last frame because nothing has changed."""
+        """Return whether a new frame would equal the last frame, because no input has changed."""
         ports = self._ports
         arms = (ports.arm_left.message, ports.arm_right.message)
         others = (ports.skin.message, ports.eye.message, shown)
@@ -94,7 +97,7 @@ class FrameRenderer:
         )
 
     def render(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
-        """Draw a frame, and return its message and the exposure time (ns) of its data.
+        """Draw a frame, and return its message and the camera exposure time (ns) of its input data.
 
         begun_ns: start of drawing. with_pixels: whether the message contains the image. If there is
         a window, the message has no display time until `on_shown` is called.
@@ -163,7 +166,9 @@ class FrameRenderer:
         return frame, source_ns
 
     def _place_check_marks(self, sheet: SheetPose, now_ns: int) -> CheckMarks:
-        """Place and return the check marks if they are due; otherwise return no marks."""
+        """Compute the projected check marks if `CHECK_MARKS_PERIOD_NS` has elapsed; otherwise
+        return no marks.
+        """
         projector = self.scene_renderer.scene.projector
         if projector is None or not projector.check_marks_sheet_m:
             return NO_MARKS
@@ -188,10 +193,11 @@ class FrameRenderer:
         )
 
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
-        """Deform the object as predicted for the display time `light_ns`.
+        """Deform the drawn object as predicted for the display time `light_ns`.
 
-        Without a recent response of the solver, use the last response unchanged. Return two times
-        (ns): the exposure time of the data, and the time for which the deformation was predicted.
+        Without a recent response of the soft-body solver, use its last response unchanged. Return
+        two times (ns): the exposure time of the data, and the time for which the deformation was
+        predicted.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age.seconds

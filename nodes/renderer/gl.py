@@ -34,13 +34,13 @@ SCREEN_PATTERNS = ("grid", "checker", "white")
 """The patterns that are drawn on the imaginary screen, the plane z = 0, instead of the object."""
 SOFT_LOOK, FLAT_LOOK = 0, 1
 LOOKS = {"coordinate_ramp_x": 2, "coordinate_ramp_y": 3, "grid": 4, "checker": 5, "white": 6}
-"""The value of the macro LOOK in the shader `object.frag.glsl` for each pattern."""
+"""The value of the macro LOOK in the shader `object.frag.glsl`, by pattern."""
 TEXTURES = {"none": 0, "speckle": 1, "grid": 2, "image": 3}
 MARK_RADIUS_M = 0.003
 
 
 class NoOpenGLError(FlexsheetError, RuntimeError):
-    """An error that is raised if no OpenGL 3.3 context can be created."""
+    """Raised if no OpenGL 3.3 context can be created."""
 
     code = "no-opengl"
     remedy = "Install the packages for EGL that `flexsheet doctor` names."
@@ -48,12 +48,12 @@ class NoOpenGLError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class EyeView:
-    """The geometry of one eye's image.
+    """The geometry of the image for one eye.
 
-    eye, projector: positions (3,), world frame, m. screen: sheet for which the image is corrected;
-    None for no correction. clip_from_screen: matrix (3, 3) from the imaginary screen to OpenGL clip
-    coordinates. lens: lens of the projector; None for no distortion. grey: whether to draw without
-    colour.
+    eye, projector: positions (3,), world frame, m. screen: shape of the sheet for which the image
+    is corrected; None for no correction. clip_from_screen: matrix (3, 3) from the imaginary screen
+    to OpenGL clip coordinates. lens: lens of the projector; None for no distortion. grey: whether
+    to draw without colour.
     """
 
     eye: Floats
@@ -68,9 +68,9 @@ class EyeView:
 class DrawStyle:
     """The style in which the object is drawn.
 
-    flat: whether to draw without shading. pattern: name of a pattern, or "object". fingertip_mark,
-    target_mark: points (3,), world frame, m, of the undeformed object at which marks are drawn, or
-    None.
+    flat: whether to draw without shading. pattern: name of a test pattern, or "object".
+    fingertip_mark, target_mark: points (3,) on the undeformed object, world frame, m, at which
+    marks are drawn, or None.
     """
 
     flat: bool
@@ -87,7 +87,8 @@ class DrawStyle:
 class ImagePart:
     """The part of the projector's image that one eye sees.
 
-    viewport: left, bottom, width and height, px. channels: whether red, green and blue are drawn.
+    viewport: left, bottom, width and height, px. channels: for red, green and blue, whether the
+    channel is drawn.
     """
 
     viewport: tuple[int, int, int, int]
@@ -99,7 +100,9 @@ class ImagePart:
 
     @contextmanager
     def of(self, frame: moderngl.Framebuffer) -> Iterator[None]:
-        """Restrict drawing in the context to this part of a frame and its colour channels."""
+        """Restrict drawing to this part of a frame and its colour channels until the context
+        exits.
+        """
         whole = frame.viewport
         frame.viewport, frame.color_mask = self.viewport, (*self.channels, True)
         if self.is_grey:
@@ -130,7 +133,9 @@ class SurfaceMaterial:
 
 
 class Canvas:
-    """The OpenGL shaders, meshes and framebuffers that draw the image of one projector."""
+    """A drawing area: the OpenGL shaders, meshes and framebuffers for the image of one
+    projector.
+    """
 
     def __init__(
         self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
@@ -163,7 +168,7 @@ class Canvas:
         self._grid = _MeshBuffers(self.context, *_grid_mesh())
 
     def release(self) -> None:
-        """Release the framebuffers, meshes and shaders, but not the context."""
+        """Release the framebuffers, meshes and shaders, but not the OpenGL context."""
         for mesh in (self._object, self._grid):
             if mesh is not None:
                 mesh.release()
@@ -212,39 +217,39 @@ class Canvas:
     def set_shape(self, positions: Floats, normals: Floats) -> None:
         """Set the current positions (n, 3), m, and unit normals (n, 3) of the object's vertices.
 
-        Raise RuntimeError before the first call of `set_mesh`.
+        Raise RuntimeError if `set_mesh` has not been called.
         """
         if self._object is None:
             raise RuntimeError("the canvas has no mesh; call set_mesh before set_shape")
         self._object.move(_interleaved(positions, normals))
 
     def set_moved(self, moved: NDArray[np.float32]) -> None:
-        """Set positions and normals of the object's vertices as one array (n, 6).
+        """Set positions (m) and normals of the object's vertices, given as one array (n, 6).
 
-        The normals may have any length. Raise RuntimeError before the first call of `set_mesh`.
+        The normals may have any length. Raise RuntimeError if `set_mesh` has not been called.
         """
         if self._object is None:
             raise RuntimeError("the canvas has no mesh; call set_mesh before set_moved")
         self._object.move(moved)
 
     def draw(self, view: EyeView, look: DrawStyle) -> None:
-        """Draw an image and wait until it is complete."""
+        """Draw the image for one eye, and wait until it is complete."""
         self.begin(multisampled=True)
         self.draw_into(self.target, view, look)
         self.resolve()
         self.context.finish()
 
     def draw_unresolved(self, view: EyeView, look: DrawStyle) -> None:
-        """Draw an image without averaging its samples.
+        """Draw an image without averaging the samples of each pixel.
 
-        Benchmarks use its time as a lower bound for all correction methods.
+        Benchmarks use the time of this method as a lower bound for all correction methods.
         """
         self.begin(multisampled=True)
         self.draw_into(self.target, view, look)
         self.context.finish()
 
     def begin(self, *, multisampled: bool) -> None:
-        """Select and clear the framebuffer `target` for the next image."""
+        """Select the framebuffer for the next image as `target`, and clear it."""
         self.target = self._frame if multisampled else self._single
         self.target.clear(0.0, 0.0, 0.0, 1.0)
 
@@ -293,10 +298,10 @@ class Canvas:
         return np.ascontiguousarray(rows[::-1])
 
     def shifted_points(self, view: EyeView) -> Floats:
-        """Return the corrected positions of the vertices as the shader computes them.
+        """Return the vertex positions after the image correction, as the shader computes them.
 
-        The result (n, 4) contains positions (m) and validity (0 or 1). Tests compare it with a
-        reference. Raise RuntimeError before the first call of `set_mesh`.
+        The result (n, 4) contains positions (m) and validity (0 or 1). Tests compare the result
+        with a reference. Raise RuntimeError if `set_mesh` has not been called.
         """
         if self._object is None:
             raise RuntimeError("the canvas has no mesh; call set_mesh before shifted_points")
@@ -314,7 +319,7 @@ def _mark(point: Floats | None) -> tuple[float, ...]:
 
 
 class Uniforms:
-    """The uniforms of a shader program, of which only changed values are written to OpenGL."""
+    """The uniforms of a shader program. Only changed values are written to OpenGL."""
 
     def __init__(self, program: moderngl.Program) -> None:
         self._program = program
@@ -358,7 +363,7 @@ class Programs:
 
 
 def set_view(uniforms: Uniforms, view: EyeView) -> None:
-    """Set the uniforms of the vertex shader for a view."""
+    """Set the uniforms of the vertex shader for the image of one eye."""
     screen = view.screen
     uniforms.set(
         eye=tuple(view.eye.tolist()),
@@ -383,7 +388,9 @@ def set_view(uniforms: Uniforms, view: EyeView) -> None:
 
 
 class _MeshBuffers:
-    """The OpenGL buffers of one mesh, of which one is written for each frame."""
+    """The OpenGL buffers of one mesh. Only the buffer of the current positions and normals is
+    written for each frame.
+    """
 
     def __init__(
         self,
@@ -402,7 +409,10 @@ class _MeshBuffers:
         self._arrays: dict[tuple[int, bool], moderngl.VertexArray] = {}
 
     def move(self, moved: NDArray[np.float32]) -> None:
-        """Set positions and normals (n, 6). Raise ValueError for another shape of the array."""
+        """Set the current positions (m) and normals of the vertices, given as one array (n, 6).
+
+        Raise ValueError if the array has another shape.
+        """
         if moved.shape != (self.count, 6):
             raise ValueError(
                 f"positions and normals of the mesh: expected shape ({self.count}, 6), found "
@@ -431,7 +441,9 @@ class _MeshBuffers:
 
 
 def _determinant(matrix: Floats) -> float:
-    """Return the determinant of a (3, 3) matrix, faster than `numpy.linalg.det`."""
+    """Return the determinant of a (3, 3) matrix. This function is faster than
+    `numpy.linalg.det`.
+    """
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
@@ -450,7 +462,7 @@ def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
 
 
 def shader_text(name: str, **macros: int) -> str:
-    """Return the text of a shader file with defined macros and expanded `#include` lines.
+    """Return the text of a shader file, with macro definitions and expanded `#include` lines.
 
     name: name of the file. macros: value of each macro.
     """
@@ -463,9 +475,9 @@ def shader_text(name: str, **macros: int) -> str:
 def limit_driver_threads() -> None:
     """Limit the threads of a software OpenGL driver to half of the cores.
 
-    On two cores, the driver uses no threads. The other cores remain free for other nodes, because
-    waiting for threads on busy cores uses 50 % more processor time. A value of the environment
-    variable LP_NUM_THREADS takes precedence.
+    On two cores, the driver uses no threads. The other half of the cores remains free for other
+    nodes. Without the limit, waiting for driver threads on busy cores uses 50 % more processor
+    time. A value of the environment variable LP_NUM_THREADS takes precedence.
     """
     cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("LP_NUM_THREADS", str(cores // 2 if cores > 2 else 0))
@@ -477,7 +489,9 @@ def is_software(context: moderngl.Context) -> bool:
 
 
 def headless_context() -> moderngl.Context:
-    """Return an OpenGL 3.3 context without a window. Raise NoOpenGLError if EGL provides none."""
+    """Return an OpenGL 3.3 context without a window. Raise NoOpenGLError if the library EGL
+    provides none.
+    """
     limit_driver_threads()
     # The type stub accepts further settings only as a dict.
     settings: dict[str, Any] = {"backend": "egl"}

@@ -9,13 +9,13 @@ import numpy as np
 from flexsheet.messages.scene import Lens
 
 REACH_MARGIN = 1.1
-"""The multiple of the slope at the image's corners up to which the distortion must be invertible.
-The slope of a ray is the tangent of its angle to the optical axis."""
+"""The ratio of the slope up to which the distortion must be invertible to the slope at the image's
+corners. The slope of a ray is the tangent of its angle to the optical axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClipLens:
-    """The projector lens in OpenGL clip coordinates.
+    """The parameters of the projector lens in OpenGL clip coordinates.
 
     focal_centre: focal lengths and principal point (fx, fy, cx, cy). distortion: k1, k2, p1, p2 and
     k3 of OpenCV. reach: maximum squared slope of a ray. The slope of steeper rays is limited to

@@ -9,12 +9,13 @@ from flexsheet.messages.base import Header
 
 HISTORY = 15
 PERIODS = 4.0
-"""The maximum age in camera periods, which permits the loss of three successive messages."""
+"""The maximum age of a message, in camera periods. This value permits the loss of three successive
+messages."""
 MIN_AGE_S, MAX_AGE_S = 0.1, 0.5
 
 
 class MaxAge:
-    """The maximum age at which poses, fingertips, eyes and soft bodies are used.
+    """The maximum age at which messages about poses, fingertips, eyes and soft bodies are used.
 
     seconds: current maximum age. It is either a fixed value, or
     `PERIODS` measured periods of the camera, limited to the range `MIN_AGE_S` to `MAX_AGE_S`.

@@ -1,4 +1,7 @@
-"""Find the projector's monitor and open a window on it with GLFW (main thread only)."""
+"""Find the projector's monitor, and open a window on this monitor with the library GLFW.
+
+All functions must be called on the main thread.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ ON_A_PROJECTOR = {
 
 
 class WindowError(FlexsheetError, RuntimeError):
-    """An error that is raised if the requested window cannot be opened or was lost."""
+    """Raised if the requested window cannot be opened or was lost."""
 
     code = "window"
     remedy = "Set the renderer's `monitor` to one that the text lists, or `output: headless`."
@@ -34,7 +37,7 @@ class WindowError(FlexsheetError, RuntimeError):
 
 @contextmanager
 def glfw_errors() -> Iterator[None]:
-    """Convert errors of the window library GLFW to WindowError in the context.
+    """Convert errors of the window library GLFW to WindowError until the context exits.
 
     `start_glfw` must be called first.
     """
@@ -47,7 +50,7 @@ def glfw_errors() -> Iterator[None]:
 
 
 def start_glfw() -> None:
-    """Connect to the display. Raise WindowError if there is no display."""
+    """Initialize the window library GLFW. Raise WindowError if there is no display."""
     glfw.ERROR_REPORTING = "raise"
     try:
         with glfw_errors():
@@ -107,7 +110,7 @@ def _text(name: bytes | str) -> str:
 
 
 def refresh_period_s(monitor: Any) -> float:
-    """Return the current refresh period of a monitor, in seconds, or 0 if it is unknown."""
+    """Return the current refresh period of a monitor, in seconds; 0 if the period is unknown."""
     rate_hz = glfw.get_video_mode(monitor).refresh_rate
     return 1.0 / rate_hz if rate_hz > 0 else 0.0
 

@@ -30,11 +30,11 @@ from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 
 
 class Renderer(Node):
-    """The node that draws a frame for each soft-body message, at most at `rate_hz`.
+    """The renderer node, which draws a frame for each soft-body message, at most at `rate_hz`.
 
-    Without recent soft-body messages, fingertip messages trigger frames. Without both, a timer
-    triggers frames. The node publishes a frame after it was drawn or, with a window, after it was
-    shown.
+    If there are no recent soft-body messages, fingertip messages trigger frames. If there are no
+    recent messages of both types, a timer triggers frames. The node publishes a frame after it was
+    drawn or, with a window, after it was shown.
     """
 
     role: ClassVar[NodeRole | None] = NodeRole.RENDERER

@@ -2,8 +2,8 @@
 
 The skin is the surface mesh of the soft-body solver. The drawn mesh is finer, and its vertices are
 on the true shape. A coarse mesh would have a visibly angular outline, and the image is corrected
-only at vertices (module `correction`). Displacement and change of the normals are interpolated
-between the vertices of the skin.
+only at vertices (module `correction`). The displacement and the change of the normals are
+interpolated between the vertices of the skin.
 """
 
 from __future__ import annotations
@@ -30,9 +30,11 @@ Indices = NDArray[np.int32]
 Real = TypeVar("Real", np.float32, np.float64)
 
 MIN_AROUND = 128
-"""The minimum number of vertices around a cylinder, sphere or ellipsoid, for a smooth outline."""
+"""The minimum number of vertices around a cylinder, sphere or ellipsoid. It ensures a smooth
+outline."""
 CANDIDATES = 16
-"""The number of nearby skin samples whose triangles are searched for the nearest point."""
+"""The number of nearby sample points on the skin. Their triangles are searched for the nearest
+point."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +53,7 @@ class ObjectSurface:
     def placed(
         points: Floats, normals: Floats, triangles: NDArray[np.integer], world_from_object: Floats
     ) -> ObjectSurface:
-        """Transform a surface from the object frame to the world frame.
+        """Make a surface in the world frame from vertices in the object frame.
 
         points (n, 3): vertices, m. normals (n, 3): unit normals. triangles (t, 3): vertex indices.
         world_from_object (4, 4): pose of the object.
@@ -182,7 +184,7 @@ def _inflate_cuboid(template: CuboidMap, spacing_m: float) -> tuple[Floats, NDAr
 
 
 class VertexNormals:
-    """A function that computes area-weighted unit normals at the vertices of a mesh."""
+    """A function object that computes area-weighted unit normals at the vertices of a mesh."""
 
     def __init__(self, triangles: NDArray[np.integer], vertices: int) -> None:
         columns = np.repeat(np.arange(len(triangles)), 3)
@@ -209,16 +211,18 @@ class VertexNormals:
 
 
 class DeformationTransfer:
-    """A transfer of the displacement of the solver's skin to a drawn surface.
+    """An operator that transfers the displacement of the soft-body solver's skin to a drawn
+    surface.
 
-    A drawn vertex moves with the nearest point of the skin. The normal of the drawn vertex changes
-    like the normal of the skin at this point, which is interpolated between vertices of the skin.
+    A drawn vertex moves with the nearest point of the skin. The change of the vertex's normal
+    equals that of the skin's normal at this point. Values on the skin are interpolated between its
+    vertices.
     """
 
     def __init__(
         self, surface: ObjectSurface, skin_vertices: Floats, skin_triangles: Indices
     ) -> None:
-        """Compute the interpolation weights.
+        """Compute the interpolation weights between a drawn surface and the skin.
 
         skin_vertices (s, 3): vertices at rest, world frame, m. skin_triangles (t, 3):
         counter-clockwise as seen from outside. Raise ValueError if all triangles have zero area, or
@@ -303,8 +307,8 @@ def transfer_matrix(
 def _samples(corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Return sample points (n, 3) on triangles (t, 3, 3), and their triangle indices (n,).
 
-    Larger triangles have more samples. The nearest samples of a point therefore belong to the
-    nearest triangles, even if triangle sizes differ.
+    Larger triangles have more samples. Therefore the samples nearest to a point belong to the
+    nearest triangles, even if the triangles differ in size.
     """
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
     parts = np.clip(np.ceil(sides / max(float(np.median(sides)), 1e-12)), 1, 12).astype(int)

@@ -1,4 +1,5 @@
-"""Select the eyes for which a frame is drawn, and the part of the projector's image for each."""
+"""Select the eyes for which a frame is drawn, and the part of the projector's image for each
+eye."""
 
 from __future__ import annotations
 
@@ -18,11 +19,12 @@ MIN_EYE_DISTANCE_M = 0.05
 
 
 def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
-    """Return the eyes for drawing, the unit vector (3,) from left to right eye, and a note.
+    """Return the eye positions for drawing, the unit vector (3,) from the left to the right eye,
+    and a note.
 
-    eyes: eyes of the scene, which are used without tracked eyes. tracked: newest message of the
-    topic eye; None if there is no message or it is too old. The note is the reason why `tracked` is
-    not used, or empty.
+    eyes: eye positions of the scene, which are used if no eyes are tracked. tracked: newest message
+    of the topic eye; None if there is no message or it is too old. The note is the reason why
+    `tracked` is not used, or empty.
     """
     across = np.array([1.0, 0.0, 0.0])
     if tracked is None:
@@ -59,10 +61,10 @@ def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Flo
 
 
 def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
-    """Return the eyes for which a frame is drawn.
+    """Return the eye or eyes for which a frame is drawn.
 
-    number: number of the frame. shows_both: whether the output alternates between the eyes, so each
-    frame needs both images. Otherwise, odd frames are for the left eye in the mode
+    number: number of the frame. shows_both: whether the output itself alternates between the eyes.
+    Then each frame needs both images. Otherwise, odd frames are for the left eye in the mode
     frame_sequential, and even frames for the right eye.
     """
     if mode != "frame_sequential" or shows_both:
@@ -76,8 +78,8 @@ def select_drawn_eyes(
     """Return the eye positions (1 or 2, 3) for which a frame is drawn.
 
     pair (2, 3): positions of the left and right eye. which: eye or eyes to which the projector
-    shows the frame. swap_eyes: whether shutter glasses open in the opposite order, so a frame for
-    one eye is drawn for the other eye. A frame for both eyes ignores `swap_eyes`.
+    shows the frame. swap_eyes: whether the shutter glasses open in the opposite order. Then a frame
+    for one eye is drawn for the other eye. A frame for both eyes ignores `swap_eyes`.
     """
     if which != "both":
         row = int((which == "right") != swap_eyes)

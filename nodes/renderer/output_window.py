@@ -1,4 +1,6 @@
-"""Provide the renderer's offscreen output, and a window on the projector's monitor."""
+"""Provide the outputs of the renderer: an offscreen output, and a window on the projector's
+monitor.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ CLOSED = "the window was closed; restart the node to show frames again"
 class OutputWindow(Protocol):
     """The interface of an output that shows the images for the eyes.
 
-    context: OpenGL context for drawing, which is current in the thread of the caller.
+    context: OpenGL context for drawing, which is the current context of the calling thread.
     """
 
     context: moderngl.Context
@@ -35,8 +37,7 @@ class OutputWindow(Protocol):
     shows_both: bool
     """Whether the output itself alternates between the eyes in the mode frame_sequential."""
     period_s: float
-    """The time between swaps that wait for the monitor's refresh, in seconds; 0 if swaps do not
-    wait."""
+    """The monitor's refresh period, in seconds; 0 if buffer swaps do not wait for the refresh."""
     note: str
 
     def open(self, size: tuple[int, int]) -> None: ...
@@ -47,7 +48,7 @@ class OutputWindow(Protocol):
 
 
 class OffscreenOutput:
-    """An output without a window. Images are drawn and can be part of frame messages."""
+    """An output without a window. Images are drawn, and can be added to frame messages."""
 
     is_seen = shows_both = False
     period_s = 0.0
@@ -75,7 +76,7 @@ class OffscreenOutput:
 def open_output(
     parameters: RendererParameters, now_ns: Callable[[], int], shown: Shown
 ) -> OutputWindow:
-    """Open the output that the parameters select.
+    """Open the output that the parameters select: offscreen, or a window.
 
     now_ns: function that returns the current time. shown: function that receives the tag and the
     swap time, ns, of each shown image. Raise WindowError if the window cannot be opened, and

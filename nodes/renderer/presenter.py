@@ -1,9 +1,9 @@
 """Show the newest image in a window from a separate thread.
 
-A swap that waits for the projector's refresh blocks only this thread. Meanwhile the event loop
-draws the next image. Both threads have their own OpenGL context, but share textures. There are
-three pairs of textures (triple buffering): a shown pair, a completely drawn pair, and a pair for
-the next image.
+A buffer swap that waits for the projector's refresh blocks only this thread. During this time, the
+event loop draws the next image. Both threads have their own OpenGL context, but share textures.
+There are three pairs of textures (triple buffering): a shown pair, a completely drawn pair, and a
+pair for the next image.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from flexsheet.nodes.renderer.monitors import WindowError, glfw_errors
 SLOTS = 3
 IDLE_S = 0.1
 REDRAW_COUNT = 4
-"""The number of times that an image is shown again after the window was resized. Drivers may resize
-their buffers up to two swaps later."""
+"""The number of times that an image is shown again after the window was resized. Some drivers
+resize their buffers only after two more buffer swaps."""
 
 _NO_WINDOW: Any = None
 GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
@@ -85,7 +85,7 @@ class Presenter:
         self._thread.start()
 
     def free_slot(self) -> Slot:
-        """Return a slot that is neither shown nor waiting to be shown, for drawing."""
+        """Return a slot for drawing. The slot is neither shown nor waiting to be shown."""
         with self._changed:
             return next(
                 slot
@@ -94,7 +94,10 @@ class Presenter:
             )
 
     def put(self, slot: Slot) -> None:
-        """Show a completely drawn slot at the next refresh, and return immediately."""
+        """Hand a completely drawn slot to the thread, and return immediately.
+
+        The thread shows the slot at the next refresh, unless a newer slot replaces it.
+        """
         with self._changed:
             superseded, self._ready = self._ready, slot
             self._changed.notify()
@@ -172,7 +175,7 @@ class Presenter:
 
 
 class _WindowQuad:
-    """The shader program and the textures that draw the image of a slot in the window.
+    """The shader program that draws the image of a slot in the window.
 
     Blocking OpenGL functions are called through ctypes, which releases the interpreter lock.
     """
@@ -209,7 +212,9 @@ class _WindowQuad:
 
 
 def _function(name: str, result: Any, *arguments: Any) -> Any:
-    """Return an OpenGL function of the current context, or None if the driver lacks it."""
+    """Return a function of the OpenGL driver by its name, or None if the driver does not provide
+    the function.
+    """
     address = glfw.get_proc_address(name)
     if not address:
         return None

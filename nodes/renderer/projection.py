@@ -1,9 +1,9 @@
 """Correct the image in two passes (projective texture mapping).
 
-The first pass draws the object as the eye should see it, through a rectangle on the imaginary
-screen (the plane z = 0). The second pass draws the sheet's mesh as the projector sees it, textured
-with the first image. The method is exact for any shape of the sheet and any depth of the object,
-and has no seams between triangles.
+The first pass draws the object as the eye must see it through a rectangle on the imaginary screen
+(the plane z = 0). The second pass draws the sheet's mesh from the position of the projector, with
+the first image as its texture. The method is exact for any shape of the sheet and any depth of the
+object, and has no seams between triangles.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ class ScreenRectangle:
 
 @dataclass(frozen=True, slots=True)
 class EyePicture:
-    """The framebuffers of the first pass.
+    """The framebuffers for the image of an eye in the first pass.
 
-    samples: framebuffer for drawing. resolved: framebuffer with the averaged image, which is the
-    same without multisampling. image: texture of `resolved`.
+    samples: framebuffer for drawing. resolved: framebuffer with the averaged image. Without
+    multisampling, it is the same framebuffer. image: texture of `resolved`.
     """
 
     samples: moderngl.Framebuffer
@@ -90,7 +90,7 @@ class EyePicture:
 
 
 class TwoPassProjector:
-    """A renderer of the two-pass method."""
+    """A renderer of the image correction in two passes."""
 
     def __init__(self, context: moderngl.Context, *, samples: int = SAMPLES) -> None:
         """Prepare the shaders.
@@ -116,7 +116,7 @@ class TwoPassProjector:
         part: ImagePart,
         size: tuple[int, int],
     ) -> None:
-        """Draw the projector's image for one eye into a part of the canvas's target framebuffer.
+        """Draw the projector's image for one eye into a part of the framebuffer `canvas.target`.
 
         window: rectangle that the eye's image shows. size: width and height of the eye's image, px.
         """
@@ -147,7 +147,9 @@ class TwoPassProjector:
         self._context.enable(moderngl.CULL_FACE)
 
     def _sheet_array(self, sheet: SheetMesh, program: moderngl.Program) -> moderngl.VertexArray:
-        """Return the vertex array of the sheet, after an update of its buffers if necessary."""
+        """Return the OpenGL vertex array of the sheet. Update its buffers first if the sheet has
+        changed.
+        """
         if self._buffers is None or sheet is not self._drawn:
             vertices = np.ascontiguousarray(sheet.vertices, np.float32)
             if self._buffers is None or not self._has_triangles(sheet.triangles):
@@ -166,9 +168,9 @@ class TwoPassProjector:
         return self._arrays[program.glo]
 
     def _has_triangles(self, triangles: NDArray[np.int32]) -> bool:
-        """Return whether the buffers contain these triangles (t, 3).
+        """Return whether the buffers contain the given triangles (t, 3).
 
-        Equal grids usually share one array, so contents are rarely compared.
+        Equal grids usually share one array. Therefore the contents of arrays are rarely compared.
         """
         drawn = None if self._drawn is None else self._drawn.triangles
         return drawn is triangles or (drawn is not None and np.array_equal(drawn, triangles))
@@ -179,7 +181,7 @@ class TwoPassProjector:
         self._arrays, self._buffers = {}, None
 
     def release(self) -> None:
-        """Release all buffers, but not the context."""
+        """Release all buffers, but not the OpenGL context."""
         self._release_sheet()
         for picture in self._pictures.values():
             picture.release()

@@ -59,16 +59,17 @@ from flexsheet.nodes.renderer.sheet_mesh import (
 
 OVERSAMPLING, UNSAMPLED_OVERSAMPLING = 1.5, 2.5
 """The ratios of the resolution of the eye's image (first pass of two_pass) to that of the
-projector, with and without multisampling. Without multisampling, a software driver needs a quarter
-less time for equally smooth edges."""
+projector, with and without multisampling. On a software driver, the variant without multisampling
+needs a quarter less time for equally smooth edges."""
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
-"""The margin of the rectangle around the object in the eye's image, and the step to which the edges
-of the rectangle are rounded. Rounding prevents flicker of the outline when the object moves."""
+"""The margin (m) of the rectangle around the object in the eye's image, and the step (m) to which
+the edges of the rectangle are rounded. Rounding prevents flicker of the outline when the object
+moves."""
 MAX_WINDOW_M = 0.3
 """The maximum distance of the edges of the drawn rectangle from the centre of the screen."""
 MIN_REPORTED_FRACTION = 0.005
-"""The minimum fraction of the sheet without light due to folds that is reported."""
+"""The minimum fraction of the sheet without light (due to folds) that a note reports."""
 NO_SHAPES_NOTE = (
     "the cache contains no deflection shapes, so a pushed sheet is drawn as four triangles; "
     "run flexsheet precompute"
@@ -173,10 +174,10 @@ class SceneRenderer:
         self.mesh_id = skin.mesh_id
 
     def deform(self, body: SoftBody | None) -> None:
-        """Deform the drawn surface by a response of the soft-body solver.
+        """Deform the drawn surface by the displacements from the soft-body solver.
 
-        body: response; None to draw the surface at rest. Raise ValueError, without a change of the
-        surface, if the displacement does not fit the current skin or is not finite.
+        body: message of the solver; None to draw the surface at rest. Raise ValueError, without a
+        change of the surface, if the displacement does not fit the current skin or is not finite.
         """
         if body is self._drawn_body:
             return
@@ -199,8 +200,9 @@ class SceneRenderer:
     ) -> DrawStyle:
         """Return the drawing style for a display message.
 
-        If the message requests marks, they are at the finger and at the contact point of the
-        target. finger_tip (3,): world position (m) at the display time; None if it is unknown.
+        If the message requests marks, the style contains marks at the finger and at the contact
+        point of the target. finger_tip (3,): world position (m) at the display time; None if it is
+        unknown.
         """
         marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
         return DrawStyle(
@@ -228,7 +230,7 @@ class SceneRenderer:
         return SheetPose(np.eye(4), corners(left, right, self.scene.sheet.height_m), None)
 
     def usable(self, sheet: SheetPose, centre: Floats | None = None) -> bool:
-        """Return whether the eyes see the sheet's front and the projector illuminates its back.
+        """Return whether the eyes see the front of a sheet and the projector illuminates its back.
 
         centre (3,): world position (m) of the midpoint of the eyes; None for the eyes of the scene.
         """
@@ -289,7 +291,7 @@ class SceneRenderer:
         return self.check_marks
 
     def _draw_check_marks(self, part: ImagePart) -> None:
-        """Draw the check marks as white squares into a part of the image."""
+        """Draw the projected check marks as white squares into a part of the image."""
         canvas, (left, bottom, width, height) = self.canvas, part.viewport
         scale = np.array([width / canvas.width_px, height / canvas.height_px])
         side_px = self.check_marks.side_px
@@ -336,7 +338,8 @@ class SceneRenderer:
     ) -> EyeView:
         """Return the geometry of one eye's image.
 
-        eye (3,): position, world frame, m. screen: sheet for which the image is corrected, or None.
+        eye (3,): position, world frame, m. screen: shape of the sheet for which the image is
+        corrected; None for no correction.
         """
         projector = self._world_from_projector[:3, 3]
         return EyeView(eye, projector, screen, self._clip_from_screen, self._lens, grey)
@@ -374,8 +377,8 @@ class SceneRenderer:
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
         """Compute the mesh of the sheet by the method `sheet_shape`.
 
-        Without deflection shapes, four triangles replace the method reduced_order. The attribute
-        `note` then reports limits.
+        If there are no deflection shapes, four triangles replace the method reduced_order. Then the
+        attribute `note` reports the limits of this method.
         """
         if self.sheet_shape != "reduced_order" or self.basis is None:
             lacks_shapes = self.sheet_shape == "reduced_order"
@@ -389,7 +392,9 @@ class SceneRenderer:
         return mesh
 
     def _range_note(self, sheet: SheetPose) -> str:
-        """Return a note if the push is too deep for four triangles, otherwise an empty text."""
+        """Return a warning if the push is too deep for a sheet of four triangles, otherwise an
+        empty text.
+        """
         if sheet.pushed_point is None:
             return ""
         depth_m = -float(apply(inverse(sheet.world_from_sheet), sheet.pushed_point)[2])
@@ -401,7 +406,9 @@ class SceneRenderer:
         )
 
     def _report_folds(self, mesh: SheetMesh, eye: Floats) -> None:
-        """Compute the fraction of the sheet that gets no light due to folds, and report it."""
+        """Compute the fraction of the sheet that gets no light due to folds, and report it in
+        `note`.
+        """
         self.occluded_fraction = occluded_fraction(mesh, eye, self._world_from_projector[:3, 3])
         if self.occluded_fraction > MIN_REPORTED_FRACTION:
             folds = (
@@ -425,7 +432,7 @@ class SceneRenderer:
         return ScreenRectangle(float(low[0]), float(low[1]), *(float(side) for side in high - low))
 
     def release(self) -> None:
-        """Release all graphics objects, but not the context."""
+        """Release all graphics objects, but not the OpenGL context."""
         self.canvas.release()
         self._projection.release()
 

@@ -1,4 +1,4 @@
-"""Estimate the sheet's pose, and the projection screen for the correction of the image."""
+"""Estimate the sheet's pose, and derive the screen for which the projected image is corrected."""
 
 from __future__ import annotations
 
@@ -58,12 +58,13 @@ def estimate_sheet(
     ahead_s: float,
     finger_tip: Floats | None,
 ) -> SheetPose | None:
-    """Predict the sheet from the measured poses (4, 4) of its edges.
+    """Predict the pose and the pushed point of the sheet from the measured poses (4, 4) of its
+    edges.
 
     twist_world (6,): linear (m/s) and angular (rad/s) velocity of the sheet. ahead_s: time from the
-    measurement to the prediction. finger_tip (3,): predicted fingertip, world frame, m, or None. It
-    pushes the sheet if it is below the plane and within the outline of the sheet. Return None if
-    the edges are closer than `MIN_EDGE_DISTANCE_M`, or if a value is not finite.
+    measurement to the prediction. finger_tip (3,): predicted fingertip, world frame, m, or None.
+    The fingertip pushes the sheet if it is below the plane and within the outline of the sheet.
+    Return None if the edges are closer than `MIN_EDGE_DISTANCE_M`, or if a value is not finite.
     """
     left, right = world_from_left_edge, world_from_right_edge
     if not all(np.isfinite(each).all() for each in (left, right, twist_world)):
@@ -84,7 +85,7 @@ def estimate_sheet(
 
 
 def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
-    """Return the screen for which a method corrects the image.
+    """Return the shape of the sheet for which a method corrects the image.
 
     Return None for the methods none and two_pass, which need no such screen.
     """

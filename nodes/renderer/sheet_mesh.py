@@ -19,11 +19,12 @@ from flexsheet.nodes.renderer.sheet import SheetPose
 Indices = NDArray[np.int32]
 
 MAX_TRIANGLES_DEPTH_M = 0.0035
-"""The push depth at which the shape of four triangles causes an rms error of half a millimetre, the
-maximum for this method."""
+"""The maximum push depth (m) for a sheet mesh of four triangles. At this depth, the rms error of
+the image is half a millimetre."""
 
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
-"""The vertex indices of triangles between adjacent corners (0 to 3) and pushed point (4)."""
+"""The vertex indices of the triangles between adjacent corners (0 to 3) and the pushed point (4).
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,9 @@ def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
 
 
 def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
-    """Return the same surface with smaller triangles, at whose vertices the lens is applied.
+    """Divide the triangles of a mesh without changing its surface.
+
+    The lens distortion is applied only at vertices, so a finer mesh is more accurate.
 
     halvings: number of times that each edge is halved.
     """
@@ -75,7 +78,8 @@ def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
 
 
 _grid_triangles = cache(triangulate_grid)
-"""A cached `triangulate_grid`. Equal grids share one array, which makes comparisons fast."""
+"""A variant of `triangulate_grid` with a cache. Equal grids share one array, which makes
+comparisons fast."""
 
 
 def deflected_mesh(
@@ -83,8 +87,9 @@ def deflected_mesh(
 ) -> SheetMesh:
     """Return the mesh of a sheet that is stretched, sags by its weight and is pushed by a finger.
 
-    The deflection of a flat sheet is added to the ruled surface between the edges. Sag and
-    indentation are superposed. The indentation is the depth of the finger below the sagging sheet.
+    The deflection of a flat sheet is added to the ruled surface between the edges. The sag and the
+    indentation are added. The depth of the indentation is that of the finger below the sagging
+    sheet.
     """
     rubber = basis.rubber
     stretch = sheet.edge_distance_m / rubber.width_m

@@ -18,8 +18,8 @@ from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 class SheetPosePredictor:
     """A predictor of the sheet's pose from the measured flange poses of the arms.
 
-    If there are no valid poses newer than `max_age`, the predictor returns the last valid sheet,
-    and the attribute `note` contains the reason. Otherwise, `note` is empty.
+    If no valid pose is newer than `max_age`, the predictor returns the last valid sheet. Then the
+    attribute `note` contains the reason. Otherwise, `note` is empty.
     """
 
     def __init__(self, max_age: MaxAge) -> None:
@@ -38,7 +38,7 @@ class SheetPosePredictor:
         horizon_s: float,
         eye: Floats,
     ) -> SheetPose:
-        """Return the sheet as predicted for a time `horizon_s` after the current time.
+        """Return the predicted sheet at the time `horizon_s` after the current time.
 
         Before the first valid pose, return the sheet at rest. finger_tip (3,): fingertip at the
         predicted time, world frame, m, or None. eye (3,): midpoint of the eyes, world frame, m.

@@ -1,7 +1,7 @@
-"""Measure time and error of the methods that compute the shape of a pushed sheet.
+"""Measure the time and the error of the methods that compute the shape of a pushed sheet.
 
-The error is the difference in height between a method's mesh and a reference sheet, at the points
-of the reference. The caller provides the reference.
+The error is the difference in height between the mesh of a method and a reference sheet. It is
+computed at the points of the reference. The caller provides the reference.
 """
 
 from __future__ import annotations
@@ -41,11 +41,13 @@ SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
     ("near the clamp", 0.29, 0.0),
     ("near the free edge", 0.0, 0.35),
 )
-"""The names of push positions, with x and y from the centre as fractions of width and height."""
+"""The names of push positions, and their coordinates x and y from the centre as fractions of width
+and height."""
 
 
 def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Return the benchmark of all methods over stretch ratios, push depths and positions.
+    """Return the benchmark of all sheet shape methods over stretch ratios, push depths and
+    positions.
 
     solved: whether to include the methods that need precomputed deflection shapes.
     """

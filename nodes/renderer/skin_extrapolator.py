@@ -1,7 +1,7 @@
 """Extrapolate the responses of the soft-body solver to the display time of a frame.
 
-A response is the displacement of the object's surface at the time of the camera's exposure plus
-`prediction_horizon_s`. The frame is displayed tens of milliseconds later. Each vertex is
+A response contains the displacement of the object's surface for one moment, the camera exposure
+plus `prediction_horizon_s`. The frame is displayed tens of milliseconds later. Each vertex is
 extrapolated linearly from an older and the newest response.
 """
 
@@ -14,14 +14,14 @@ from flexsheet.messages.types import SoftBody
 
 HISTORY = 8
 MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
-"""The limits of the time between the older and the newest response. A shorter time amplifies noise,
-and a longer time causes lag."""
+"""The limits of the time between the two responses that are extrapolated, in seconds. A shorter
+time amplifies noise, and a longer time causes lag."""
 
 MAX_PERIOD_S = 0.12
-"""The maximum time between the last two responses of a slow solver for extrapolation."""
+"""The maximum time (s) between two successive responses up to which they are extrapolated."""
 
 MAX_EXTRAPOLATION_S = 0.06
-"""The maximum extrapolation time, in seconds."""
+"""The maximum time over which the displacement is extrapolated, in seconds."""
 
 
 class SkinExtrapolator:
@@ -32,7 +32,9 @@ class SkinExtrapolator:
         self._clock_id = ""
 
     def add(self, body: SoftBody, header: Header) -> None:
-        """Add a response. A change of skin, method or clock deletes all earlier responses."""
+        """Add a response. If its skin mesh, method or clock differs, delete all earlier
+        responses.
+        """
         last = self._history[-1][1] if self._history else None
         other = last is not None and (last.mesh_id, last.method) != (body.mesh_id, body.method)
         at_ns = header.source_ns + round(body.prediction_horizon_s * 1e9)
@@ -42,7 +44,8 @@ class SkinExtrapolator:
         self._history.append((at_ns, body))
 
     def extrapolate(self, at_ns: int, clock_id: str) -> tuple[SoftBody | None, int]:
-        """Return the response extrapolated to the time `at_ns` of a clock, and its time (ns).
+        """Return the response extrapolated to the time `at_ns` of a clock, and the time (ns) for
+        which it is valid.
 
         Return the newest response unchanged if it has another clock, if it is later than `at_ns`,
         or if no earlier response is suitable. Return None and 0 before the first response.
