@@ -1,4 +1,5 @@
-"""Simulate the arms: manipulators with six joints and servo lag behind Modbus TCP servers.
+"""Simulate the arms, manipulators with six joints and servo lag, which receive commands over Modbus
+TCP.
 
 This module was written from `docs/modbus.md` and the dimensions of the arms only. It shares no code
 with the bridge (the node that sends commands to an arm), because it serves to test the bridge. The
@@ -41,15 +42,15 @@ Fault = Literal[
     "frozen",
     "lagging",
 ]
-"""The faults that a test can switch on in a simulated arm. MXT is the protocol of
-`mxt_controller.py`.
+"""The faults that a test can switch on in a simulated arm. MXT is Mitsubishi's protocol for
+real-time external control.
 
 silent: the arm does not answer.
 slow: the arm answers with the delay LATE_S.
 exception: the arm answers with a Modbus exception (MXT: with a packet of another data type).
 bad_crc: the arm answers with a wrong checksum (MXT: with a truncated packet).
 old_version: the arm answers with the version of an older register map.
-repeated: the arm repeats the counter of the previous answer.
+repeated: the arm answers with the message counter of its previous answer.
 frozen: the arm answers, but its joints do not move.
 lagging: the arm executes commands with the delay LATE_S.
 """
@@ -62,14 +63,14 @@ logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 CONTROLLER_CYCLE_S = 0.0071
 
 JITTER_STREAM = 1
-"""The second element of the random seed for the jitter of controller cycles, which makes the jitter
+"""The second element of the random seed for the jitter of controller cycles. It makes the jitter
 independent of the noise of measured joint angles."""
 
 
 def check_loopback(address: str) -> str:
-    """Return a network address unchanged; raise ValueError unless it is a loopback address.
+    """Raise ValueError unless a network address is a loopback address; return the address.
 
-    The simulated arms have no authentication and obey any client.
+    The simulated arms accept commands from any client without authentication.
     """
     if not ipaddress.ip_address(address).is_loopback:
         raise ValueError(
@@ -94,7 +95,7 @@ def _skew(axis: Floats) -> Floats:
 
 
 class ArmMechanics:
-    """The geometry and limits of a simulated arm, from its model in the scene.
+    """The geometry and limits of a simulated arm, taken from the arm's model in the scene.
 
     range_rad: lower and upper ends of the joints' ranges (6, 2).
     speed_rad_per_s, acceleration_rad_per_s2: maximum speeds and accelerations of the joints (6,).
@@ -136,17 +137,20 @@ class ArmMechanics:
         return np.asarray(one @ two @ three @ self._home)
 
     def _rotations(self, joints_rad: Floats) -> Floats:
-        """Return the matrices exp(S q) (6, 4, 4) for screw axes S and joint angles q (6,), rad."""
+        """Return the matrices exp(S q) (6, 4, 4) for the screw axes S and the joint angles q (6,),
+        rad.
+        """
         angles = joints_rad[:, None, None]
         return np.asarray(
             np.eye(4) + np.sin(angles) * self._cross + (1.0 - np.cos(angles)) * self._square
         )
 
     def solve_inverse_kinematics(self, base_from_flange: Floats, guess_rad: Floats) -> Floats:
-        """Solve the joint angles (6,), rad, within their ranges, for a flange pose (4, 4).
+        """Return joint angles (6,), rad, within their ranges, at which the flange has a pose (4,
+        4).
 
-        The damped Gauss-Newton method starts at `guess_rad` (6,). Raises ValueError unless the
-        pose error falls to a micrometre and a microradian.
+        A damped Gauss-Newton method starts at `guess_rad` (6,). Raises ValueError unless the pose
+        error decreases to a micrometre and a microradian.
         """
         joints = guess_rad.copy()
         low, high = self.range_rad.T
@@ -171,7 +175,9 @@ class ArmMechanics:
 
 
 def _pose_error(wanted: Floats, present: Floats) -> Floats:
-    """Return the translation (m) and small rotation (rad) from `present` to `wanted`, (6,)."""
+    """Return the translation (m) and the small rotation (rad) from pose `present` to pose `wanted`,
+    as (6,).
+    """
     turn = wanted[:3, :3] @ present[:3, :3].T
     spin = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -180,7 +186,7 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 
 RV_1A_MECHANICS = ArmMechanics(RV_1A)
-"""The mechanics of the RV-1A, the default arm of a scene."""
+"""The mechanics of the Mitsubishi RV-1A, the default arm of a scene."""
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
@@ -190,10 +196,10 @@ def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
 def decelerate(
     velocity_rad_per_s: Floats, duration_s: float, acceleration_rad_per_s2: Floats
 ) -> Floats:
-    """Return the joint velocities (..., 6), rad/s, after braking for a duration.
+    """Return the joint velocities (..., 6), rad/s, after braking for `duration_s`.
 
-    All joints are slowed by the same factor, so the arm stays on its path. acceleration_rad_per_s2:
-    maximum decelerations (6,).
+    All velocities are reduced by the same factor, so the arm stays on its path.
+    acceleration_rad_per_s2: maximum decelerations (6,).
     """
     stopping_s = (np.abs(velocity_rad_per_s) / acceleration_rad_per_s2).max(axis=-1, keepdims=True)
     left = np.maximum(stopping_s - duration_s, 0.0) / np.maximum(stopping_s, 1e-12)
@@ -202,11 +208,11 @@ def decelerate(
 
 @dataclass(slots=True)
 class Servo:
-    """The six joint servos of an arm, of second order with critical damping.
+    """The six joint servos of an arm. Each servo is a second-order system with critical damping.
 
     joints_rad: joint angles (6,) that the encoders at the motors measure.
     lag_s: lag of a joint behind a set-point of constant velocity.
-    driven_rad: joint angles (6,) at the output of the gears. After a reversal they stay constant
+    driven_rad: joint angles (6,) at the output of the gears. After a reversal, they are constant
         until the motor has moved by `backlash_rad`.
     """
 
@@ -221,9 +227,10 @@ class Servo:
         self.driven_rad = self.joints_rad.copy()
 
     def advance(self, wanted_rad: Floats, duration_s: float, *, braking: bool = False) -> None:
-        """Simulate `duration_s` in steps of at most a millisecond.
+        """Simulate the servos for `duration_s`, in steps of at most a millisecond.
 
-        wanted_rad: set-point (6,). braking: brake along the path instead of following it.
+        wanted_rad: set-point (6,), rad. braking: whether to brake along the path instead of
+        following the set-point.
         """
         if braking and not self.velocity_rad_per_s.any():
             return
@@ -249,17 +256,17 @@ class Servo:
 class Controller:
     """A simulated controller of one arm, which checks command blocks and answers with its status.
 
-    The controller rejects an invalid command (magic number, version, CRC, mode, sequence number) by
-    a Modbus exception. In four cases it enters the fault state, in which it brakes and stops: joint
-    angles out of range, joint angles not finite, a jump of the set-point, and no command for
-    `watchdog_s` while moving. An `idle` command clears a fault and may restart the sequence
-    numbers.
+    The controller answers a command with an invalid magic number, version, CRC, mode or sequence
+    number by a Modbus exception. Four faults make it brake and stop: joint angles out of range,
+    joint angles not finite, a jump of the set-point, and no command for `watchdog_s` while moving.
+    A command with the mode `idle` clears a fault and may restart the sequence numbers.
 
     noise_rad: standard deviation of the measured joints.
-    cycle_s: duration of a controller cycle. A set-point takes effect when the next cycle begins; 0:
-        at once.
+    cycle_s: duration of a controller cycle. A set-point takes effect when the next cycle begins.
+        With 0, set-points take effect immediately.
     cycle_jitter_s: standard deviation of the time at which a cycle begins.
-    latency_s: time from the arrival of a set-point until it waits for the next cycle.
+    latency_s: time from the arrival of a set-point until the controller has processed it. Then it
+        takes effect in the next cycle.
     """
 
     def __init__(
@@ -300,7 +307,9 @@ class Controller:
         self._random = np.random.default_rng(seed)
 
     def advance(self, duration_s: float) -> None:
-        """Simulate `duration_s` of motion; enter the fault state if commands are missing."""
+        """Simulate the motion for `duration_s`; enter the fault state if no command has arrived in
+        time.
+        """
         end_s = self._time_s + duration_s
         while self._pending and self._pending[0][0] <= end_s:
             due_s, wanted_rad = self._pending.popleft()
@@ -316,7 +325,9 @@ class Controller:
             self.servo.advance(self._acting_rad, duration_s, braking=self.state != STATE_MOVING)
 
     def receive_command(self, registers: list[int]) -> bool:
-        """Check and execute the registers of a command; return False if they must be rejected."""
+        """Check and execute a command, which is given as 16-bit registers; return False if it is
+        invalid.
+        """
         block = struct.pack(f">{len(registers)}H", *registers)
         if len(block) != _COMMAND.size:
             return self._refuse()
@@ -397,14 +408,14 @@ class Controller:
 
 
 class ArmServer:
-    """A modbus TCP server through which clients command a simulated controller."""
+    """A Modbus TCP server through which clients send commands to a simulated controller."""
 
     def __init__(
         self, controller: Controller, *, host: str, port: int, before: Callable[[], None]
     ) -> None:
-        """Store the settings; `start` opens the port.
+        """Store the settings. The method `start` opens the port.
 
-        before: function called before each request; it must call `controller.advance`.
+        before: function that is called before each request. It must call `controller.advance`.
         """
         self.controller = controller
         self._address = (host, port)
@@ -412,7 +423,7 @@ class ArmServer:
         self._server: ModbusTcpServer | None = None
 
     async def start(self) -> None:
-        """Start to listen; raise OSError or RuntimeError if the port is in use."""
+        """Start the server. Raises OSError or RuntimeError if the port is in use."""
         device = SimDevice(
             1,
             simdata=[
@@ -427,7 +438,10 @@ class ArmServer:
 
     @property
     def port(self) -> int:
-        """Return the port on which the server listens, also if any free port was requested."""
+        """Return the number of the port on which the server listens.
+
+        If port 0 was requested, this is the port that the operating system chose.
+        """
         listener: Any = None if self._server is None else self._server.transport
         if listener is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")

@@ -1,7 +1,7 @@
 """Simulate two arms that are controlled over the network, and publish their true poses.
 
-The apparatus holds the true parameters of the simulated hardware. The scene holds the parameters
-that the other nodes assume.
+The parameter `apparatus` contains the true parameters of the simulated hardware. The scene contains
+the parameters that the other nodes assume.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Loopback = Annotated[str, AfterValidator(check_loopback)]
 
 
 class TwinArmsParameters(SimulatorParameters):
-    """The parameters of the simulated arms; values in the apparatus take precedence."""
+    """The parameters of the simulated arms. Values in the parameter `apparatus` take precedence."""
 
     host: Loopback = "127.0.0.1"
     left_port: ListenPort = Field(
@@ -78,9 +78,10 @@ class TwinArmsParameters(SimulatorParameters):
 
 
 def open_joints_file(path: str | None) -> dict[str, Floats]:
-    """Open the file that stores the joint angles of both arms, rad, beyond the end of the process.
+    """Open the file that preserves the joint angles (rad) of both arms after the end of the
+    process.
 
-    The returned arrays (6,) by side are mapped onto the file. The angles are NaN if the file is new
+    The returned arrays (6,), by side, are mapped to the file. They contain NaN if the file is new
     or `path` is None. Raises OSError if the file cannot be opened.
     """
     if path is None:
@@ -96,10 +97,10 @@ def open_joints_file(path: str | None) -> dict[str, Floats]:
 def joint_torques_nm(
     mechanics: ArmMechanics, joints_rad: Floats, flange_from_edge: Floats, force_n: Floats
 ) -> Floats:
-    """Return the joint torques (6,), N m, that a force on the sheet's edge causes.
+    """Return the joint torques (6,), N m, that a force on the sheet's edge causes in an arm.
 
-    joints_rad: joint angles (6,). flange_from_edge: pose (4, 4). force_n: force (3,) in the base
-    frame.
+    joints_rad: joint angles (6,). flange_from_edge: pose (4, 4) of the edge in the flange frame.
+    force_n: force (3,) in the base frame.
     """
     step_rad = 1e-4
     torques = np.zeros(6)
@@ -112,7 +113,9 @@ def joint_torques_nm(
 
 
 class TwinArmsNode(Node):
-    """Simulate both arms with the sheet between them; they start when the first scene arrives."""
+    """A node that simulates both arms and the sheet between them. The arms start when the first
+    scene arrives.
+    """
 
     role: ClassVar[NodeRole | None] = NodeRole.ARM_SIMULATOR
     opens_devices: ClassVar[bool] = True
@@ -205,9 +208,9 @@ class TwinArmsNode(Node):
         return self._arms.left if side == "left" else self._arms.right
 
     def _true_joints(self, side: str, motor_rad: Floats) -> Floats:
-        """Return the true joint angles (6,), rad: encoder angles plus the true zero offsets.
+        """Return the true joint angles (6,), rad: the measured angles plus the true zero offsets.
 
-        motor_rad: joint angles (6,) after the backlash of the gears.
+        motor_rad: measured joint angles (6,) after the backlash of the gears.
         """
         offsets_rad = self._truth(side).joint_offsets_rad
         return motor_rad + np.array(offsets_rad) if any(offsets_rad) else motor_rad
@@ -237,7 +240,11 @@ class TwinArmsNode(Node):
             self._stored_joints[side][:] = controller.servo.joints_rad
 
     def _load_motors(self, joints: dict[str, Floats], left: Floats, right: Floats) -> None:
-        """Set the joint torques by the sheet's tension, which only the protocol MXT reports."""
+        """Compute the joint torques that the sheet's tension causes, and store them in the
+        controllers.
+
+        Only controllers with the protocol MXT report torques.
+        """
         across = right[:3, 3] - left[:3, 3]
         distance_m = float(np.linalg.norm(across))
         if self._pull is None or distance_m <= 0.0:

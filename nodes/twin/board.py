@@ -21,29 +21,29 @@ from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
 
 RAYS = 3
-"""The number of rays per pixel in each direction."""
+"""The number of rays per pixel along each image axis."""
 
 PAPER_LEVEL = 175.0
 INK_LEVEL = 22.0
 ROOM_LEVEL = 45.0
 BORDER_SQUARES = 0.6
-"""The width of the white border around the squares, in squares."""
+"""The width of the white border around the squares, divided by the side of a square."""
 
 TILTS_RAD = (0.0, 0.35, 0.6, 0.45, 0.25)
 HEIGHT_FRACTIONS = (0.95, 0.5, 0.75, 0.35, 0.6)
-"""The fractions of the image height that the untilted board fills in successive poses. `TILTS_RAD`
-holds the tilts of the same poses."""
+"""The fractions of the image height that the board without tilt fills in successive poses.
+`TILTS_RAD` contains the tilts of the same poses."""
 
 MARGIN_PX = 6.0
 MIN_CHARUCO_FRACTION = 0.6
 """The minimum fraction of the corners of a ChArUco board that must be visible in both images."""
 
 CHARUCO_NEARER = 1.2
-"""The factor by which a ChArUco board appears larger than a chessboard in the images."""
+"""The ratio of the image size of a ChArUco board to that of a chessboard."""
 
 
 class BoardError(FlexsheetError, ValueError):
-    """The error that is raised for a board that cannot be rendered."""
+    """Raised for a board that cannot be rendered."""
 
     code = "board"
     exit_code = 2
@@ -54,8 +54,8 @@ class BoardError(FlexsheetError, ValueError):
 class Light:
     """The uneven illumination of an image, and the background behind the board.
 
-    gain: factor at the image centre. slope_x, slope_y: relative change from the centre to the right
-    and lower edges. background: grey levels (height, width).
+    gain: brightness factor at the image centre. slope_x, slope_y: relative change of the brightness
+    from the centre to the right and lower edges. background: grey levels (height, width).
     """
 
     gain: float
@@ -81,7 +81,8 @@ class TwinBoard:
     def _cast(self, lens: Lens) -> Singles:
         """Return x/z and y/z (RAYS * height, RAYS * width, 2) of the rays through the image.
 
-        The rays within a pixel are equally spaced, because the distortion varies little there.
+        The rays within a pixel are equally spaced, because the distortion varies little within a
+        pixel.
         """
         height, width = self.camera.height_px, self.camera.width_px
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
@@ -125,7 +126,9 @@ class TwinBoard:
         return seen
 
     def pair(self, left_from_board: Floats) -> tuple[Image, Image]:
-        """Render the left and right image of the board at the pose `left_from_board` (4, 4)."""
+        """Render the left and the right image of the board at the pose `left_from_board` (4, 4),
+        with noise.
+        """
         left, right = self.levels(left_from_board)
         return self._exposed(left), self._exposed(right)
 
@@ -134,7 +137,9 @@ class TwinBoard:
         return quantize(levels + self.sensor.noise(levels) * noise)
 
     def levels(self, left_from_board: Floats) -> tuple[Singles, Singles]:
-        """Render both images (height, width) at the pose (4, 4), without noise and rounding."""
+        """Render both images (height, width) of the board at a pose (4, 4), without noise and
+        rounding.
+        """
         self._views(left_from_board, self._outline())
         light = self._light()
         left, right = (
@@ -227,7 +232,7 @@ class TwinBoard:
         return self.board.marker_m / self.board.square_m
 
     def poses(self, count: int) -> list[Floats]:
-        """Return poses `left_from_board` (4, 4) at which a careful person would hold the board.
+        """Return poses `left_from_board` (4, 4) of the board that are suitable for a calibration.
 
         The poses cover the centre, corners and edges of the image at several distances, with tilts
         in all directions. Each pose has the maximum distance from the image centre at which both
@@ -255,10 +260,10 @@ class TwinBoard:
     def _place_board(
         self, turn: Floats, depth_m: float, direction: Floats, board_centre: Floats
     ) -> Floats:
-        """Place a rotated board as far from the image centre in `direction` as it is visible.
+        """Return the pose left_from_board (4, 4) of a rotated board near the edge of the image.
 
-        A board that is too large at `depth_m` is moved farther away. Returns left_from_board
-        (4, 4).
+        The board is moved in `direction` from the image centre as far as it remains visible. A
+        board that is too large at the distance `depth_m` is moved farther away.
         """
         between_m = -0.5 * float(self.camera.right_from_left[0, 3])
         half = 0.5 * np.array([self.camera.width_px, self.camera.height_px])
@@ -294,7 +299,7 @@ class TwinBoard:
 
 
 def _measure_rise(place: Singles) -> Singles:
-    """Return the change (rows, columns) of values (rows, columns) from one ray to the next.
+    """Return the change (rows, columns) of values (rows, columns) between adjacent rays.
 
     The change is computed at one ray per pixel, because it varies little within a pixel.
     """
@@ -306,11 +311,11 @@ def _measure_rise(place: Singles) -> Singles:
 
 
 def _markers(board: Board) -> NDArray[np.bool_]:
-    """Return which cells of the ChArUco markers are black, (rows + 1, columns + 1, n, n).
+    """Return whether each cell of the ChArUco markers is black, (rows + 1, columns + 1, n, n).
 
     A marker has n cells per side, including its black border. Markers are numbered by row over the
-    white squares. The first square of the board is black, as in OpenCV.
-    Raises BoardError if the board has no valid markers, or more than its dictionary holds.
+    white squares. The first square of the board is black, as in OpenCV. Raises BoardError if the
+    board has no valid markers, or more markers than its dictionary contains.
     """
     if board.marker_m is None or board.dictionary is None:
         raise BoardError(
@@ -347,7 +352,7 @@ def _markers(board: Board) -> NDArray[np.bool_]:
 
 
 def _marker_ink(squares: Singles, markers: NDArray[np.bool_], share: float) -> Singles:
-    """Return an array (...) with 1 where a marker is printed black and 0 elsewhere.
+    """Return an array (...) that is 1 where a marker is black and 0 elsewhere.
 
     squares: board positions (..., 2) in units of squares. share: side length of a marker as a
     fraction of its square.

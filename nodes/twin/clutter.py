@@ -1,9 +1,10 @@
-"""Describe the clutter: objects in the camera images that make it hard to track the fingertip.
+"""Describe clutter, which consists of objects in the camera images that interfere with fingertip
+tracking.
 
-Positions are in m; `pixels.py` renders the objects. The path of an object is in the world frame,
-or relative to the fingertip if the object is `carried`. `views` names the cameras that see the
-object. Levels are grey levels (0 to 255) at normal exposure. The marker on the fingertip has a
-level of about 215.
+Positions are in m. The module `pixels` renders the objects. The path of an object is in the world
+frame, or relative to the fingertip if its attribute `carried` is true. The attribute `views` names
+the cameras that see the object. Levels are grey levels (0 to 255) at normal exposure. The marker on
+the fingertip has a level of about 215.
 """
 
 from __future__ import annotations
@@ -21,14 +22,17 @@ Views = Literal["both", "left", "right"]
 MARKER_RADIUS_M = 0.003
 FINGER_LENGTH_M = 0.06
 FINGER_DIRECTION: Point = (0.0, -0.5, 0.866)
-"""The world direction from the fingertip to the knuckle. The finger does not hide the marker."""
+"""The world direction from the fingertip to the knuckle. In this direction, the finger does not
+hide its marker from the cameras."""
 
 
 class Trajectory(Protocol):
     """The interface of a position as a function of simulation time."""
 
     def at(self, time_s: float) -> Floats:
-        """Return the position (3,), in m, in the world frame, or relative to the fingertip."""
+        """Return the position (3,), m, at a time, in the world frame or relative to the
+        fingertip.
+        """
         ...
 
 
@@ -44,7 +48,7 @@ class FixedPoint:
 
 @dataclass(frozen=True, slots=True)
 class Moving:
-    """A trajectory that leaves `start` at time 0 and has a constant velocity."""
+    """A trajectory of constant velocity that starts at the point `start` at time 0."""
 
     start: Point
     velocity_m_per_s: Point
@@ -69,7 +73,9 @@ class Oscillation:
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """A part of the hand: a tapered capsule between two points, drawn behind the finger."""
+    """A part of the hand. It is a tapered capsule (rounded cone) between two points, and is drawn
+    behind the finger.
+    """
 
     start: Trajectory
     end: Trajectory
@@ -92,7 +98,7 @@ class SecondMarker:
 
 @dataclass(frozen=True, slots=True)
 class Highlight:
-    """A reflection of a lamp: a small spot whose light is added to the background.
+    """A reflection of a lamp, which is a small spot whose light is added to the background.
 
     The image saturates above the grey level 255. A reflection on a curved surface often appears in
     only one of the two images.
@@ -107,7 +113,9 @@ class Highlight:
 
 @dataclass(frozen=True, slots=True)
 class Occluder:
-    """A capsule of constant level that hides everything behind it, such as a cable."""
+    """A capsule of constant grey level that hides everything behind it. It represents, for example,
+    a cable.
+    """
 
     start: Trajectory
     end: Trajectory
@@ -121,7 +129,8 @@ class Occluder:
 class Sheet:
     """An illuminated rubber sheet behind the finger, at rest in the plane z = 0, with a texture.
 
-    contrast: standard deviation of the texture's levels. grain_m: size of its features.
+    contrast: standard deviation of the texture's grey levels. grain_m: size of the texture's
+    features.
     """
 
     half_width_m: float = 0.12
@@ -146,22 +155,28 @@ class Clutter:
 
 
 def second_marker(offset_m: Point) -> Clutter:
-    """Make a second marker at a fixed offset (3,), in m, from the fingertip."""
+    """Make clutter that consists of a second marker at a fixed offset (3,), m, from the
+    fingertip.
+    """
     return Clutter(markers=(SecondMarker(FixedPoint(offset_m), carried=True),))
 
 
 def touching_highlight(overlap: float, *, radius_m: float = 0.0015) -> Clutter:
-    """Make a highlight beside the marker (+x) that covers a fraction of the marker's diameter."""
+    """Make clutter that consists of a reflection beside the marker (+x).
+
+    overlap: fraction of the marker's diameter that the reflection covers.
+    """
     aside_m = MARKER_RADIUS_M + radius_m - overlap * 2.0 * MARKER_RADIUS_M
     spot = Highlight(FixedPoint((aside_m, 0.0, 0.0)), radius_m, 300.0, carried=True)
     return Clutter(highlights=(spot,))
 
 
 def covered(share: float, *, views: Views = "both") -> Clutter:
-    """Make an occluder whose straight edge hides the fraction `share` (0 to 1) of the marker.
+    """Make clutter with an occluder whose straight edge hides the fraction `share` (0 to 1) of the
+    marker.
 
-    The occluder comes from +x. At `share` = 1 it also hides the blur of the marker.
-    views: cameras from which the marker is hidden.
+    The occluder covers the marker from the side +x. With `share` = 1, it also hides the blurred
+    edge of the marker. views: cameras from which the marker is hidden.
     """
     radius_m = 0.05
     if share >= 1.0:
@@ -179,7 +194,7 @@ def covered(share: float, *, views: Views = "both") -> Clutter:
 
 
 def together(*parts: Clutter) -> Clutter:
-    """Combine sets of clutter; raise ValueError if several sets contain a sheet."""
+    """Combine several sets of clutter. Raises ValueError if more than one set contains a sheet."""
     sheets = [part.sheet for part in parts if part.sheet is not None]
     if len(sheets) > 1:
         raise ValueError(
@@ -220,7 +235,7 @@ HAND = Clutter(
 NAIL = Clutter(
     highlights=(Highlight(FixedPoint((0.001, -0.006, 0.014)), 0.0006, 120.0, carried=True),)
 )
-"""The reflection on the fingernail, dimmer and smaller than the marker."""
+"""A reflection on the fingernail, which is darker and smaller than the marker on the fingertip."""
 
 CLAMPS = Clutter(
     highlights=(
@@ -228,7 +243,7 @@ CLAMPS = Clutter(
         Highlight(FixedPoint((0.135, -0.04, 0.01)), 0.0008, 150.0),
     )
 )
-"""The reflections on the clamps of the sheet's edges."""
+"""Reflections on the clamps of the sheet's edges."""
 
 PASSING = Clutter(
     markers=(SecondMarker(Oscillation((0.0, 0.05, 0.02), (0.14, 0.02, 0.0), 7.3)),),
@@ -250,11 +265,12 @@ PASSING = Clutter(
         ),
     ),
 )  # fmt: skip
-"""The moving bead as bright as the marker, moving reflections, and cables that swing in front."""
+"""Moving clutter: a bead as bright as the marker, reflections, and cables in front of the finger.
+"""
 
 CLUTTER = {
     "none": Clutter(),
     "lab": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS),
     "crowded": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS, PASSING),
 }
-"""The sets of clutter by their names in launch files, such as "lab"."""
+"""The sets of clutter, by their names in launch files (for example "lab")."""

@@ -1,9 +1,10 @@
-"""Measure the image error at each point of the object, by means of position codes drawn on it.
+"""Measure the image error at each point of the object, with position codes that are drawn on the
+object.
 
-In the patterns `coordinate_ramp_x` and `coordinate_ramp_y`, the colour of each point of the object
-encodes the x or y at which the eye should see it on the imaginary screen (z = 0). Red and
-green are the cosine and sine of a phase; blue encodes the coarse position. The image error is
-the position at which the eye sees a point minus the position that its colour encodes.
+In the patterns `coordinate_ramp_x` and `coordinate_ramp_y`, the colour of each point encodes a
+coordinate. It is the x or y at which the eye should see this point on the imaginary screen (z = 0).
+Red and green are the cosine and the sine of a phase. Blue encodes the coarse position. The image
+error is the position at which the eye sees a point minus the position that its colour encodes.
 """
 
 from __future__ import annotations
@@ -16,31 +17,31 @@ import numpy as np
 from flexsheet.nodes.arrays import Bools, Floats, Image
 
 PERIOD_M, RANGE_M = 0.02, 0.24
-"""The period of the phase and range of the coarse position, as in the shader `object.frag.glsl`."""
+"""The period of the phase and the range of the coarse position (m), as in the shader
+`object.frag.glsl`."""
 
 PURE = 0.06
-"""The maximum deviation of red and green from the circle of codes, relative to the radius of the
-circle. A pixel that deviates more is a mixture of different colours and is ignored."""
+"""The maximum deviation of (red, green) from the circle of valid codes, relative to the circle's
+radius. A pixel with a larger deviation contains a mixture of colours and is ignored."""
 
 AGREES_M = 0.002
-"""The maximum difference between the positions that blue and the phase encode. A pixel with a
+"""The maximum difference (m) between the positions that blue and the phase encode. A pixel with a
 larger difference is ignored. One step of blue is 1.2 mm."""
 
 RIM_PX = 3
-"""The width of the outline that is ignored, since mixing with black would change the decoded
-position.
-"""
+"""The width of the object's outline that is ignored, px. There, mixing with black would change the
+decoded position."""
 
 COARSE_LIGHT = 0.1
-"""The fraction of full blue below which a pixel counts as black and not as the object."""
+"""The fraction of the maximum blue below which a pixel does not belong to the object."""
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorMap:
     """The image error at each visible point of the object.
 
-    errors_m: (rows, columns, 2) seen minus expected position, x right, y up; NaN where no point can
-    be decoded.
+    errors_m (rows, columns, 2): actual minus expected position as seen by the eye, m, with x to the
+        right and y up; NaN where no point can be decoded.
     """
 
     errors_m: Floats
@@ -53,9 +54,10 @@ class ErrorMap:
 
 
 def error_map(coordinate_ramp_x: Image, coordinate_ramp_y: Image, metres_per_px: float) -> ErrorMap:
-    """Measure the image errors from both patterns as the eye sees them.
+    """Measure the image errors from the eye's images of both patterns.
 
-    coordinate_ramp_x, coordinate_ramp_y: images (rows, columns, 3).
+    coordinate_ramp_x, coordinate_ramp_y: images (rows, columns, 3). metres_per_px: pixel size on
+    the imaginary screen.
     """
     seen = _lit(coordinate_ramp_x) & _lit(coordinate_ramp_y)
     kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
@@ -76,7 +78,7 @@ def _lit(picture: Image) -> Bools:
 
 
 def _places(picture: Image) -> tuple[Floats, Bools]:
-    """Return the encoded position (m) and the validity of each pixel, both (rows, columns)."""
+    """Return the position (m) that each pixel encodes, and its validity, both (rows, columns)."""
     red, green, blue = np.moveaxis(picture.astype(np.float64) / 127.5 - 1.0, -1, 0)
     phase = np.arctan2(green, red) / (2.0 * np.pi)
     coarse = ((0.5 * (blue + 1.0) - 0.2) / 0.8 - 0.5) * RANGE_M

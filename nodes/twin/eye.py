@@ -1,13 +1,13 @@
 """Render by ray tracing what the user's eye sees on the simulated sheet, to verify the display.
 
-A virtual measuring camera is placed at the eye. Its image plane is the screen plane (z = 0), a
-square window about the origin. Each ray is traced to the triangles of the sheet, and takes the
-colour that the projector casts on that point. The expected image, which shows the virtual object
-itself, is traced in the same way. Sizes are then measured in both images as in Furukawa et al. 2007
-("the paper" below).
+A virtual measuring camera is placed at the eye. It views a square window about the origin of the
+screen plane (z = 0). Each ray is intersected with the triangles of the sheet, and gets the colour
+that the projector casts on that point. The expected image, which shows the virtual object itself,
+is rendered in the same way. Sizes are then measured in both images as in Furukawa et al. 2007 ("the
+paper" below).
 
-"True" names the simulator's own devices, which may differ from those that the nodes assume. The
-module shares no code with the renderer, so that an error of the renderer becomes visible here.
+"True" refers to the simulated devices, which may differ from those that the nodes assume. The
+module shares no code with the renderer, so that it can reveal errors of the renderer.
 """
 
 from __future__ import annotations
@@ -35,27 +35,29 @@ from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
 Indices = NDArray[np.intp]
 
 METRES_PER_PX = 0.00035
-"""The default size of a pixel on the screen plane: half of the paper's 0.7 mm."""
+"""The default size of a pixel on the screen plane, in metres. The pixel size in Furukawa et al.
+2007 is 0.7 mm."""
 
 HALF_WINDOW_M = 0.12
 MARGIN_PX = 3
 SEEN_SAMPLES = 2
 
 FLAT_SAMPLES, SOFT_SAMPLES = 8, 4
-"""The number of samples per pixel and direction in an expected image with flat and soft shading.
+"""The number of samples per pixel along each axis of an expected image, with flat and soft shading.
 Flat-shaded images need more samples, because sizes are measured at their outlines."""
 
 SHADOW_TOLERANCE = 0.002
-"""The minimum relative distance of a shadowed point behind the first surface on a projector ray."""
+"""The minimum relative distance of a point behind the first surface on a projector ray at which the
+point is in shadow."""
 
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 AMBIENT, WRAP, SHEEN, SHEEN_EXPONENT = 0.25, 0.35, 0.10, 20.0
 GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0, 1.05]), 0.025
-"""Three parameters of the shading of a soft object; docs/renderer.md describes all parameters."""
+"""Three parameters of the shading of a soft object. docs/renderer.md describes all parameters."""
 
 
 class NotMeasurableError(FlexsheetError, ValueError):
-    """The error that is raised if an image does not show the object that is to be measured."""
+    """Raised if an image does not show the whole object that must be measured."""
 
     code = "not-measurable"
     remedy = "Choose a pose in which the whole object is visible within the image."
@@ -63,9 +65,9 @@ class NotMeasurableError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """A regular fan of rays from `origin`, one per pixel of an image.
+    """The rays from a point `origin` through the pixels of an image.
 
-    The direction of a ray is first + column * right + row * down; all vectors are (3,).
+    The direction of a ray is first + column * right + row * down. All vectors have the shape (3,).
     """
 
     origin: Floats
@@ -76,19 +78,19 @@ class Rays:
     height: int
 
     def directions(self) -> Floats:
-        """Return the directions (height, width, 3) of all rays; they are not unit vectors."""
+        """Return the directions (height, width, 3) of all rays, which are not unit vectors."""
         columns, rows = np.arange(self.width), np.arange(self.height)
         return self.first + columns[None, :, None] * self.right + rows[:, None, None] * self.down
 
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """The first intersection of each ray of a fan with a mesh.
+    """The first intersection of each ray through an image with a mesh.
 
-    triangle: (height, width) index of the triangle that is hit; -1 where nothing is hit.
-    inverse_range: (height, width) reciprocal of the ray parameter at the hit; 0 if there is no hit.
-    weights: (triangles, 3, 3) matrices that map (1, column, row) to barycentric weights, which are
-        not normalised.
+    triangle (height, width): index of the triangle that the ray hits; -1 if it hits none.
+    inverse_range (height, width): reciprocal of the ray parameter at the hit; 0 if there is no hit.
+    weights (triangles, 3, 3): matrices that map (1, column, row) to barycentric weights, which are
+        not normalized.
     """
 
     triangle: NDArray[np.int32]
@@ -97,14 +99,14 @@ class Hits:
 
 
 def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
-    """Find the nearest triangle that each ray hits.
+    """Find the first triangle that each ray hits.
 
-    triangles: (triangles, 3) indices of vertices (vertices, 3), m.
+    vertices (vertices, 3): positions, m. triangles (triangles, 3): indices of vertices.
 
     A direction is written as d = sum of w_i (vertex_i - origin) over the corners of a triangle. The
     ray hits the triangle if all w_i >= 0, at the ray parameter 1 / sum(w). The weights w_i are
-    linear in column and row. Triangles that extend behind the origin, or are seen edge-on, are
-    ignored.
+    linear in column and row. Triangles that extend behind the origin, or whose plane contains the
+    origin, are ignored.
     """
     corners = (vertices - rays.origin)[triangles]
     basis = np.column_stack([rays.first, rays.right, rays.down])
@@ -143,9 +145,10 @@ class TrueProjector:
     """A simulated projector, which maps its pixels to the points of the sheet and back."""
 
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
-        """Prepare the rays of a projector that lights a mesh.
+        """Compute the rays of a projector that illuminates a sheet.
 
-        vertices: (vertices, 3) of the sheet in the world frame. triangles: (triangles, 3) indices.
+        vertices (vertices, 3): vertices of the sheet, world frame, m. triangles (triangles, 3):
+        indices.
         """
         pose, lens = projector.world_from_projector, projector.lens
         self._world_from_projector = pose_matrix(pose)
@@ -184,7 +187,8 @@ class TrueProjector:
         return np.asarray(slopes_of(lens, pixels) * focal + centre)
 
     def pixels_of(self, points: Floats) -> tuple[Floats, Bools]:
-        """Return the projector pixels (..., 2) of world points (..., 3), and whether each is lit.
+        """Return the projector pixels (..., 2) of world points (..., 3), and whether each point is
+        lit.
 
         A point is not lit if it lies outside the projected image or if another part of the sheet
         casts a shadow on it.
@@ -205,7 +209,8 @@ class TrueProjector:
         return pixels, lit
 
     def intersect_surface(self, pixels: Floats) -> tuple[Floats, Bools]:
-        """Return the points (n, 3) of the sheet that pixels (n, 2) light, and their validity (n,).
+        """Return the points (n, 3) of the sheet that pixels (n, 2) illuminate, and their validity
+        (n,).
 
         A point is not valid if the pixel is outside the image or if its ray misses the sheet.
         """
@@ -224,7 +229,7 @@ class TrueProjector:
 
 
 Box = tuple[int, int, int, int]
-"""The part of an image: first column, first row, last column + 1, last row + 1."""
+"""A rectangular part of an image: first column, first row, last column + 1, last row + 1."""
 
 
 def eye_rays(eye: Floats, *, metres_per_px: float, size: int, box: Box, samples: int) -> Rays:
@@ -255,9 +260,10 @@ def seen(
     eye: Floats,
     metres_per_px: float = METRES_PER_PX,
 ) -> Image:
-    """Render the image (rows, columns, 3) that the measuring camera at the eye takes of the sheet.
+    """Render the image (rows, columns, 3) of the sheet that a measuring camera at the eye takes.
 
-    projected: the projected image (height, width, 3), top row first.
+    projected: projected image (height, width, 3), which starts with the top row. eye (3,):
+    position, m.
 
     The result is black where there is no sheet or where a fold of the sheet blocks the light.
     """
@@ -316,7 +322,7 @@ def render_expected(
     flat: bool,
     metres_per_px: float = METRES_PER_PX,
 ) -> Image:
-    """Render the expected image (rows, columns, 3): the virtual object itself, on black.
+    """Render the expected image (rows, columns, 3): the virtual object on a black background.
 
     Raises ValueError unless the whole object lies in front of the eye.
     """
@@ -359,10 +365,10 @@ def render_expected(
 
 
 def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) -> Floats:
-    """Return the colours (n, 3), 0 to 1, of points on a soft object without a texture.
+    """Return the colours (n, 3), from 0 to 1, of points on a soft object without a texture.
 
-    colour: (3,) of the object. normals: (n, 3). to_eye: (n, 3) vectors from the points to the eye.
-    sunk_m: (n,) depths by which the points are pushed in.
+    colour (3,): colour of the object. normals (n, 3): unit normals. to_eye (n, 3): vectors from the
+    points to the eye. sunk_m (n,): depths by which the points are pushed in, m.
     """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     half = to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True) + LIGHT
@@ -375,7 +381,9 @@ def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) ->
 
 
 class _Silhouette:
-    """The outline of the largest bright region of an image, measured along rows and columns."""
+    """The outline of the largest bright region of an image, which is measured along rows and
+    columns.
+    """
 
     def __init__(self, picture: Image) -> None:
         gray = picture.astype(np.float64).mean(axis=2)
@@ -403,11 +411,15 @@ class _Silhouette:
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Return the top and bottom row (px) of the object on a fractional column."""
+        """Return the first and the last row (px, subpixel) of the object at a column, which need
+        not be an integer.
+        """
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:
-        """Return the left and right column (px) of the object on a fractional row."""
+        """Return the first and the last column (px, subpixel) of the object at a row, which need
+        not be an integer.
+        """
         return self._ends_between(self._gray, row)
 
     def _ends_between(self, lines: Floats, at: float) -> tuple[float, float]:
@@ -423,8 +435,8 @@ class _Silhouette:
 def _ends(profile: Floats) -> tuple[float, float]:
     """Return the subpixel positions at which a bright run of a grey-level profile begins and ends.
 
-    The position of an edge is that of a sharp step with the same total light, which is exact for
-    any symmetric blur. Raises NotMeasurableError if the run is too short.
+    The position of an edge is that of a sharp step with the same total light. This position is
+    exact for any symmetric blur. Raises NotMeasurableError if the run is too short.
     """
     bright = np.nonzero(profile > 0.5)[0]
     if len(bright) < 12:
@@ -445,8 +457,8 @@ def _edge(profile: Floats, first: int) -> float:
 
 
 INSET = 0.05
-"""The distance of the measured widths of the tilted cylinder from its upper and lower edge, as a
-fraction of its height. The distance avoids the rounded corners."""
+"""The distance from the upper and lower edge of the tilted cylinder at which its widths are
+measured, as a fraction of its height. At this distance, the rounded corners have no influence."""
 
 MIDDLE_COLUMNS = 17
 """The number of columns about the centre over which a measured height is averaged."""
@@ -462,8 +474,8 @@ def _height(shape: _Silhouette) -> tuple[float, float]:
 def tilt_sizes(picture: Image, metres_per_px: float) -> tuple[float, float, float]:
     """Measure height, upper width and lower width (m) of a cylinder in a flat-shaded image.
 
-    The method is that of section VI-B of the paper. Raises NotMeasurableError if the cylinder is
-    cut off, interrupted or missing.
+    The method is that of section VI-B of Furukawa et al. 2007. Raises NotMeasurableError if the
+    cylinder is cut off, interrupted or missing.
     """
     shape = _Silhouette(picture)
     top, bottom = _height(shape)
@@ -480,8 +492,8 @@ def tilt_sizes(picture: Image, metres_per_px: float) -> tuple[float, float, floa
 def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
     """Measure height and width (m) of a cylinder at its centre in a flat-shaded image.
 
-    The method is that of section VI-C of the paper. Raises NotMeasurableError if the cylinder is
-    cut off, interrupted or missing.
+    The method is that of section VI-C of Furukawa et al. 2007. Raises NotMeasurableError if the
+    cylinder is cut off, interrupted or missing.
     """
     shape = _Silhouette(picture)
     top, bottom = _height(shape)
@@ -493,11 +505,12 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
 class EyeSituation:
     """The true state of the simulated hardware and of the object while a frame is shown.
 
-    world_from_flange_left, world_from_flange_right: (4, 4) poses of the arms' last links.
-    finger_tip: (3,) in the world frame, or None if there is no finger.
-    skin_vertices, skin_triangles: surface mesh of the soft body at rest, (skin vertices, 3) and
-        (skin triangles, 3).
-    displacement: (skin vertices, 3). All three are None if the object is not deformed.
+    world_from_flange_left, world_from_flange_right: poses (4, 4) of the arms' last links.
+    finger_tip: position (3,) in the world frame, m, or None if there is no finger.
+    skin_vertices, skin_triangles: surface mesh (the skin) of the soft body at rest, (v, 3) and (t,
+        3).
+    displacement: displacement (v, 3) of the skin, m. Skin and displacement are None if the object
+        is not deformed.
     flat: whether the object is shown in one colour, without shading.
     """
 
@@ -528,8 +541,8 @@ class EyeSituation:
     ) -> Self:
         """Collect the true state from the latest messages.
 
-        scene: the scene with the true devices. The deformation is ignored unless `body` and `skin`
-        belong to the same mesh.
+        scene: scene with the parameters of the simulated devices. The deformation is ignored unless
+            `body` and `skin` belong to the same mesh.
         """
         moved = body if skin is not None and body and body.mesh_id == skin.mesh_id else None
         shown = skin if moved is not None else None
@@ -559,7 +572,7 @@ def true_sheet(
 ) -> DeformedSheet:
     """Compute the shape of the sheet between the true flange poses (4, 4).
 
-    scene: the scene with the true devices.
+    scene: scene with the parameters of the simulated devices.
     finger_tip: true position (3,) of the fingertip that pushes the sheet, or None.
 
     Raises NotConvergedError if the membrane has no solution.
@@ -583,7 +596,7 @@ def true_sheet(
 
 
 class EyeCamera:
-    """A measuring camera at the user's eye, which caches the expected image."""
+    """A simulated measuring camera at the user's eye. It caches the expected image."""
 
     def __init__(self) -> None:
         self._scene: Scene | None = None
@@ -593,10 +606,11 @@ class EyeCamera:
     def take(
         self, projected: Image, situation: EyeSituation, *, eye: Floats
     ) -> tuple[Image, Image]:
-        """Render the image of a projected frame that the eye sees, and the expected image.
+        """Render the image that the eye sees of a projected frame, and the expected image.
 
-        Both images are (rows, columns, 3). Raises NotConvergedError if the sheet's shape is not
-        found, and ValueError if the object reaches the eye or its deformation is invalid.
+        Both images have the shape (rows, columns, 3). Raises NotConvergedError if the computation
+        of the sheet's shape fails. Raises ValueError if the object reaches the eye or its
+        deformation is invalid.
         """
         sheet = true_sheet(
             situation.scene,

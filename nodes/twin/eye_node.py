@@ -1,7 +1,7 @@
-"""Simulate the user's eye: render its images of projected frames, to evaluate experiments.
+"""Simulate the user's eye, whose images of projected frames are evaluated in experiments.
 
-Experiments label the frames that they evaluate. The apparatus holds the true parameters of the
-simulated hardware; the scene holds those that the other nodes assume.
+Experiments label the frames that they evaluate. The parameter `apparatus` contains the true
+parameters of the simulated hardware. The scene contains the parameters that the other nodes assume.
 """
 
 from __future__ import annotations
@@ -68,15 +68,17 @@ class TwinEyeParameters(SimulatorParameters):
 
 
 class TwinEyeNode(Node):
-    """Render the eye's image of labelled frames, once per label, correction and eye.
+    """A node that renders the eye's image of labelled frames, once per label, correction method and
+    eye.
 
     Only frames that contain the pixels of a single view are rendered. A mono frame is rendered from
     the viewpoint in the parameters, and a frame for one eye from that eye.
 
-    An image takes about a second. Further frames of a label that is waiting or was just rendered
-    are therefore skipped and do not count as lost. The sheet has its true shape at the time at
-    which the projector shows the frame, a few milliseconds after the frame arrives. The finger
-    position is that of the latest exposure, and the deformation is the latest from the solver.
+    The computation of an image takes about a second. Therefore the node ignores further frames with
+    the same label, and does not count them as lost. The shape of the sheet is that at the time at
+    which the projector shows the frame. This time is a few milliseconds after the frame arrives.
+    The finger position is that of the latest exposure. The deformation is the latest result of the
+    soft-body solver.
     """
 
     on_demand: ClassVar[bool] = True
@@ -156,7 +158,10 @@ class TwinEyeNode(Node):
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
 
     def _true_scene(self, scene: Scene) -> Scene:
-        """Return the scene with the true devices: the same object for the same scene."""
+        """Return the scene with the parameters of the simulated devices.
+
+        The same scene object gives the same result object.
+        """
         if self._scenes is None or self._scenes[0] is not scene:
             true = apply_apparatus(scene, self.parameters.apparatus)
             if self.parameters.projector is not None:
@@ -180,10 +185,10 @@ class TwinEyeNode(Node):
         return self.parameters.viewpoint if frame.eye == "both" else frame.eye
 
     def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
-        """Return the true world position (3,), in m, of the measuring camera at `at_s`.
+        """Return the true world position (3,), m, of the measuring camera at the time `at_s`.
 
-        The position is that of the tracked eyes, or else of the scene's eyes, plus the offset in
-        the apparatus.
+        The position is that of the tracked eyes, or of the scene's eyes if none are tracked. The
+        offset in the parameter `apparatus` is added.
         """
         given = self.parameters
         tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None

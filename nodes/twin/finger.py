@@ -1,9 +1,9 @@
 """Simulate the motion of a person's fingertip as a function of time.
 
-A path message and a random seed determine the motion. The finger follows the path with two kinds of
-unsteadiness: wander (slow) and tremor (fast). As the position can be computed for any time, the
+A path message and a random seed determine the motion. The finger follows the path with two random
+deviations: wander (slow) and tremor (fast). Because the position can be computed for any time, the
 ground truth of each image is exact. Positions are in the world frame, in m. Times are in seconds
-since the path was given, unless stated otherwise.
+since the path message arrived, unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from flexsheet.nodes.arrays import Floats
 Real = TypeVar("Real", float, Floats)
 
 ROUNDING_S = 0.04
-"""Half of the duration (s) over which corners of a polyline are rounded."""
+"""Half of the time interval (s) of the moving average that rounds the corners of a polyline."""
 
 EASE_SPEED_M_PER_S = 0.4
-"""The peak speed of the reach from the present position to the first point of a path."""
+"""The peak speed of the finger's motion from its current position to the first point of a path."""
 
 MIN_EASE_S = 0.3
 WANDER_BAND_HZ = (0.15, 1.2)
@@ -33,7 +33,7 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 
 
 class FingerPathError(FlexsheetError, ValueError):
-    """The error that is raised for a path that the simulated finger cannot follow."""
+    """Raised for a path that the simulated finger cannot follow."""
 
     code = "finger-path"
     remedy = "Slow the path down, or correct the point or line that the text names."
@@ -41,9 +41,10 @@ class FingerPathError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class SineSum:
-    """A band-limited noise: a sum of sines per axis with standard deviation 1.
+    """Band-limited noise with three components. Each component is a sum of n sines with the
+    standard deviation 1.
 
-    frequencies_hz, phases_rad: (3 axes, sines).
+    frequencies_hz, phases_rad (3, n): frequencies and phases of the sines.
     """
 
     frequencies_hz: Floats
@@ -51,7 +52,7 @@ class SineSum:
 
     @staticmethod
     def drawn(band_hz: tuple[float, float], generator: np.random.Generator) -> SineSum:
-        """Choose seven random sines per axis: one from each seventh of the frequency band."""
+        """Choose seven random sines per component, one from each seventh of the frequency band."""
         edges = np.linspace(*band_hz, 8)
         return SineSum(
             frequencies_hz=generator.uniform(edges[:-1], edges[1:], (3, 7)),
@@ -59,7 +60,7 @@ class SineSum:
         )
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return the value and its rate of change (1/s), each (3,)."""
+        """Return the value (3,) and its rate of change (3,), 1/s, at a time."""
         pace = 2.0 * np.pi * self.frequencies_hz
         angle = pace * time_s + self.phases_rad
         scale = np.sqrt(2.0 / self.frequencies_hz.shape[1])
@@ -67,9 +68,10 @@ class SineSum:
 
 
 class Path(Protocol):
-    """The interface of the motion along a path, without wander and tremor.
+    """The interface of a fingertip's motion along a path, without its random deviations.
 
-    Times are in seconds from the first point. The finger rests before and after the path.
+    Times are in seconds since the finger was at the first point. The finger rests before and after
+    the path.
     """
 
     @property
@@ -82,7 +84,7 @@ class Path(Protocol):
     def begins_s(self) -> float:
         """Return the time (s, at most 0) at which the finger leaves the first point.
 
-        The reach to the first point must end at this time or earlier.
+        The finger must reach the first point at this time or earlier.
         """
         ...
 
@@ -91,21 +93,21 @@ class Path(Protocol):
         ...
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return position (m) and velocity (m/s), each (3,)."""
+        """Return the position (3,), m, and the velocity (3,), m/s, at a time."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class RoundedLines:
-    """The motion along straight lines, whose corners are rounded by a moving average of
+    """A motion along straight lines, whose corners are rounded by a moving average over
     +-ROUNDING_S.
 
     The average is computed exactly from the integral of the position. The rounded motion never
     leaves the convex hull of the points, never exceeds the speed on the lines, and has a continuous
-    velocity. Densely sampled smooth motions are unsuitable: rounding would displace them by
+    velocity. Densely sampled smooth motions are unsuitable, because rounding would displace them by
     ROUNDING_S^2 / 6 times their acceleration.
 
-    integral: (n, 3) integral (m s) of the position from time 0 to each point.
+    integral (n, 3): integral (m s) of the position from time 0 to each point.
     """
 
     times_s: Floats
@@ -129,12 +131,14 @@ class RoundedLines:
         return -ROUNDING_S
 
     def speeds(self) -> Floats:
-        """Return the speeds (n - 1,), in m/s, on the lines, which bound the rounded motion."""
+        """Return the speeds (n - 1,), m/s, on the lines. The rounded motion is not faster."""
         ways = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
         return np.asarray(ways / np.diff(self.times_s))
 
     def _corner(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return the position (3,), m, on the polyline and its integral (3,), m s, since time 0."""
+        """Return the position (3,), m, on the polyline, and the integral (3,), m s, of the position
+        since time 0.
+        """
         if time_s <= 0.0:
             return self.points[0], self.points[0] * time_s
         if time_s >= self.times_s[-1]:
@@ -149,7 +153,7 @@ class RoundedLines:
         )
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return position (m) and velocity (m/s), each (3,), at a time from the first point."""
+        """Return the position (3,), m, and velocity (3,), m/s, at a time after the first point."""
         before, area_before = self._corner(time_s - ROUNDING_S)
         after, area_after = self._corner(time_s + ROUNDING_S)
         span = 2.0 * ROUNDING_S
@@ -158,10 +162,10 @@ class RoundedLines:
 
 @dataclass(frozen=True, slots=True)
 class SmoothPath:
-    """A cubic spline through samples of a motion, at rest at both ends.
+    """A motion along a cubic spline through samples, which is at rest at both ends.
 
-    Between samples at intervals h the error is about h^4 / 100 times the fourth derivative of the
-    motion. For a reach of 10 mm in 50 ms, sampled every 4 ms, it is below a micrometre.
+    For samples at intervals h, the error is about h^4 / 100 times the fourth derivative of the
+    motion. The error of a motion of 10 mm in 50 ms with samples every 4 ms is below a micrometre.
     """
 
     times_s: Floats
@@ -191,9 +195,9 @@ class SmoothPath:
     def speeds(self) -> Floats:
         """Return upper bounds (n - 1,), in m/s, on the speed between successive samples.
 
-        Between two samples the velocity is a quadratic Bezier curve, which stays within the
-        triangle of its control points: both end velocities, and 3 times the mean velocity minus
-        both end velocities.
+        Between two samples, the velocity is a quadratic Bezier curve, which is inside the triangle
+        of its control points. Two control points are the end velocities. The third is 3 times the
+        mean velocity minus both end velocities.
         """
         ends = self.rates
         mean = np.diff(self.points, axis=0) / np.diff(self.times_s)[:, None]
@@ -202,7 +206,7 @@ class SmoothPath:
         return np.asarray(corners.max(axis=0))
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return position (m) and velocity (m/s), each (3,), at a time from the first point."""
+        """Return the position (3,), m, and velocity (3,), m/s, at a time after the first point."""
         if time_s <= 0.0:
             return self.points[0], np.zeros(3)
         if time_s >= self.times_s[-1]:
@@ -218,10 +222,10 @@ class SmoothPath:
 
 
 def find_clamped_rates(times_s: Floats, points: Floats) -> Floats:
-    """Return the rates (n, 3) at the points (n, 3) of the cubic spline that rests at both ends.
+    """Return the velocities (n, 3) of a clamped cubic spline at its points (n, 3).
 
-    The second derivative is continuous. The tridiagonal equations are solved by elimination,
-    because the import of SciPy would delay the restart of the node by a third of a second.
+    The velocity is zero at both ends, and the second derivative is continuous. The tridiagonal
+    equations are solved without SciPy, because its import would delay the start of the node.
     """
     steps = np.diff(times_s)
     mean = np.diff(points, axis=0) / steps[:, None]
@@ -237,7 +241,7 @@ def find_clamped_rates(times_s: Floats, points: Floats) -> Floats:
 
 
 def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
-    """Check points (n, 3) and times (n,), and make the path through them.
+    """Check the points (n, 3) and times (n,) of a path, and return the motion through these points.
 
     Raises FingerPathError if the path has no points or its times do not increase.
     """
@@ -265,7 +269,7 @@ class FingerState:
 
     position, velocity: (3,) in m and m/s.
     path_time_s: time since the first point of the path; negative before the finger reaches it.
-    path_done: whether the end of the path is reached.
+    path_done: whether the finger has reached the end of the path.
     force: (3,) force of the sheet on the finger, N.
     """
 
@@ -278,15 +282,16 @@ class FingerState:
 
 @dataclass(frozen=True, slots=True)
 class FingerMotion:
-    """The motion of the fingertip: a reach to the first point of a path, the path, and
-    unsteadiness.
+    """The motion of the fingertip: a motion to the first point of a path, the path itself, and
+    random deviations (wander and tremor).
 
-    start, start_velocity: position and velocity when the path was given, without unsteadiness.
-    ease_s: duration of the reach to the first point.
-    amplitudes_before_m, amplitudes_m: (wander, tremor) before the reach and on the path. Amplitudes
-        during the reach are interpolated.
-    age_s: time argument of the unsteadiness when the path was given. Later motions continue this
-        time, so the unsteadiness has no jumps.
+    start, start_velocity: position and velocity when the path message arrived, without random
+        deviations.
+    ease_s: duration of the motion to the first point.
+    amplitudes_before_m, amplitudes_m: amplitudes of wander and tremor before the path message and
+        on the path. During the motion to the first point, they are interpolated.
+    age_s: time argument of the random deviations when the path message arrived. Later motions
+        continue this time, so the deviations have no jumps.
     """
 
     path: Path
@@ -307,7 +312,10 @@ class FingerMotion:
         wander_band_hz: tuple[float, float] = WANDER_BAND_HZ,
         tremor_band_hz: tuple[float, float] = TREMOR_BAND_HZ,
     ) -> FingerMotion:
-        """Make a finger that rests at `position` (3,), m; `seed` determines later unsteadiness."""
+        """Make the motion of a finger that rests at `position` (3,), m.
+
+        seed: random seed of the deviations on later paths.
+        """
         generator = np.random.default_rng(seed)
         return FingerMotion(
             path=RoundedLines.through(np.zeros(1), position[None]),
@@ -323,7 +331,10 @@ class FingerMotion:
 
     @staticmethod
     def of(finger: FingerTruth | None, position: Floats, *, seed: int) -> FingerMotion:
-        """Make a finger that rests at `position` (3,), m, with the true tremor if it is known."""
+        """Make the motion of a finger that rests at `position` (3,), m.
+
+        finger: true parameters of wander and tremor; None for default values.
+        """
         if finger is None:
             return FingerMotion.resting(position, seed=seed)
         middle_hz, half_hz = finger.tremor_frequency_hz, 0.5 * finger.tremor_width_hz
@@ -345,12 +356,12 @@ class FingerMotion:
         max_speed_m_per_s: float,
         joined_by: PathJoin = "rounded_lines",
     ) -> FingerMotion:
-        """Return the motion that follows a new path from the time `at_s` of this motion on.
+        """Return the motion that follows a new path, starting at the time `at_s` of this motion.
 
         times_s, points: path of n times and points (n, 3), m.
 
         wander_m: standard deviation of the wander per axis.
-        tremor_m: amplitude of the tremor, that is sqrt(2) times its standard deviation per axis.
+        tremor_m: amplitude of the tremor, which is sqrt(2) times its standard deviation per axis.
 
         Raises FingerPathError if the path has no points, times that do not increase, or a speed
         above `max_speed_m_per_s`.
@@ -382,7 +393,9 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Return position and velocity (3,) without unsteadiness, and its two amplitudes (m)."""
+        """Return position (3,), m, and velocity (3,), m/s, without random deviations, and the
+        amplitudes of wander and tremor (m).
+        """
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))
             return position, velocity, self.amplitudes_m
@@ -397,7 +410,9 @@ class FingerMotion:
         return position, velocity, amplitudes
 
     def at(self, time_s: float) -> FingerState:
-        """Return the true state of the fingertip `time_s` after the path was given."""
+        """Return the true state of the fingertip at the time `time_s` after the path message
+        arrived.
+        """
         position, velocity, amplitudes = self._steady(time_s)
         _, share_rate = minimum_jerk_profile(min(max(time_s / self.ease_s, 0.0), 1.0))
         noises = ((self.wander, 1.0), (self.tremor, np.sqrt(0.5)))
@@ -420,7 +435,8 @@ class FingerMotion:
 def find_tremor_m(finger: FingerTruth | None, path_tremor_m: float) -> float:
     """Return the tremor amplitude (m) on a path.
 
-    The tremor of the apparatus, if any, replaces the amplitude of a path with tremor.
+    If the true parameters `finger` contain a tremor, it replaces the amplitude of a path with
+    tremor.
     """
     if finger is None or finger.tremor_rms_m is None or not path_tremor_m:
         return path_tremor_m
@@ -428,9 +444,10 @@ def find_tremor_m(finger: FingerTruth | None, path_tremor_m: float) -> float:
 
 
 def minimum_jerk_profile(s: Real) -> tuple[Real, Real]:
-    """Return the minimum-jerk profile and its derivative at s (Flash and Hogan 1985).
+    """Return the minimum-jerk position profile and its derivative at s (Flash and Hogan 1985).
 
-    s: fraction of the duration, 0 to 1; numbers or arrays. The profile rises from 0 to 1.
+    s: fraction of the duration, from 0 to 1, as a number or an array. The profile rises from 0 to
+        1.
     """
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2
 
@@ -442,7 +459,7 @@ def _reach(
 
     s: fraction of the duration, 0 at `start` and 1 at the first point of the path.
 
-    The effect of the initial velocity decays by the quintic Hermite function s (1-s)^3 (1+3s), so
+    The quintic Hermite function s (1-s)^3 (1+3s) makes the initial velocity decay. Therefore
     position and velocity are continuous.
     """
     share, slope = minimum_jerk_profile(s)

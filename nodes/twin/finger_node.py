@@ -1,7 +1,7 @@
 """Simulate the user's finger and the stereo camera that observes it.
 
-The apparatus holds the true parameters of the simulated hardware. The scene holds the parameters
-that the other nodes assume.
+The parameter `apparatus` contains the true parameters of the simulated hardware. The scene contains
+the parameters that the other nodes assume.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 JITTER_STREAM = 1
-"""The second element of the random seed for the jitter of exposure times, which makes the jitter
+"""The second element of the random seed for the jitter of exposure times. It makes the jitter
 independent of the image noise."""
 
 
@@ -73,7 +73,9 @@ class TwinFingerParameters(SimulatorParameters):
 
 
 class TwinFingerNode(Node):
-    """Move a simulated finger along its path, and render stereo images at the camera's rate."""
+    """A node that moves a simulated finger along its path, and renders stereo images at the
+    camera's rate.
+    """
 
     role: ClassVar[NodeRole | None] = NodeRole.FINGER_SIMULATOR
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame", "twin__arms"})
@@ -100,7 +102,7 @@ class TwinFingerNode(Node):
 
     @cached_property
     def has_scene(self) -> asyncio.Event:
-        """Return the event that is set when the first scene arrives."""
+        """Return an event, which is set when the first scene arrives."""
         return asyncio.Event()
 
     @classmethod
@@ -183,7 +185,9 @@ class TwinFingerNode(Node):
         return (at_ns - self.started_ns) * 1e-9
 
     def _voluntary(self, at_s: float) -> tuple[Floats, Floats]:
-        """Return position (3,), m, and velocity (3,), m/s, of a finger that touches nothing."""
+        """Return the position (3,), m, and velocity (3,), m/s, that the finger has if no force acts
+        on it.
+        """
         state = self.motion.at(at_s - self._seconds(self.motion_from_ns))
         return state.position, state.velocity
 
@@ -212,9 +216,10 @@ class TwinFingerNode(Node):
         return None if apparatus is None else apparatus.finger
 
     def _follow(self, path: FingerPath) -> None:
-        """Start to follow a path now.
+        """Start to follow a path immediately.
 
-        Raises FingerPathError, without any change, if the finger cannot follow the path.
+        Raises FingerPathError if the finger cannot follow the path. Then the current motion
+        continues.
         """
         now_ns = self.clock.now_ns()
         if self.coupled is not None and self.edges:
@@ -245,10 +250,11 @@ class TwinFingerNode(Node):
         )
 
     def expose(self, middle_ns: int) -> StereoPair:
-        """Render the image pair with timestamp `middle_ns`; publish the true finger at that time.
+        """Render the image pair with the timestamp `middle_ns`, and publish the true finger
+        position.
 
-        The actual exposure time differs from `middle_ns` by the timestamp error of the apparatus.
-        Call this method only after a scene has been received.
+        The actual exposure time differs from `middle_ns` by the timestamp error in the parameter
+        `apparatus`. This method must be called after a scene was received.
         """
         assert self.camera is not None
         exposed_ns = middle_ns + self._stamp_error_ns()
@@ -280,7 +286,9 @@ class TwinFingerNode(Node):
         )
 
     def _track(self, exposed_ns: int) -> Callable[[float], Floats]:
-        """Return a function from the time (s) since mid-exposure to the fingertip position (3,)."""
+        """Return a function that maps the time (s) since mid-exposure to the fingertip position
+        (3,), m.
+        """
         if self.coupled is None:
             return lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position
         seen = self.truth(exposed_ns)
@@ -310,7 +318,7 @@ class TwinFingerNode(Node):
 
     @property
     def _max_late_ns(self) -> int:
-        """Return the maximum delay (ns) of an exposure's start without missing the frame.
+        """Return the maximum delay (ns) of an exposure's start up to which the frame is not missed.
 
         An exposure may overlap the read-out of the previous frame.
         """

@@ -1,14 +1,14 @@
 """Apply the hysteresis and creep of rubber to the force of the simulated elastic sheet.
 
 Creep follows quasi-linear viscoelasticity (Fung, Biomechanics, 1981). The force is the sum of all
-past changes of the elastic force, each multiplied by a relaxation function of its age. The function
-is a sum of exponentials with one time constant per decade of time. The force therefore falls by a
-constant fraction per decade. The function is one at the age `REFERENCE_S`, at which the modulus is
-measured.
+past changes of the elastic force. Each change is multiplied by a relaxation function of its age.
+The function is a sum of exponentials with one time constant per decade of time. Therefore the force
+decreases by a constant fraction per decade. The function is one at the age `REFERENCE_S`, at which
+the modulus is measured.
 
-Hysteresis does not depend on the rate. It multiplies the force by 1 + h while the elastic force
-rises, and by 1 - h while it falls. After a reversal the factor changes gradually, over a relative
-change of the force by `REVERSAL_RATIO`.
+Hysteresis does not depend on the rate of change. It multiplies the force by 1 + h while the elastic
+force increases, and by 1 - h while it decreases. After a reversal, the factor changes gradually,
+while the force changes by the fraction `REVERSAL_RATIO`.
 """
 
 from __future__ import annotations
@@ -22,24 +22,26 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.nodes.arrays import Floats
 
 REFERENCE_S = 1.0
-"""The age of a force at which the relaxation function is one."""
+"""The age (s) of a change of the force at which the relaxation function is one."""
 
 TIME_CONSTANTS_S = 10.0 ** np.arange(-1.0, 4.0)
-"""The time constants of the relaxation function; forces relax from about 50 ms to some hours."""
+"""The time constants (s) of the relaxation function. With them, forces relax from about 50 ms to
+some hours."""
 
 REVERSAL_RATIO = 0.1
-"""The relative change of the elastic force after a reversal in which the hysteresis factor's
-distance from its new value falls to 1/e."""
+"""The relative change of the elastic force, after a reversal, in which the deviation of the
+hysteresis factor from its new value decreases to 1/e."""
 
 MIN_FORCE_N = 1e-3
 """The minimum elastic force (N) whose changes can reverse the hysteresis."""
 
 CREEP_LOSS_RATIO = math.pi**2 / (4.0 * math.log(10.0))
-"""The fraction of the energy that a load cycle loses by creep, divided by the creep per decade."""
+"""The fraction of the energy that a load cycle loses by creep, divided by the relative creep per
+decade."""
 
 MOVING_IN_S, TURNING_RATIO = 1.0, 1.25
 """The time (s) in which the force of a push rises to the evaluated force, and the ratio of the
-maximum force, at which the finger reverses, to the evaluated force."""
+maximum force to the evaluated force. The finger reverses at the maximum force."""
 
 
 class ForceHistory:
@@ -61,7 +63,8 @@ class ForceHistory:
 
     @classmethod
     def of(cls, apparatus: Apparatus | None) -> Self | None:
-        """Make the history for the sheet of an apparatus (true hardware parameters).
+        """Make the force history for the sheet of an apparatus (the true parameters of the
+        hardware).
 
         Return None if the sheet has neither hysteresis nor creep.
         """
@@ -108,16 +111,18 @@ class ForceHistory:
 
 
 def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> Floats:
-    """Return forces (n,), in N, with hysteresis and creep for elastic forces (n,) at times (n,)."""
+    """Return forces (n,), N, with hysteresis and creep, for elastic forces (n,) at times (n,)."""
     return np.array(
         [history.update(float(t), float(f)) for t, f in zip(times_s, elastic_n, strict=True)]
     )
 
 
 def compute_history_ratios(apparatus: Apparatus) -> Floats:
-    """Return the force ratios (2,) of rubber to an elastic sheet, for loading and unloading.
+    """Return the ratios (2,) of the force of rubber to that of an elastic sheet, for loading and
+    unloading.
 
-    The elastic force rises linearly to `TURNING_RATIO` times the evaluated force and falls again.
+    The elastic force increases linearly to `TURNING_RATIO` times the evaluated force, and decreases
+    again.
     """
     history = ForceHistory.of(apparatus)
     if history is None:

@@ -1,7 +1,7 @@
 """Simulate a force gauge between the finger and the simulated sheet.
 
-The apparatus holds the true parameters of the simulated hardware. The scene holds the parameters
-that the other nodes assume.
+The parameter `apparatus` contains the true parameters of the simulated hardware. The scene contains
+the parameters that the other nodes assume.
 """
 
 from __future__ import annotations
@@ -27,13 +27,16 @@ from flexsheet.nodes.twin.sheet_surface import make_edge_plane
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 CELLS = 12
-"""The number of cells per side of the mesh. With 32 cells, the force differs by 1 %."""
+"""The number of finite elements along each side of the sheet. With 32 elements, the force differs
+by 1 %."""
 
 STATED_STANDARD_DEVIATION_N = 0.02
-"""The standard uncertainty in the gauge's data sheet, which the node publishes with each force."""
+"""The standard uncertainty of the force (N) according to the gauge's data sheet. The node publishes
+this value with each force."""
 
 GAUGE_STREAM = 3
-"""The second element of the random seed, which makes the gauge's noise independent."""
+"""The second element of the gauge's random seed. It makes the noise independent of other simulated
+noise."""
 
 
 class TwinGaugeParameters(SimulatorParameters):
@@ -48,7 +51,9 @@ class TwinGaugeParameters(SimulatorParameters):
 
 
 class TrueSheetForce:
-    """The force of the simulated sheet on the finger, along the sheet's normal."""
+    """A computation of the true force that the simulated sheet exerts on the finger, along the
+    sheet's normal.
+    """
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
         true_scene = apply_apparatus(scene, apparatus)
@@ -62,9 +67,10 @@ class TrueSheetForce:
         ]
 
     def compute_n(self, time_s: float, tip: Floats, left: Floats, right: Floats) -> float:
-        """Return the normal force (N) for a fingertip and poses of the flanges (last arm links).
+        """Return the normal force (N) of the sheet on a fingertip.
 
-        tip: position (3,), m. left, right: poses (4, 4). time_s must not decrease between calls.
+        time_s: time, which must not decrease between calls. tip (3,): position of the fingertip, m.
+        left, right (4, 4): poses of the arms' flanges.
         """
         edges = left @ self._clamps[0], right @ self._clamps[1]
         plane = make_edge_plane(*edges)
@@ -84,7 +90,7 @@ class TrueSheetForce:
 
 @dataclass(slots=True)
 class GaugeErrors:
-    """The gain, offset and noise of the simulated gauge."""
+    """The measurement errors of the simulated gauge: gain, offset and noise."""
 
     truth: GaugeTruth
     random: np.random.Generator
@@ -95,7 +101,7 @@ class GaugeErrors:
 
 
 class TwinGauge(Node):
-    """Publish the readings of a simulated force gauge at the fingertip."""
+    """A node that publishes the readings of a simulated force gauge at the fingertip."""
 
     parameters: TwinGaugeParameters
     scene: Input[Scene]

@@ -1,29 +1,29 @@
-"""Generate typical finger gestures on an object; each is a function of the scene and a random seed.
+"""Generate typical finger gestures on an object, as functions of a scene and a random seed.
 
 The gestures follow published measurements of human motion:
 
 - A reach has a bell-shaped speed profile, of the same shape for all distances and durations
-  (Atkeson and Hollerbach 1985, J. Neurosci. 5:2318). It is the profile of minimum jerk (Flash and
-  Hogan 1985, J. Neurosci. 5:1688). Its peak speed is 1.875 times the mean, its maximum acceleration
-  5.77 distance / duration^2.
-- Unhurried reaches have peak speeds of 0.2-0.35 m/s (REACH+, which plans for them). Hurried elbow
-  flexions of 27-45 degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav. 14:341), so
-  the braking half takes 50-80 ms.
+    (Atkeson and Hollerbach 1985, J. Neurosci. 5:2318). It is the profile of minimum jerk (Flash and
+    Hogan 1985, J. Neurosci. 5:1688). Its peak speed is 1.875 times the mean speed. Its maximum
+    acceleration is 5.77 distance / duration^2.
+- Unhurried reaches have peak speeds of 0.2-0.35 m/s (REACH+). Hurried elbow flexions of 27-45
+    degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav. 14:341). The deceleration
+    takes half of this time, 50-80 ms.
 - People explore a surface at 77-86 mm/s on average (Smith, Gosselin and Houde 2002, Exp. Brain Res.
-  147:209).
+    147:209).
 - In typing, the interval between taps is 150-500 ms (Angelaki and Soechting 1993, Exp. Brain Res.
-  95:319). Hurried taps follow in 170-200 ms, 50-60 in ten seconds (finger tapping test of the
-  Halstead Reitan battery). Contact is assumed to last 100-200 ms of an unhurried tap and about half
-  of a hurried one; there is no source for soft objects.
+    95:319). In hurried tapping, the interval is 170-200 ms, which gives 50-60 taps in ten seconds
+    (finger tapping test of the Halstead Reitan battery). The contact is assumed to last 100-200 ms
+    of an unhurried tap, and about half of a hurried tap. There is no source for soft objects.
 - After a signal to stop a reach, people need 206 ms on average to react (Mirabella, Pani, Pare and
-  Ferraina 2006, Exp. Brain Res. 174:240). A stop is therefore sudden for an observer only.
+    Ferraina 2006, Exp. Brain Res. 174:240). Therefore a stop is sudden only for an observer.
 - Ellipses and similar figures are drawn more slowly where they are more curved, as in harmonic
-  motion (Richardson and Flash 2002, J. Neurosci. 22:8201).
+    motion (Richardson and Flash 2002, J. Neurosci. 22:8201).
 - Physiological tremor peaks at 6-12 Hz (Lakie et al. 2015, J. Physiol. 593:4411). Its amplitude is
-  0.03 mm with the hand at rest, 0.06 mm with the hand held out, and 0.12 to 0.15 mm with the arm
-  held out (Growdon et al. 2000, Electromyogr. Clin. Neurophysiol. 40:295).
-- Most of the motion of a finger that is held still is slower, 1-3.5 Hz and below (Carignan,
-  Daneault and Duval 2009, Exp. Brain Res. 201:299). It is called wander here.
+    0.03 mm with the hand at rest, 0.06 mm with the hand held out, and 0.12 to 0.15 mm with the arm
+    held out (Growdon et al. 2000, Electromyogr. Clin. Neurophysiol. 40:295).
+- Most of the motion of a finger at rest has frequencies of 1-3.5 Hz and below (Carignan, Daneault
+    and Duval 2009, Exp. Brain Res. 201:299). This motion is called wander in this package.
 
 Surface positions (along, arc, height) are defined in `paths.py`.
 """
@@ -43,7 +43,7 @@ from flexsheet.nodes.twin.finger import minimum_jerk_profile
 from flexsheet.nodes.twin.paths import map_to_surface, place_path, touchable
 
 Sampled = tuple[Floats, Floats]
-"""Times (n,), s, from zero, and surface positions (n, 3) or distances (n,), m, at these times."""
+"""A sampled motion: times (n,), s, from zero, and surface positions (n, 3) or distances (n,), m."""
 
 SAMPLE_S = 0.004
 WANDER_M = 0.0005
@@ -54,10 +54,10 @@ HOVER_M = 0.04
 APPROACH_S = 0.8
 REST_S = 0.3
 TOUCH_M = 0.001
-"""The depth below the surface of a light touch."""
+"""The depth of a light touch below the surface, m."""
 
 PRESS_M = 0.002
-"""The depth below the surface of a tap."""
+"""The depth of a tap below the surface, m."""
 
 EXPLORE_M_PER_S = 0.086
 REACH_PEAK_M_PER_S = 0.35
@@ -71,11 +71,11 @@ class Gesture(Protocol):
 
 
 def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> Sampled:
-    """Sample a sequence of minimum-jerk reaches.
+    """Sample a sequence of motions with minimum jerk, each from one position to the next.
 
     start: first position (3,), m.
-    moves: pairs of a duration (s) and the next position (3,), m. A move to the present position is
-    a rest.
+    moves: pairs of a duration (s) and the next position (3,), m. During a move to the current
+        position, the finger rests.
     """
     corners = np.array([start, *(place for _, place in moves)])
     ends = np.cumsum([0.0, *(duration for duration, _ in moves)])
@@ -89,7 +89,7 @@ def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> 
 def integrate_speed_profile(phases: Sequence[tuple[float, float]]) -> Sampled:
     """Sample the distance (n,), m, that a finger covers while its speed changes in phases.
 
-    phases: pairs of a duration (s) and the speed at the end of the phase (m/s); the finger starts
+    phases: pairs of a duration (s) and the speed (m/s) at the end of the phase. The finger starts
     at rest. The speed follows the minimum-jerk profile, which makes the acceleration continuous.
     """
     durations = np.array([duration for duration, _ in phases])
@@ -109,7 +109,7 @@ def _sampled_times(duration_s: float) -> Floats:
 
 
 def touched(motion: Sampled) -> Sampled:
-    """Extend a motion on the surface by an approach from above, short rests and a lift."""
+    """Add an approach from above, short rests and a lift to a motion on the surface."""
     times, places = motion
     first, last = places[0], places[-1]
     above_first, above_last = (np.array([*place[:2], HOVER_M]) for place in (first, last))
@@ -129,13 +129,15 @@ def _on_surface(scene: Scene, label: str, motion: Sampled) -> FingerPath:
 
 
 def hold(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Touch the object lightly and hold still for 5 s; `seed` has no effect."""
+    """Touch the object lightly, and hold the finger still for 5 s. The argument `seed` has no
+    effect.
+    """
     touch = (0.0, 0.0, -TOUCH_M)
     return _on_surface(scene, "hold", minimum_jerk(touch, [(5.0, touch)]))
 
 
 def hover(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Hold the finger still in the air for 5 s, with the large tremor of an arm held out."""
+    """Hold the finger still in the air for 5 s, with the large tremor of an extended arm."""
     place = (0.0, 0.0, 0.5 * HOVER_M)
     times, places = minimum_jerk(place, [(5.0, place)])
     return place_path(scene, "hover", times, places, wander_m=WANDER_M, tremor_m=TREMOR_ARM_M)
@@ -161,12 +163,12 @@ def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed:
 
 
 def reach(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Reach to and from the object at normal speed, with rests of 0.4 s."""
+    """Move the finger to the object and back at normal speed, with rests of 0.4 s."""
     return _reaches(scene, "reach", REACH_PEAK_M_PER_S, 0.4, seed)
 
 
 def reach_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Reach to and from the object in a hurry, with rests of 0.1 s."""
+    """Move the finger to the object and back at high speed, with rests of 0.1 s."""
     return _reaches(scene, "reach-fast", 3.0 * REACH_PEAK_M_PER_S, 0.1, seed)
 
 
@@ -180,10 +182,10 @@ def _taps(
     lift_m: float,
     seed: int,
 ) -> FingerPath:
-    """Tap `count` times at about the same position; intervals vary by 5 %, positions by 2 mm.
+    """Tap `count` times near one position. The intervals vary by 5 %, and the positions by 2 mm.
 
-    A tap is a reach from `lift_m` above the surface to PRESS_M below the surface, a rest there, and
-    a reach back. The finger does not brake before contact, and is below the surface for `contact_s`
+    A tap is a motion from `lift_m` above the surface to PRESS_M below the surface, a rest, and a
+    motion back. The finger does not brake before contact, and is below the surface for `contact_s`
     of each interval `every_s`.
     """
     generator = np.random.default_rng(seed)
@@ -215,13 +217,15 @@ def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _arc_run(scene: Scene) -> tuple[float, float]:
-    """Return half the arc length (m) of a stroke around the surface, and its speed (m/s)."""
+    """Return half the arc length (m) of a stroke around the surface, and the speed (m/s) of the
+    stroke.
+    """
     half = 0.5 * touchable(scene)[1]
     return half, min(scene.working_range.speed_m_per_s, half / 0.3)
 
 
 def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Stroke around the surface and stop suddenly, at half length and at the end of each stroke.
+    """Stroke around the surface, and stop suddenly in the middle and at the end of each stroke.
 
     There are three strokes in each direction.
     """
@@ -237,7 +241,7 @@ def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Stroke back and forth around the surface; reverse suddenly at unpredictable times."""
+    """Stroke back and forth around the surface, and reverse suddenly at random times."""
     half, speed = _arc_run(scene)
     generator = np.random.default_rng(seed)
     turn_s = 2.0 * BRAKE_S
@@ -271,19 +275,22 @@ def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _rounds(turns: int, turn_s: float) -> Sampled:
-    """Sample the angle (n,), rad, of a number of turns on a closed figure, from rest to rest."""
+    """Sample the angle (n,), rad, of a motion around a closed figure that starts and ends at rest.
+
+    turns: number of revolutions. turn_s: duration of one revolution.
+    """
     pace = 2.0 * np.pi / turn_s
     ramp_s = 0.25 * turn_s
     return integrate_speed_profile([(ramp_s, pace), (turns * turn_s - ramp_s, pace), (ramp_s, 0.0)])
 
 
 def _drawing_m(scene: Scene) -> float:
-    """Return the radius (m) of a figure that fits the part of the surface that can be stroked."""
+    """Return the radius (m) of a figure that fits in the touchable part of the surface."""
     return min(0.02, *(0.5 * size for size in touchable(scene)))
 
 
 def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Draw four circles on the surface, at the speed at which people explore a surface."""
+    """Move along four circles on the surface, at the speed at which people explore a surface."""
     radius = _drawing_m(scene)
     times, angle = _rounds(4, 2.0 * np.pi * radius / EXPLORE_M_PER_S)
     places = np.stack(
@@ -293,7 +300,7 @@ def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Draw three figures of eight on the surface, more slowly where they are curved."""
+    """Move along three figures of eight on the surface, more slowly where they are curved."""
     radius = _drawing_m(scene)
     # The length of the figure, integrated numerically, is 6.1 radii.
     times, angle = _rounds(3, 6.1 * radius / EXPLORE_M_PER_S)
@@ -305,7 +312,9 @@ def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _pressing(arcs: Floats, depth_m: float) -> Floats:
-    """Return surface positions (n, 3), m, at arc lengths (n,) and the depth `depth_m`."""
+    """Return surface positions (n, 3), m, at arc lengths (n,), m, and a constant depth below the
+    surface.
+    """
     return np.stack([np.zeros(len(arcs)), arcs, np.full(len(arcs), -depth_m)], axis=1)
 
 
@@ -322,4 +331,4 @@ GESTURES: dict[str, Gesture] = {
     "circle": circle,
     "eight": eight,
 }
-"""All gestures by the label of their path."""
+"""The gesture functions, by the label of the path that they generate."""

@@ -1,12 +1,13 @@
-"""Simulate the hand behind the finger: a mass on a spring and a damper, pushed by the sheet.
+"""Simulate the hand behind the finger as a mass with a spring and a damper, on which the sheet
+acts.
 
-Without contact, the finger follows its voluntary path exactly. The force F of the sheet moves it by
-a deviation e from this path, for mass m, damping b and stiffness k of the hand at the fingertip:
+Without contact, the finger follows its voluntary path exactly. The force F of the sheet causes a
+deviation e from this path. The hand at the fingertip has the mass m, damping b and stiffness k:
 
     m e'' + b e' + k e = F(path + e)
 
-F acts along the sheet's normal. Friction forces along the sheet are neglected. In each step F is
-constant, evaluated at the centre of the step; the linear equation is solved exactly.
+F acts along the sheet's normal. Friction forces along the sheet are neglected. In each step, F is
+constant and is evaluated at the centre of the step. The linear equation is solved exactly.
 """
 
 from __future__ import annotations
@@ -28,16 +29,18 @@ from flexsheet.nodes.twin.sheet_reaction import SheetReaction
 from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface, make_edge_plane
 
 VoluntaryPath = Callable[[float], tuple[Floats, Floats]]
-"""A function from a time (s) to the voluntary position (3,), m, and velocity (3,), m/s."""
+"""A function that returns the voluntary position (3,), m, and velocity (3,), m/s, at a time (s)."""
 
 Edges = Callable[[float], tuple[Floats, Floats]]
-"""A function from a time (s) to the poses (4, 4) of the sheet's left and right edge."""
+"""A function that returns the poses (4, 4) of the sheet's left and right edges at a time (s)."""
 
 STEP_S = 0.0005
-"""The maximum time step of the normal motion: a tenth of a radian of the fastest oscillation."""
+"""The maximum time step of the motion along the sheet's normal. The fastest oscillation advances by
+a tenth of a radian in this time."""
 
 INTERVAL_S = 0.004
-"""The maximum interval over which the voluntary path and the sheet are interpolated."""
+"""The maximum interval (s) over which the voluntary path and the sheet's force curves are
+interpolated."""
 
 NEAR_M = 0.005
 """The maximum distance (m) of the finger from the sheet at which a force is computed."""
@@ -52,10 +55,10 @@ UP = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class HandImpedance:
-    """The mechanical impedance of a hand at the fingertip, equal in all directions.
+    """The mechanical impedance of a hand at the fingertip, which is equal in all directions.
 
-    The default is a finger whose wrist moves too. Its natural frequency in the air is 5 Hz (Lakie
-    et al. 2015: 6 to 12 Hz with less mass).
+    The default values are those of a finger that moves together with the wrist. Their natural
+    frequency without contact is 5 Hz (Lakie et al. 2015: 6 to 12 Hz with less mass).
     """
 
     mass_kg: float = 0.15
@@ -64,9 +67,10 @@ class HandImpedance:
 
     @classmethod
     def of(cls, apparatus: Apparatus | None) -> Self:
-        """Return the impedance in an apparatus (true hardware parameters).
+        """Return the hand impedance from an apparatus (the true parameters of the simulated
+        hardware).
 
-        Return the default if the apparatus states no impedance.
+        Return the default if the apparatus contains no impedance.
         """
         finger = None if apparatus is None else apparatus.finger
         if finger is None or finger.hand_mass_kg is None:
@@ -78,7 +82,8 @@ class HandImpedance:
     def transition(self, step_s: float) -> tuple[float, float, float, float]:
         """Return the transition matrix (2, 2) of the free motion over `step_s`, row by row.
 
-        The matrix maps the deviation (m) and its rate (m/s) to their values one step later.
+        The matrix maps the deviation (m) from the voluntary path, and its rate (m/s), to the values
+        after the step.
         """
         pace = math.sqrt(self.stiffness_n_per_m / self.mass_kg)
         decay = self.damping_ratio * pace
@@ -95,8 +100,9 @@ class HandImpedance:
 class Touch:
     """The local state of the sheet below the finger at one time.
 
-    origin: point (3,) of the unloaded sheet's tangent plane. normal: (3,) towards the user.
-    curve_n: normal forces (d,) at the depths in the force table `SheetReaction`.
+    origin (3,): point of the unloaded sheet's tangent plane, m. normal (3,): its unit normal
+        towards the user.
+    curve_n (d,): normal forces at the depths in the force table `SheetReaction`.
     """
 
     origin: Floats
@@ -105,7 +111,9 @@ class Touch:
 
 
 class TrueSheet:
-    """The force of the simulated sheet on the finger, for given poses of its edges."""
+    """A model of the force that the simulated sheet exerts on the finger, for given poses of the
+    sheet's edges.
+    """
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None, reaction: SheetReaction) -> None:
         self.step_m = float(reaction.depths_m[1])
@@ -113,7 +121,7 @@ class TrueSheet:
         self._reaction, self._surface = reaction, SheetSurface.of(scene, apparatus)
 
     def find_touch(self, edges: tuple[Floats, Floats], tip: Floats) -> Touch:
-        """Return point, normal and force curve of the sheet nearest to the fingertip.
+        """Return the sheet's tangent plane and force curve at the point nearest to the fingertip.
 
         edges: poses (4, 4) of the left and right edges. tip: world position (3,), m.
         """
@@ -134,7 +142,9 @@ class TrueSheet:
 
 
 class EdgeTrack:
-    """The poses of the sheet's edges as a linear function of time, from the last two samples."""
+    """A predictor of the poses of the sheet's edges. It extrapolates the last two samples
+    linearly.
+    """
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, Floats]] = []
@@ -151,7 +161,9 @@ class EdgeTrack:
         return len(self._samples) == 2
 
     def __call__(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return the poses (4, 4) of both edges, extrapolated by at most MAX_EXTRAPOLATION_S."""
+        """Return the poses (4, 4) of both edges at a time (s), extrapolated by at most
+        MAX_EXTRAPOLATION_S.
+        """
         (before_s, before), (after_s, after) = self._samples
         at_s = min(max(time_s, before_s), after_s + MAX_EXTRAPOLATION_S)
         left, right = after + (at_s - after_s) / (after_s - before_s) * (after - before)
@@ -159,11 +171,12 @@ class EdgeTrack:
 
 
 class CoupledFinger:
-    """The deviation of the finger from its voluntary path, integrated over time.
+    """A simulation of the finger's deviation from its voluntary path due to the force of the sheet.
 
-    path: voluntary motion, which may be replaced at any time. deviation_m, rate_m_per_s: (3,).
-    force_n: (3,) force of the sheet on the finger, mean over the last interval.
-    log: rows (time s, indentation m, force N) of each step; None: not recorded.
+    path: voluntary motion, which may be replaced at any time.
+    deviation_m, rate_m_per_s (3,): deviation and its rate of change.
+    force_n (3,): force of the sheet on the finger, averaged over the last interval.
+    log: rows (time in s, indentation in m, force in N) of all steps; None if they are not recorded.
     """
 
     def __init__(self, impedance: HandImpedance, sheet: TrueSheet, path: VoluntaryPath) -> None:
@@ -175,10 +188,10 @@ class CoupledFinger:
         self._ratio, self._remembers = 1.0, sheet.history is not None
 
     def predict(self, time_s: float, edges: Edges) -> CoupledFinger:
-        """Return a copy of the finger that is advanced to `time_s`.
+        """Return a copy of this simulation that is advanced to `time_s`.
 
-        The finger itself is advanced only to MAX_PREDICTION_S before this time, which has an effect
-        only if no poses of the edges arrive.
+        This simulation itself is advanced only to MAX_PREDICTION_S before `time_s`. This has an
+        effect only if no poses of the edges arrive.
         """
         self.advance(time_s - MAX_PREDICTION_S, edges)
         ahead = copy(self)
@@ -187,12 +200,16 @@ class CoupledFinger:
         return ahead
 
     def position(self) -> tuple[Floats, Floats]:
-        """Return position (m) and velocity (m/s), each (3,), at `time_s`."""
+        """Return the position (3,), m, and velocity (3,), m/s, of the fingertip at the current
+        simulation time.
+        """
         position, velocity = self.path(self.time_s)
         return position + self.deviation_m, velocity + self.rate_m_per_s
 
     def advance(self, until_s: float, edges: Edges) -> None:
-        """Integrate the motion until a time; an earlier time has no effect."""
+        """Integrate the motion until the time `until_s`. A time before the current simulation time
+        has no effect.
+        """
         span_s = until_s - self.time_s
         if span_s <= 0.0:
             return

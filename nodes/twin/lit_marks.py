@@ -1,6 +1,6 @@
-"""Compute the points of the simulated sheet that the projected check marks light.
+"""Compute the points of the simulated sheet that the projected check marks illuminate.
 
-The stereo camera sees these points. True parameters are those of the simulated hardware.
+The simulated stereo camera sees these points. "True" refers to the simulated hardware.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from flexsheet.nodes.twin.sheet_surface import make_edge_plane
 from flexsheet.nodes.twin.truth import find_display_delay_s
 
 CELLS = 8
-"""The number of cells per side of the sheet's mesh, which is solved in 0.15 s."""
+"""The number of finite elements along each side of the sheet. The solution takes 0.15 s."""
 
 SOLVE_PERIOD_NS = 500_000_000
 """The minimum time (ns) between two solutions of the sheet's shape."""
 
 MAX_FINGER_MOTION_M = 5e-4
-"""The maximum motion of a pushing finger since the last solution of the sheet's shape. After a
-larger motion the shape is unknown, and no marks are drawn."""
+"""The maximum motion (m) of a pushing finger since the last solution of the sheet's shape. After a
+larger motion, the shape is unknown, and no marks are drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,16 +49,16 @@ class _Heights:
 
 
 class LitMarks:
-    """The points of the simulated sheet that the projected marks light.
+    """A computation of the points of the simulated sheet that the projected marks illuminate.
 
-    The sheet moves with the true arms. Its deflection by the finger and by its weight is solved in
-    the background.
+    The sheet moves with the simulated arms. The deflection of the sheet by the finger and by its
+    weight is computed in a background thread.
     """
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
-        """Store the true devices.
+        """Store the parameters of the simulated devices.
 
-        scene: scene with the true devices. apparatus: deviations of the devices from the scene that
+        scene: scene with these parameters. apparatus: deviations of the devices from the scene that
         the nodes assume.
         """
         self._scene, self._apparatus = scene, apparatus
@@ -75,20 +75,20 @@ class LitMarks:
         self._worker.shutdown(cancel_futures=True)
 
     def settle(self) -> None:
-        """Wait until a running solution of the sheet's shape is finished."""
+        """Wait until a running computation of the sheet's shape is finished."""
         if self._solving is not None:
             self._solving.exception()
 
     def on_frame(self, frame: Frame) -> None:
-        """Add a frame, which the projector shows until the next frame."""
+        """Store the check marks of a frame, which the projector shows until the next frame."""
         if frame.light_ns and len(frame.marks_px):
             late_ns = round(1e9 * find_display_delay_s(frame, self._apparatus))
             self._frames.append((frame.light_ns + late_ns, frame.marks_px))
 
     def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
-        """Return the lit world points (n, 3), m, at `at_ns`; empty if the points are unknown.
+        """Return the illuminated points (n, 3), world frame, m, at the time `at_ns`.
 
-        finger: position (3,) of the fingertip.
+        The result is empty if the points are unknown. finger (3,): position of the fingertip, m.
         """
         shown = [pixels for light_ns, pixels in self._frames if light_ns <= at_ns]
         if not shown:

@@ -1,17 +1,18 @@
-"""Solve the simulated sheet: a finite-element membrane between two clamps, pushed by a finger.
+"""Compute the simulated sheet as a finite-element membrane between two clamps, which a finger
+pushes.
 
 The material is incompressible neo-Hookean rubber in plane stress. Its energy per volume is W = mu/2
-(I1 - 3), where I1 is the first strain invariant and mu = E/3 the shear modulus. A membrane has no
-bending stiffness and would buckle into ever finer wrinkles. Where W would give compression, the
-energy of a tension field replaces it (Pipkin, IMA J. Appl. Math. 36, 1986): the stress is uniaxial
-along the wrinkles, zero across them, and zero where the sheet is slack. This relaxed energy is
-convex in the strain, so Newton's method with a line search finds its minimum.
+(I1 - 3), where I1 is the first strain invariant and mu = E/3 is the shear modulus. A membrane has
+no bending stiffness, so it would buckle into infinitely fine wrinkles. Where W would give
+compression, the energy of a tension field is used instead (Pipkin, IMA J. Appl. Math. 36, 1986).
+The stress is uniaxial along the wrinkles, zero across them, and zero where the sheet is slack. This
+relaxed energy is convex in the strain, so Newton's method with a line search finds its minimum.
 
 The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points). They differ from the
-elements of the renderer, which this module serves to test. The mesh is finer around the finger.
-Gravity acts on the sheet. The fingertip is a rigid sphere that is pushed in along the sheet's
-normal, in steps. A stiff penalty force keeps the sheet outside the sphere. Touched nodes stick to
-the sphere unless the limit of Coulomb friction is exceeded.
+elements of the renderer, because this module is used to test the renderer. The mesh is finer around
+the finger. Gravity acts on the sheet. The fingertip is a rigid sphere that is moved into the sheet
+along the sheet's normal, in steps. A stiff penalty force keeps the sheet outside the sphere.
+Touched nodes stick to the sphere unless the limit of Coulomb friction is exceeded.
 """
 
 from __future__ import annotations
@@ -29,25 +30,29 @@ from flexsheet.nodes.arrays import Bools, Floats
 Indices = NDArray[np.intp]
 
 CELLS = 32
-"""The number of intervals between nodes along each side; an element spans two of them."""
+"""The number of intervals between nodes along each side of the sheet. An element spans two
+intervals."""
 MIN_CELL_FRACTION = 0.008
-"""The distance between nodes under the finger, as a fraction of the side: 1.9 mm of 240 mm."""
+"""The distance between nodes under the finger, divided by the length of the side. It is 1.9 mm for
+240 mm."""
 
 SLACK_TENSION = 2e-4
 """The isotropic tension that is added everywhere, in units of the shear modulus. Without this
 tension, the equilibrium of slack and wrinkled regions would not be unique."""
 
 CONTACT_PA_PER_M = 1e10
-"""The contact pressure per penetration depth, Pa/m; a force of 10 N on 1 cm2 penetrates 0.01 mm."""
+"""The contact pressure per penetration depth, Pa/m. With it, a force of 10 N on 1 cm2 penetrates
+0.01 mm."""
 
 MAX_STEP_RADII = 0.7
-"""The maximum advance of the finger per step, in radii; a longer step could cross the sheet."""
+"""The maximum advance of the finger per step, in finger radii. A longer step could cross the
+sheet."""
 
 MAX_ITERATIONS = 80
 
 UNDAMPED_ROUNDS = 6
-"""The number of equilibria per finger step after each of which changes of the friction forces are
-halved once more, because they may alternate."""
+"""The number of equilibria in one finger step after which the applied changes of the friction
+forces are halved again. Without this damping, the changes may alternate."""
 
 MAX_FRICTION_ROUNDS = 30
 """The maximum number of equilibria that are solved per finger step while nodes slip."""
@@ -59,7 +64,7 @@ GRAVITY_M_PER_S2 = np.array([0.0, -9.81, 0.0])
 
 
 class NotConvergedError(FlexsheetError, RuntimeError):
-    """The error that is raised if the equilibrium of the membrane is not found."""
+    """Raised if the iteration for the membrane's equilibrium does not converge."""
 
     code = "membrane"
     remedy = "Reduce the depth of the push: the simulated membrane has no solution for it."
@@ -69,7 +74,8 @@ class NotConvergedError(FlexsheetError, RuntimeError):
 class TrueRubber:
     """The dimensions and material of the simulated sheet at rest.
 
-    width_m: free length between the clamps of the unstretched sheet; height_m: length along them.
+    width_m: free length of the unstretched sheet between the clamps. height_m: length along the
+        clamps.
     density_kg_per_m3: 0 for a sheet without weight.
     thickness_gradient: relative change of the thickness from the left to the right clamp, and from
         the lower to the upper end of the clamps.
@@ -87,10 +93,10 @@ class TrueRubber:
 class DeformedSheet:
     """The equilibrium of the sheet.
 
-    rest_m: (rows, columns, 2) node positions at rest, measured from the bottom left corner.
-    positions: (rows, columns, 3) node positions in the world frame.
-    finger_force_n: (3,) force that the sheet exerts on the finger.
-    left_force_n, right_force_n: (3,) forces that the sheet exerts on the clamps.
+    rest_m (rows, columns, 2): node positions at rest, measured from the bottom left corner, m.
+    positions (rows, columns, 3): node positions in the world frame, m.
+    finger_force_n (3,): force that the sheet exerts on the finger.
+    left_force_n, right_force_n (3,): forces that the sheet exerts on the clamps.
     iterations: total number of Newton steps.
     """
 
@@ -150,8 +156,8 @@ def _quadratic(t: Floats) -> tuple[Floats, Floats]:
 class _Mesh:
     """A rectangular finite-element mesh, which assembles the elastic forces and stiffness.
 
-    x, y: coordinates of the nodes. Element boundaries have even indices; nodes with odd indices
-    are midway between their neighbours.
+    x, y: coordinates of the nodes. Element boundaries have even indices. Nodes with odd indices are
+        midway between their neighbours.
     """
 
     def __init__(self, rubber: TrueRubber, x: Floats, y: Floats, slack_tension: float) -> None:
@@ -219,7 +225,7 @@ class _Mesh:
         return f, c
 
     def energy(self, positions: Floats) -> float:
-        """Return the elastic energy minus the work of gravity, J."""
+        """Return the elastic energy minus the work of gravity, J, for node positions (nodes, 3)."""
         _, c = self.deformation(positions)
         elastic = np.sum(self.weight * relaxed_energy(c, self.shear_modulus, self.slack_tension))
         return float(elastic - np.sum(self.load_n * positions))
@@ -254,7 +260,7 @@ class _Mesh:
     def matrix(self, stiffness: Floats, contact: Floats) -> scipy.sparse.csc_array:
         """Return the sparse stiffness matrix of the nodes that are not clamped.
 
-        contact: (nodes, 3, 3) contact stiffness, added to the diagonal blocks.
+        contact (nodes, 3, 3): contact stiffness, N/m, which is added to the diagonal blocks.
         """
         free = stiffness.ravel()[self._is_free]
         values = np.bincount(self._slot, free, minlength=len(self._unique))
@@ -269,9 +275,9 @@ class _Mesh:
 
 
 def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return both eigenvalues (...,) of C, larger first, and the larger's eigenvector (..., 2).
+    """Return the larger and the smaller eigenvalue (...,) of C, and a unit eigenvector (..., 2).
 
-    c: components (..., 3) = [C11, C22, C12]. The eigenvector has unit length.
+    The eigenvector is that of the larger eigenvalue. c: components [C11, C22, C12] (..., 3).
     """
     mean, half = 0.5 * (c[..., 0] + c[..., 1]), 0.5 * (c[..., 0] - c[..., 1])
     radius = np.hypot(half, c[..., 2])
@@ -280,9 +286,9 @@ def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION) -> Floats:
-    """Return the elastic energy (...,) per volume at rest, J/m3; wrinkles have no compression.
+    """Return the elastic energy (...,) per volume at rest, J/m3, of a membrane that wrinkles.
 
-    c: (..., 3) components [C11, C22, C12] of the right Cauchy-Green tensor.
+    c: components [C11, C22, C12] (..., 3) of the right Cauchy-Green tensor. shear_modulus: in Pa.
     """
     large, small, _ = _eigen(c)
     stretched = np.maximum(large, 1.0)
@@ -299,8 +305,8 @@ def relaxed_stress(
 ) -> tuple[Floats, Floats]:
     """Return the second Piola-Kirchhoff stress (..., 3) = [S11, S22, S12], Pa, and its tangent.
 
-    The stress is the derivative of `relaxed_energy` with respect to the Green strain
-    [E11, E22, 2 E12]. The tangent (..., 3, 3) is the derivative of the stress.
+    The stress is the derivative of `relaxed_energy` with respect to the Green strain [E11, E22, 2
+    E12]. The tangent (..., 3, 3), Pa, is the derivative of the stress.
     """
     large, small, along = _eigen(c)
     taut = small > np.maximum(large, 1.0) ** -0.5
@@ -337,9 +343,11 @@ def relaxed_stress(
 
 
 class _Finger:
-    """A fingertip as a rigid sphere: a penalty force keeps nodes outside, and touched nodes stick.
+    """A model of the fingertip as a rigid sphere, to which touched nodes stick.
 
-    stuck: (nodes,) whether a node sticks to the finger at its position in `anchor` (nodes, 3).
+    A penalty force acts on nodes inside the sphere.
+
+    stuck (nodes,): whether each node sticks to the finger at its position in `anchor` (nodes, 3).
     friction_coefficient: Coulomb coefficient; None if touched nodes never slip.
     """
 
@@ -366,7 +374,7 @@ class _Finger:
         return np.where(self._stuck, 0.0, np.maximum(self._radius - distance, 0.0)), outward
 
     def touching(self, positions: Floats) -> Bools:
-        """Return whether each node (nodes,) sticks to the finger or penetrates it."""
+        """Return whether each node sticks to the finger or penetrates it, as an array (nodes,)."""
         return self._stuck | (self._depth(positions)[0] > 0.0)
 
     def energy(self, positions: Floats) -> float:
@@ -379,8 +387,7 @@ class _Finger:
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
         """Return the gradient (nodes, 3) of `energy`, N, and a stiffness (nodes, 3, 3), N/m.
 
-        The stiffness omits the effect of the sphere's curvature, so the stiffness is never
-        negative.
+        The effect of the sphere's curvature is omitted. Therefore the stiffness is never negative.
         """
         depth, outward = self._depth(positions)
         pressed = np.where(depth > 0.0, self._stiffness, 0.0)
@@ -393,9 +400,10 @@ class _Finger:
     def release(self, positions: Floats, share: float) -> bool:
         """Release the nodes whose friction force exceeds the Coulomb limit, so that they slip.
 
-        Return whether forces changed; if so, a new equilibrium must be solved. The friction force
-        of a slipping node keeps its direction and becomes the coefficient times the normal force.
-        share: fraction (0 to 1) of the change of the friction forces that is applied.
+        Return whether forces changed. If they did, a new equilibrium must be computed. The friction
+        force of a slipping node is the friction coefficient times the normal force, and its
+        direction does not change. share: fraction (0 to 1) of the change of the friction forces
+        that is applied.
         """
         if self._coefficient is None:
             return False
@@ -427,11 +435,11 @@ def solve(
     friction_coefficient: float | None = None,
     cells: int = CELLS,
 ) -> DeformedSheet:
-    """Solve the equilibrium of the sheet between its edges, pushed by a fingertip.
+    """Compute the equilibrium of the sheet between its edges, with or without a pushing fingertip.
 
-    finger_tip: the point (3,), in m, of the fingertip sphere that is farthest from the user. There
-    is no contact if the point is None, in front of the sheet, or beside the sheet. The other
-    arguments and the errors are those of `solve_path`.
+    finger_tip: point (3,), m, of the fingertip sphere that is farthest from the user. There is no
+    contact if the point is None, in front of the sheet, or beside the sheet. The other arguments
+    and the errors are those of `solve_path`.
     """
     return solve_path(
         rubber,
@@ -455,19 +463,20 @@ def solve_path(
     cells: int = CELLS,
     slack_tension: float = SLACK_TENSION,
 ) -> list[DeformedSheet]:
-    """Solve the equilibria of the sheet while a fingertip advances through the given positions.
+    """Compute the equilibria of the sheet while a fingertip advances through the given positions.
 
     Return the sheet at each position, or only the untouched sheet if there are no positions.
 
-    world_from_left_edge, world_from_right_edge: (4, 4) poses of the clamped edges; the origin is
-    the centre of the edge, y points along it.
+    world_from_left_edge, world_from_right_edge: poses (4, 4) of the clamped edges. The origin is
+        the centre of the edge, and y points along the edge.
     finger_tips: positions (3,) on one normal of the sheet, sorted by depth.
-    friction_coefficient: Coulomb coefficient between finger and sheet; None: touched nodes stick.
-    cells: number of intervals between nodes along each side; even.
-    slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a barely
-    taut sheet, but the equilibrium of a slack sheet is then not found.
+    friction_coefficient: Coulomb coefficient between finger and sheet; None if touched nodes stick.
+    cells: number of intervals between nodes along each side, which must be even.
+    slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a sheet
+        with little tension. With it, the iteration for a slack sheet does not converge.
 
-    Raises NotConvergedError if no equilibrium is found, and ValueError if the edges coincide.
+    Raises NotConvergedError if an iteration does not converge, and ValueError if the edges
+    coincide.
     """
     left, right = world_from_left_edge, world_from_right_edge
     x_axis = right[:3, 3] - left[:3, 3]
@@ -564,7 +573,9 @@ def _describe(
 
 
 def _insert_midpoints(boundaries: Floats) -> Floats:
-    """Return element boundaries (n,) and the midpoints between them, in order: (2 n - 1,)."""
+    """Return the element boundaries (n,) and the midpoints between them, in ascending order (2 n -
+    1,).
+    """
     nodes = np.empty(2 * len(boundaries) - 1)
     nodes[::2] = boundaries
     nodes[1::2] = 0.5 * (boundaries[1:] + boundaries[:-1])
@@ -574,8 +585,8 @@ def _insert_midpoints(boundaries: Floats) -> Floats:
 def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: TrueRubber) -> Floats:
     """Return the fraction (nodes,) of a finger step by which each node moves initially.
 
-    The fraction is 1 at the focus and decreases linearly to 0 near the clamps. The moved nodes are
-    the initial guess of the next equilibrium.
+    The fraction is 1 at the focus (the pushed point) and decreases linearly to 0 near the clamps.
+    The moved nodes are the initial guess of the next equilibrium.
     """
     x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
     focus_x, focus_y = focus
@@ -588,7 +599,7 @@ def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: TrueRub
 
 
 def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, int]:
-    """Minimise the energy by Newton's method with a line search.
+    """Minimise the energy of the sheet by Newton's method with a line search.
 
     Return the node positions (nodes, 3), m, and the number of steps. Raises NotConvergedError if
     the residual force exceeds the tolerance.

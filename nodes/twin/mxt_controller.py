@@ -1,9 +1,9 @@
 """Simulate arm controllers with Mitsubishi's real-time external control (MXT) over UDP.
 
 This module was written from `docs/mxt.md` only. It shares no code with the bridge (the node that
-sends commands to an arm), because it serves to test the bridge. The robot program
-`Mxt 1,1,<filter>` is assumed to run. The packets that a real controller rejects are only partly
-known. The simulated controller rejects more packets, and sends no answer after its program has
+sends commands to an arm), because it is used to test the bridge. The simulated controller executes
+the robot program `Mxt 1,1,<filter>`. It is only partly known which packets a real controller
+rejects. The simulated controller rejects more packets, and sends no answer after its program has
 ended.
 """
 
@@ -39,30 +39,34 @@ _JOINTS, _PULSES, _CURRENT = (2, 5, 8), 3, 11
 _MORE_AT = (64, 108, 152)
 
 TORQUE_PER_PERCENT_NM = np.array([0.3, 0.3, 0.2, 0.05, 0.05, 0.03])
-"""The torque of each simulated joint per percent of its motor's rated current."""
+"""The torque (N m) of each simulated joint per percent of its motor's rated current."""
 
 UNLOADED_PERCENT = np.array([0.0, 22.0, 30.0, 0.0, 8.0, 0.0])
-"""The currents (6,), in percent of the rated currents, that hold the simulated arm without a load.
-The change of the currents with the pose is neglected."""
+"""The motor currents (6,) of the simulated arm at rest without a load, in percent of the rated
+currents. Their dependence on the pose is neglected."""
 
 FRICTION_PERCENT = 6.0
-"""The maximum change of a motor's current by static friction of its gear, in either direction."""
+"""The maximum change (percent of the rated current) that static friction of a gear causes in a
+motor's current, in either direction."""
 
 FILTER_S = 0.01
-"""The time constant of the low-pass filter that the manufacturer recommends for `Mxt`."""
+"""The time constant (s) of the low-pass filter that the manufacturer recommends for the instruction
+`Mxt`."""
 
 FRICTION_STREAM = 11
-"""The second element of the random seed of the static friction."""
+"""The second element of the random seed of the static friction. It makes the friction independent
+of other random values."""
 
 FIRST_STEP_RAD = 0.01
-"""The maximum difference of each joint between the first set-point and the measurement."""
+"""The maximum difference, for each joint, between the first set-point and the measured angle."""
 
 STEP_CYCLES = 2.0
-"""The maximum step between set-points, in cycles that the step takes at full speed."""
+"""The maximum step between set-points, divided by the step of a joint at full speed in one
+cycle."""
 
 
 class MxtError(FlexsheetError):
-    """The error that is raised when an invalid command ends the robot program."""
+    """Raised when an invalid command ends the robot program of a simulated controller."""
 
     code = "mxt-program"
     remedy = "No action is needed: the simulated controller's program restarts."
@@ -71,19 +75,20 @@ class MxtError(FlexsheetError):
 class MxtController:
     """A simulated controller of one arm, which receives and answers one packet per cycle.
 
-    An error ends the robot program: the arm brakes, and no packet is answered until `restart`.
-    These are the errors:
-    - a move before a packet that only requests the state
+    An error ends the robot program. Then the arm brakes, and the controller answers no packet until
+        `restart` is called. The errors are:
+    - a motion command before a packet that only requests the state
     - an unknown command or data type
     - joint angles outside the allowed range
     - a first set-point away from the measured joint angles
     - a jump of the set-point
     - no packet for `timeout_s`
 
-    servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joints.
+    servo_lag_s, backlash_rad: see `Servo`. noise_rad: standard deviation of the measured joint
+        angles.
     filter_s: time constant of the low-pass filter on set-points.
-    load_nm: torques (6,) of the sheet's pull on the joints, set by the simulator.
-    restart_after_s: time after which the program restarts by itself.
+    load_nm (6,): joint torques that the sheet's tension causes. The simulator sets them.
+    restart_after_s: time after which the program restarts automatically.
     cycle_s, cycle_jitter_s: mean and standard deviation of the cycle's duration.
     latency_s: time from the arrival of a set-point until the set-point takes effect.
     """
@@ -155,7 +160,7 @@ class MxtController:
 
     @property
     def waits(self) -> bool:
-        """Return whether a packet is waiting to be processed in the next cycle."""
+        """Return whether a packet has arrived that the next cycle will process."""
         return self._waiting is not None
 
     def until_cycle_s(self) -> float:
@@ -163,7 +168,9 @@ class MxtController:
         return self._next_cycle_s - self._into_cycle_s
 
     def advance(self, duration_s: float) -> None:
-        """Simulate `duration_s` of motion; append the answers of the controller to `answers`."""
+        """Simulate the motion for `duration_s`, and append the answers of the controller to
+        `answers`.
+        """
         while duration_s >= self.until_cycle_s():
             duration_s -= self.until_cycle_s()
             self._move_on(self.until_cycle_s())
@@ -197,7 +204,9 @@ class MxtController:
         self._filtered_rad = self._filtered_rad + self._filter_share * (wanted - self._filtered_rad)
 
     def _acting(self) -> Floats:
-        """Return the set-point (6,), rad, that takes effect now, after the latency."""
+        """Return the set-point (6,), rad, that takes effect in the current cycle, after the
+        latency.
+        """
         late_s = self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
         if not late_s:
             self._late.clear()
@@ -232,8 +241,8 @@ class MxtController:
     def _stay(self, sender: Address) -> None:
         """Process a packet that only requests the state.
 
-        The arm stops. The next set-point must agree with the measured joint angles, as at the
-        start.
+        The arm stops. The next set-point must agree with the measured joint angles, like the first
+        set-point.
         """
         self._master = sender
         if self._moved:
@@ -257,7 +266,9 @@ class MxtController:
         self._moved, self.wanted_rad = True, joints
 
     def _set_point(self, send_type: int, data: Floats) -> Floats:
-        """Decode the set-point (6,), rad, of a packet; raise MxtError if it is not valid."""
+        """Decode the set-point (6,), rad, of a packet; raise MxtError if the set-point is
+        invalid.
+        """
         if send_type != _JOINTS[0]:
             raise MxtError(f"the set-point has the unknown data type {send_type}")
         if not np.isfinite(data).all():
@@ -285,7 +296,7 @@ class MxtController:
         return whole[:-4] if self.fault == "bad_crc" else whole
 
     def _monitor(self, wanted_type: int) -> tuple[float, ...]:
-        """Return the requested state of the arm as data type, eight numbers and two flags.
+        """Return the requested state of the arm as a data type, eight numbers and two flags.
 
         The data type is 0 if the requested quantity is not available.
         """
@@ -297,14 +308,14 @@ class MxtController:
     def _currents_percent(self) -> list[int]:
         """Return the motor currents (6,) in percent of the rated current, rounded to integers.
 
-        The motors carry the weight of the arm and the load, apart from the part that static
-        friction carries.
+        The motors carry the weight of the arm and the load, minus the part that static friction
+        carries.
         """
         balance = UNLOADED_PERCENT - self.load_nm / TORQUE_PER_PERCENT_NM
         return [round(float(one)) for one in balance + self._stuck_percent]
 
     def _seen(self, what: int) -> Floats:
-        """Return joint angles (6,), rad.
+        """Return the joint angles (6,), rad, that a client has requested.
 
         what: 0 for the set-point, 1 for the filtered set-point, 2 for the measured angles.
         """
@@ -313,14 +324,15 @@ class MxtController:
 
 
 class MxtServer:
-    """A UDP server through which clients command a simulated controller."""
+    """A UDP server through which clients send commands to a simulated controller."""
 
     def __init__(
         self, controller: MxtController, *, host: str, port: int, before: Callable[[], None]
     ) -> None:
-        """Store the settings; `start` opens the port.
+        """Store the settings. The method `start` opens the port.
 
-        before: function called before each packet and cycle; it must call `controller.advance`.
+        before: function that is called before each packet and cycle. It must call
+            `controller.advance`.
         """
         self.controller = controller
         self._address = (host, port)
@@ -329,7 +341,7 @@ class MxtServer:
         self._due: asyncio.TimerHandle | None = None
 
     async def start(self) -> None:
-        """Start to listen; raise OSError if the port is in use."""
+        """Start the server. Raises OSError if the port is in use."""
         loop = asyncio.get_running_loop()
         self._transport, _ = await loop.create_datagram_endpoint(
             lambda: _Packets(self._received), local_addr=self._address
@@ -337,7 +349,10 @@ class MxtServer:
 
     @property
     def port(self) -> int:
-        """Return the port on which the server listens, also if any free port was requested."""
+        """Return the number of the port on which the server listens.
+
+        If port 0 was requested, this is the port that the operating system chose.
+        """
         if self._transport is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")
         return int(self._transport.get_extra_info("sockname")[1])

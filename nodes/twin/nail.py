@@ -1,4 +1,4 @@
-"""Compute where the marker is on the nail of a finger, which may be held at an angle."""
+"""Compute the position of the marker on the nail of a finger, which may be tilted."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from flexsheet.nodes.twin.clutter import FINGER_DIRECTION, FINGER_LENGTH_M
 
 THICKNESS_RATIO = 0.6
 """The ratio of a finger's thickness from pad to nail (10 mm under pressure) to its breadth (16 to
-18 mm). `tolerance_table.py` names the sources."""
+18 mm). The module `tolerance_table` names the sources."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nail:
     """The placement of the marker and the direction of the finger, as vectors in the world frame.
 
-    marker_offset_m: (3,) from the fingertip (contact point of the finger pad) to the centre of the
-        marker.
-    marker_normal: (3,) normal of a flat marker; None if the marker is a ball.
-    direction: (3,) from the fingertip to the knuckle.
+    marker_offset_m (3,): vector from the fingertip (the contact point of the finger pad) to the
+        centre of the marker.
+    marker_normal (3,): normal of a flat marker; None if the marker is a ball.
+    direction (3,): direction from the fingertip to the knuckle.
 
-    A finger with a flat marker on its nail has an elliptic cross-section, on whose flat side the
-    marker lies. A finger with a ball, or with a marker at the pad, is round, and its axis begins at
-    the fingertip.
+    A finger with a flat marker on its nail has an elliptic cross-section, and the marker is on the
+    flat side. A finger with a ball, or with a marker at the pad, is round. The axis of a round
+    finger begins at the fingertip.
     """
 
     marker_offset_m: Floats = field(default_factory=lambda: np.zeros(3))
@@ -40,8 +40,8 @@ class Nail:
     def of(cls, finger: FingerTruth) -> Self:
         """Compute the placement from the true finger parameters.
 
-        In the finger's frame, x points from the tip to the knuckle and z out of the nail. For a
-        finger that is not tilted, y points to the right.
+        In the finger's frame, x points from the tip to the knuckle, and z points out of the nail.
+        For a finger without tilt, y points to the right.
         """
         tilt = rotation_from_vector((*finger.finger_tilt_rad, 0.0))
         x = tilt @ np.array(FINGER_DIRECTION)
@@ -82,7 +82,7 @@ class Nail:
         return np.asarray(on_nail - THICKNESS_RATIO * radius_m * normal)
 
     def find_half_width_m(self, view: Floats, radius_m: float) -> float:
-        """Return half the width of the finger's outline, seen along the vector (3,) `view`.
+        """Return half the width (m) of the finger's outline as seen along the vector `view` (3,).
 
         radius_m: half of the finger's breadth.
         """
@@ -95,7 +95,9 @@ class Nail:
 
     @property
     def knuckle_shift_m(self) -> Floats:
-        """Return the vector (3,) by which the finger's tilt displaces the knuckle and the hand."""
+        """Return the vector (3,), m, by which the finger's tilt displaces the knuckle and the
+        hand.
+        """
         return np.asarray(FINGER_LENGTH_M * (self.direction - np.array(FINGER_DIRECTION)))
 
 

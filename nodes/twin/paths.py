@@ -1,10 +1,10 @@
-"""Map finger paths onto the scene's object, within the range of the arms; read recorded paths.
+"""Map finger paths onto the scene's object, within the range of the arms, and read recorded paths.
 
-A surface position is (along, arc, height) in metres. `along` is the distance over the surface in
-the direction of the object's x axis. `arc` is the further distance over the surface at right angles
-to this direction. `height` is the distance from the surface, negative inside the object. (0, 0, 0)
-is the front of the object, the point that faces the user. Motions that are defined in surface
-positions apply to the object of any scene.
+A surface position is (along, arc, height) in metres. `along` is the distance on the surface in the
+direction of the object's x axis. `arc` is the following distance on the surface at right angles to
+this direction. `height` is the distance from the surface, negative inside the object. The position
+(0, 0, 0) is the front of the object, which is the point that faces the user. Motions that are
+defined in surface positions apply to the object of any scene.
 """
 
 from __future__ import annotations
@@ -50,10 +50,11 @@ def map_to_surface(scene: Scene, places: Floats) -> Floats:
 
 
 def touchable(scene: Scene) -> tuple[float, float]:
-    """Return the lengths (m), along and around the object, over which a finger can stroke.
+    """Return the lengths (m), along and around the object, of the touchable part of its surface.
 
-    The lengths extend equally to both sides of the front. Three limits apply: 0.8 of the length of
-    an object with ends, the maximum tilt of the working range, and the usable part of the sheet.
+    The lengths extend equally to both sides of the front (the point that faces the user). Three
+    limits apply: 0.8 of the length of an object with ends, the maximum tilt of the working range,
+    and the usable part of the sheet.
     """
     return _surface_map_of(scene).touchable_m
 
@@ -62,12 +63,14 @@ class SurfaceMap:
     """A map from surface positions on a scene's object to world points.
 
     The distances `along` and `arc` are measured on geodesics, which are computed on a grid. Points
-    between are interpolated by bicubic splines and projected onto the surface, so a mapped path is
-    as smooth as the surface.
+    between the grid points are interpolated by bicubic splines and projected onto the surface.
+    Therefore a mapped path is as smooth as the surface.
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Compute the grid; raise FingerPathError if no side of the object faces the user."""
+        """Compute the grid of surface points. Raises FingerPathError if no side of the object faces
+        the user.
+        """
         self._world_from_object = pose_matrix(scene.object.world_from_object)
         self._shape = make_shape(dict(scene.object.geometry))
         towards_user = self._world_from_object[:3, :3].T[:, 2]
@@ -109,10 +112,12 @@ class SurfaceMap:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return the maximum stroke (m) in one direction, and whether an end limits the stroke.
+        """Return the maximum length (m) of a stroke in one direction, and whether an end of the
+        object limits it.
 
-        The other limit is the tilt of the normal from the user, whose cosine is `most`. The length
-        is measured from the front along the geodesic that begins in direction `heading` (3,).
+        The length is measured from the front along the geodesic that begins in the direction
+        `heading` (3,). The other limit is the angle between the surface normal and the direction to
+        the user. most: cosine of the maximum angle.
         """
         here, way_m = front, 0.0
         while way_m < MAX_DISTANCE_M:
@@ -130,7 +135,9 @@ class SurfaceMap:
         return way_m, False
 
     def _fit_splines(self, front: Nearest, heading: Floats) -> None:
-        """Fit splines of the surface over (along, arc), for 1.25 times the range of strokes."""
+        """Fit splines to the surface over (along, arc). They cover 1.25 times the range of
+        strokes.
+        """
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
             for half in (0.625 * size for size in self.touchable_m)
@@ -146,10 +153,10 @@ class SurfaceMap:
 
 
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
-    """Return the surface point that faces the user: the point nearest to a distant user.
+    """Return the surface point that faces the user, which is the point nearest to a distant user.
 
-    If the nearest point lies on an end of the object, return instead the point that the user sees
-    in the direction of the object's origin.
+    If the nearest point is on an end of the object, return the point that the user sees in the
+    direction of the object's origin.
     """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:
@@ -168,9 +175,10 @@ def _lean_rad(found: Nearest, towards_user: Floats) -> float:
 
 
 def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tuple[Floats, Floats]:
-    """Return points and normals (k, n, 3) on geodesics from points (n, 3).
+    """Return points and normals (k, n, 3) on the geodesics through points (n, 3).
 
-    ticks: ascending distances (k,) in m at which points are computed. The middle element is 0.
+    starts, headings (n, 3): points and directions of the geodesics at these points. ticks (k,):
+    ascending distances (m) at which points are computed. The middle element is 0.
     """
     centre = len(ticks) // 2
     begun = shape.closest(starts)
@@ -197,7 +205,7 @@ def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tupl
 
 
 def _surface_map_of(scene: Scene) -> SurfaceMap:
-    """Return the surface map of a scene from a cache of the latest few scenes, or compute it."""
+    """Return the surface map of a scene. The maps of the latest scenes are cached."""
     key = pickle.dumps((scene.object, scene.working_range, scene.sheet, scene.name))
     if key not in _SURFACE_MAPS:
         while len(_SURFACE_MAPS) >= MAX_CACHED_SURFACE_MAPS:
@@ -207,16 +215,19 @@ def _surface_map_of(scene: Scene) -> SurfaceMap:
 
 
 def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
-    """Return whether world points (n, 3) are at least `margin_m` inside the finger volume."""
+    """Return whether all world points (n, 3) are at least `margin_m` inside the scene's finger
+    volume.
+    """
     low = scene.finger.volume_min_m + margin_m
     high = scene.finger.volume_max_m - margin_m
     return bool((points >= low).all() and (points <= high).all())
 
 
 def limit_path_speed(scene: Scene, times_s: Floats, points: Floats) -> Floats:
-    """Return the times (n,), s, stretched by one factor if the path exceeds the finger's speed.
+    """Return the times (n,), s, of a path, slowed down so that it does not exceed the finger's
+    maximum speed.
 
-    points: positions (n, 3), m.
+    All times are multiplied by the same factor. points (n, 3): positions, m.
     """
     fastest = float(SmoothPath.through(times_s, points).speeds().max())
     slower = max(1.0, fastest / (SPEED_FRACTION * scene.finger.max_speed_m_per_s))
@@ -236,8 +247,9 @@ def place_path(
 
     times_s, places: sample times (n,) and surface positions (n, 3), m.
 
-    The motion is scaled down by one factor if the path with wander and tremor leaves the scene's
-    finger volume. The motion is slowed down by one factor if it exceeds the scene's finger speed.
+    The motion is reduced by one factor if the path with wander and tremor would leave the scene's
+    finger volume. It is slowed down by one factor if it would exceed the scene's maximum finger
+    speed.
 
     Raises FingerPathError if the volume does not contain the front of the object.
     """
@@ -268,18 +280,18 @@ def place_path(
 
 
 def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
-    """Load a recorded fingertip path and map it into the scene; label the path by its file name.
+    """Load a recorded fingertip path, and map it to the scene's object. Its label is the file name.
 
-    The file has columns t_s, x_mm, y_mm, z_mm with y upwards, as hand trackers write it. The
-    mapping preserves the motion and changes its location:
+    The file has the columns t_s, x_mm, y_mm and z_mm, with y upwards, as hand trackers write them.
+    The mapping preserves the motion and changes its location:
 
     1. Rotate: the recorded x, y, z become the world's x, y, z (right, up, towards the user).
-    2. Scale, if necessary, by one factor. Then the central 90 % of each coordinate fits the range
-       that can be stroked (`touchable`) and 50 mm of depth.
+    2. Scale, if necessary, by one factor. Then the central 90 % of each coordinate fit the
+        touchable range (`touchable`) and 50 mm of depth.
     3. Translate: the median x, y is placed in front of the centre of the object.
     4. Project: z becomes the height above the surface. The deepest 30 % of the samples push into
-       the surface, limited smoothly to a sixth of `push_depth_m`. y becomes arc length on the
-       surface, so a vertical motion strokes the surface.
+        the surface, limited smoothly to a sixth of `push_depth_m`. y becomes arc length on the
+        surface, so a vertical motion strokes the surface.
     5. Slow down, if necessary, by one factor, to 0.8 of the scene's finger speed.
 
     The samples are limited to the scene's finger volume and joined by a spline, which preserves the
@@ -301,7 +313,7 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
         [
             _soft_clip(points[:, 0], half[0]),
             _soft_clip(points[:, 1], half[1]),
-            # The limit is gradual, since soft skin yields instead of stopping the hand abruptly.
+            # The limit is gradual, because soft skin yields and does not stop the hand abruptly.
             _soft_max(points[:, 2] - touch, -press_m, 0.5 * press_m),
         ],
         axis=1,
@@ -320,20 +332,20 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
 
 
 def _soft_max(values: Floats, floor: float, bend: float) -> Floats:
-    """Limit values (n,) smoothly to at least `floor`; the transition has the width `bend`."""
+    """Limit values (n,) smoothly to at least `floor`. The transition has the width `bend`."""
     above = values - floor
     return np.asarray(floor + 0.5 * (above + np.hypot(above, bend)))
 
 
 def _soft_clip(values: Floats, half: float) -> Floats:
-    """Limit values (n,) smoothly to +-half; the transition has the width 0.2 half."""
+    """Limit values (n,) smoothly to +-half. The transition has the width 0.2 half."""
     return -_soft_max(-_soft_max(values, -half, 0.2 * half), -half, 0.2 * half)
 
 
 def _read_recording(csv_path: Path) -> Floats:
     """Read the columns t_s, x_mm, y_mm, z_mm of a CSV file as an array (n, 4).
 
-    Raises FingerPathError, which names the file, the line and the error.
+    Raises FingerPathError for an invalid file. The error names the file, the line and the reason.
     """
     wanted = ["t_s", "x_mm", "y_mm", "z_mm"]
     try:

@@ -1,11 +1,12 @@
 """Simulate the stereo camera: render images of a finger with a bright marker at its tip.
 
-The camera model, a pinhole with Brown's distortion (`rig.py`), shares no code with the camera model
-of the nodes, which the images serve to test. The finger is a tapered capsule. By default the marker
-is a small luminous bead, whose centre is the fingertip position; `nail.py` defines other markers.
-`clutter.py` describes the surroundings. All objects are drawn ray by ray and blurred by the lens,
-defocus, pixel area and motion during the exposure. Then photon and read noise are added, and the
-result is clipped and rounded to grey levels.
+The camera model (module `rig`) is a pinhole with Brown's distortion. It shares no code with the
+camera model of the nodes, because the images are used to test the nodes. The finger is a tapered
+capsule. By default, the marker is a small luminous bead, whose centre is the fingertip position.
+The module `nail` defines other markers. The module `clutter` describes the surroundings. All
+objects are drawn pixel by pixel. They are blurred by the lens, defocus, pixel area and motion
+during the exposure. Then photon and read noise are added, and the result is clipped and rounded to
+grey levels.
 """
 
 from __future__ import annotations
@@ -41,58 +42,61 @@ Window = tuple[slice, slice]
 """The rows and columns of a rectangular part of an image."""
 
 Position = Callable[[float], Floats]
-"""The function that returns the fingertip position (3,) at a time in seconds from mid-exposure."""
+"""A function that returns the fingertip position (3,), m, at a time (s) relative to mid-
+exposure."""
 
 MOTION_STEP_PX = 0.7
-"""The maximum distance between the positions at which a moving object is drawn during one exposure.
-The lens blur closes the gaps; motion within a step, which is ignored, would widen it by at most 4
-%."""
+"""The maximum distance (px) between the positions at which a moving object is drawn during one
+exposure. The lens blur closes the gaps. The motion within a step, which is ignored, would increase
+this blur by at most 4 %."""
 
 LIGHT = np.array([-0.6, 0.7, 0.4])
-"""The world direction towards the lamp at the upper left, of about unit length."""
+"""The direction (world frame, about unit length) towards the lamp at the upper left."""
 
 SHADE = 0.35
-"""The fraction by which skin is darker at the outline of a limb than along its centre line."""
+"""The fraction by which skin is darker at the outline of a limb than on the centre line."""
 
 SIDE_LIGHT = 0.2
 """The fraction by which the lamp brightens the facing side of a limb and darkens the other side."""
 
 MIN_DEPTH_M = 0.02
-"""The minimum distance from a camera, in metres, at which objects are drawn."""
+"""The minimum distance (m) of drawn objects from a camera."""
 
 ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
-"""The projected positions along a limb (0: start, 1: end) that determine its window."""
+"""The positions along a limb (0: start, 1: end) whose projections determine the limb's image
+window."""
 
 EMPTY_FRACTION = 1.2
-"""The maximum ratio of the area of two joined windows to the sum of the areas of both windows."""
+"""The maximum ratio of the area of a window that contains two windows to the sum of their areas. Up
+to this ratio, the two windows are joined."""
 
 LIT_RADIUS_M, LIT_LEVEL = 0.0028, 150.0
-"""The radius of a projected mark (the area is that of 10 x 10 pixels of 0.5 mm), and the grey level
-that the mark adds to the sheet."""
+"""The radius (m) of a projected mark, and the grey level that the mark adds to the sheet. The area
+is that of 10 x 10 pixels of 0.5 mm."""
 
 NO_POINTS = np.zeros((0, 3))
 
 SPOTS = 61
-"""The number of Gaussian spots that make up a flat marker."""
+"""The number of Gaussian spots as whose sum a flat marker is drawn."""
 
 GOLDEN_ANGLE_RAD = math.pi * (3.0 - math.sqrt(5.0))
 
 GRAIN = 1 << 21
-"""The length of the stored sequence of random numbers from which images take their noise."""
+"""The length of the stored sequence of random numbers from which the image noise is taken."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """The properties of the image sensor and lens; grey levels (0..255) are proportional to the
-    light.
+    """The properties of the image sensor and the lens. Grey levels (0 to 255) are proportional to
+    the light.
 
     photons_per_level: full-well capacity in photons, divided by 255. The variance of the photon
-    noise at level L is L / photons_per_level.
+        noise at level L is L / photons_per_level.
     blur_px: standard deviation of the lens's point spread function in focus.
-    aperture_m, focus_m: aperture diameter and focused distance. A point at depth z spreads to a
-    disc of diameter focal_px * aperture_m * |1/z - 1/focus_m|. The disc is drawn as a Gaussian
-    with the same standard deviation, a quarter of the diameter.
-    exposure: factor on all light; well above 1 the marker saturates.
+    aperture_m, focus_m: aperture diameter and focused distance. The image of a point at depth z is
+        a disc with the diameter focal_px * aperture_m * |1/z - 1/focus_m|. The disc is drawn as a
+        Gaussian with the same standard deviation, a quarter of the diameter.
+    exposure: factor on all light. With a factor well above 1, the marker saturates.
     noisy_backgrounds: number of precomputed noisy background images per camera.
     """
 
@@ -109,22 +113,27 @@ class Sensor:
     noisy_backgrounds: int = 8
 
     def noise(self, levels: Singles) -> Singles:
-        """Return the standard deviation of photon and read noise for an array of grey levels."""
+        """Return the standard deviation of photon noise and read noise for an array of grey
+        levels.
+        """
         variance = levels * np.float32(1.0 / self.photons_per_level) + np.float32(
             self.read_noise**2
         )
         return np.asarray(np.sqrt(variance), dtype=np.float32)
 
     def spread_px(self, depth_m: float, focal_px: float) -> float:
-        """Return the blur of a point (standard deviation, px) by lens, defocus and pixel area."""
+        """Return the blur of a point (standard deviation, px) due to lens, defocus and pixel
+        area.
+        """
         defocus_px = 0.25 * focal_px * self.aperture_m * abs(1.0 / depth_m - 1.0 / self.focus_m)
         return float(np.sqrt(self.blur_px**2 + defocus_px**2 + 1.0 / 12.0))
 
     def out_of_focus(self, defocus_px: float, depth_m: float, focal_px: float) -> Sensor:
-        """Return a copy of the sensor that is focused behind `depth_m`, which blurs a point there.
+        """Return a copy of the sensor whose focus is behind `depth_m`, so that points at `depth_m`
+        are blurred.
 
-        defocus_px: standard deviation of the defocus alone. Raises ValueError if focus at infinity
-        gives less defocus.
+        defocus_px: standard deviation of the blur by the defocus alone. Raises ValueError if even a
+        focus at infinity gives less blur.
         """
         nearer = 4.0 * defocus_px / (focal_px * self.aperture_m)
         focus = 1.0 / depth_m - nearer
@@ -138,12 +147,14 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """One camera of the stereo rig with the rays through its pixels and its background images.
+    """One simulated camera of the stereo camera, with the rays through its pixels and its
+    background images.
 
-    slopes_x, slopes_y: x/z and y/z of the ray through each pixel, in the camera frame.
+    slopes_x, slopes_y (rows, columns): x/z and y/z of the ray through each pixel, in the camera
+        frame.
     background: noise-free image of all static objects.
-    canvas: buffer in which images are drawn; between images it equals the background.
-    noisy: copies of the background with noise added.
+    canvas: buffer in which images are drawn. Between images, it equals the background.
+    noisy: copies of the background with noise.
     """
 
     side: Side
@@ -157,7 +168,7 @@ class CameraView:
 
     @property
     def position_m(self) -> Floats:
-        """Return the position (3,) of the camera's centre in the world."""
+        """Return the position (3,), m, of the camera's centre in the world frame."""
         return np.asarray(-self.camera_from_world[:3, :3].T @ self.camera_from_world[:3, 3])
 
     def see(self, point_world: Floats) -> tuple[Floats, float]:
@@ -173,9 +184,10 @@ class CameraView:
         return np.array(project_ray(self.lens, x / z, y / z)), z
 
     def window(self, pixels: Sequence[tuple[float, float]], reach_px: float) -> Window | None:
-        """Return the bounding box of pixels, enlarged by `reach_px` and limited to the image.
+        """Return the bounding box of pixels, enlarged by `reach_px` on each side and limited to the
+        image.
 
-        Return None if the bounding box lies outside the image.
+        Return None if the bounding box is outside the image.
         """
         height, width = self.canvas.shape
         rows = slice(
@@ -190,7 +202,9 @@ class CameraView:
 
 
 class TwinCamera:
-    """A simulated stereo camera, which renders image pairs; `seed` determines the noise."""
+    """A simulated stereo camera, which renders image pairs. The random seed determines the
+    noise.
+    """
 
     def __init__(
         self,
@@ -205,8 +219,8 @@ class TwinCamera:
     ) -> None:
         """Render the static background of both cameras.
 
-        camera: true lenses and poses of the stereo rig.
-        nail: marker position and finger direction; None: a bead at the fingertip.
+        camera: true lenses and poses of the stereo camera.
+        nail: marker position and finger direction; None for a bead at the fingertip.
         skew_s: exposure time of the right image minus that of the left image.
         """
         self.camera = camera
@@ -234,7 +248,7 @@ class TwinCamera:
         marker_radius_m: float | None = None,
         marker_offset_m: Floats | None = None,
     ) -> TwinCamera:
-        """Return a copy of the camera with another marker or sensor; the background is unchanged.
+        """Return a copy of the camera with another marker or sensor. The background is unchanged.
 
         marker_offset_m: vector (3,) from the fingertip to the marker, in the world frame.
         """
@@ -253,11 +267,13 @@ class TwinCamera:
         time_s: float = 0.0,
         lit_points: Floats = NO_POINTS,
     ) -> tuple[Image, Image]:
-        """Render the left and right image of a finger whose tip moves along `position`.
+        """Render the left and the right image of a finger whose tip moves during the exposure.
+
+        position: function that returns the fingertip position.
 
         marker: whether the finger wears a marker.
         time_s: simulation time at mid-exposure, which determines the positions of moving clutter.
-        lit_points: points (n, 3) of the sheet that the projector lights.
+        lit_points (n, 3): points of the sheet that the projector illuminates, world frame, m.
         """
         left, right = (
             self._exposed(
@@ -284,9 +300,10 @@ class TwinCamera:
     def _views(
         self, position: Position, exposure_s: float
     ) -> Iterator[tuple[CameraView, Floats, Floats]]:
-        """Yield each camera with sampling times (n,) and fingertip positions (n, 3) at these times.
+        """Yield each camera with sampling times (n,), s, and fingertip positions (n, 3), m, at
+        these times.
 
-        Times are in seconds from mid-exposure.
+        The times are relative to mid-exposure.
         """
         instants_s, tips = self._instants(position, exposure_s)
         left, right = self.eyes
@@ -297,9 +314,11 @@ class TwinCamera:
         yield right, instants_s, tips
 
     def _instants(self, position: Position, exposure_s: float) -> tuple[Floats, Floats]:
-        """Return times (n,) from mid-exposure and fingertip positions (n, 3), for motion blur.
+        """Return the times (n,), s, and fingertip positions (n, 3), m, that are drawn to simulate
+        motion blur.
 
-        Between successive times the fingertip moves by at most MOTION_STEP_PX in the image.
+        The times are relative to mid-exposure. Between successive times, the fingertip moves by at
+        most MOTION_STEP_PX in the image.
         """
         ends = [position(share * exposure_s) for share in (-0.5, 0.5)]
         travel_px = 0.0
@@ -312,9 +331,9 @@ class TwinCamera:
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
     def _exposed(self, eye: CameraView, windows: list[Window]) -> Image:
-        """Return an image: noisy background, with the drawn windows of the canvas copied into it.
+        """Return an image that consists of a noisy background and the drawn windows of the canvas.
 
-        The canvas is then reset to the background.
+        Reset the canvas to the background.
         """
         image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
         for window in disjoint(windows):
@@ -338,7 +357,8 @@ class TwinCamera:
     ) -> list[Window]:
         """Draw the finger and all moving objects on the camera's canvas; return the drawn windows.
 
-        tips: fingertip positions (n, 3) during the exposure. times_s: their times (n,).
+        tips (n, 3): fingertip positions during the exposure, m. times_s (n,): times of these
+        positions.
         """
         clutter, sensor = self.clutter, self.sensor
         time_s, tip = float(times_s.mean()), tips.mean(axis=0)
@@ -394,16 +414,18 @@ class TwinCamera:
         *,
         lit: bool,
     ) -> Window | None:
-        """Draw a tapered capsule between two world points (2, 3) and return the drawn window.
+        """Draw a tapered capsule between two world points (2, 3), and return the drawn window.
 
         Return None if the capsule is not visible.
 
-        lit: whether the lamp shades the capsule from the side; otherwise its level is constant.
-        motion: displacement (3,) of the limb during the exposure, m, which widens the blurred
-        edges.
+        lit: whether the lamp illuminates the capsule from the side; otherwise its grey level is
+            constant.
+        motion (3,): displacement of the limb during the exposure, m. It increases the blur of the
+            edges.
 
-        The profile of the edges is a cubic, within 2 % of the normal distribution function. The
-        cubic is not valid for a limb that is thinner than its blurred edges.
+        The profile of the edges is a cubic polynomial, which is within 2 % of the normal
+        distribution function. The polynomial is not valid for a limb that is thinner than its
+        blurred edges.
         """
         (x0, y0, z0), (x1, y1, z1) = apply(eye.camera_from_world, ends).tolist()
         if min(z0, z1) <= MIN_DEPTH_M:
@@ -470,9 +492,10 @@ class TwinCamera:
         return window
 
     def _flat_disc(self, eye: CameraView, places: Floats, normal: Floats) -> Window | None:
-        """Draw the marker as a flat disc that passes through world points (n, 3) while exposed.
+        """Draw the marker as a flat disc that passes through world points (n, 3) during the
+        exposure.
 
-        Return the drawn window, or None if the disc is not visible or seen from behind.
+        Return the drawn window, or None if the disc is not visible or is seen from behind.
 
         The disc is a sum of Gaussian spots. For a disc that is larger than the blur, the sum is
         within 1 % of the light of a uniform disc.
@@ -532,7 +555,9 @@ class TwinCamera:
         return eye
 
     def _make_background(self, height: int, width: int) -> Singles:
-        """Return the image (height, width) of a dim room: smooth noise darker than the marker."""
+        """Return the image (height, width) of a dark room, which consists of smooth noise darker
+        than the marker.
+        """
         texture = np.zeros((height, width), dtype=np.float32)
         for cells, share in ((24, 0.7), (96, 0.3)):
             coarse = self._random.standard_normal((cells, cells), dtype=np.float32)
@@ -541,9 +566,10 @@ class TwinCamera:
         return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.marker_level), dtype=np.float32)
 
     def _grained(self, sheet: Sheet) -> Singles:
-        """Return the grey levels (rows, columns) of the sheet's surface, two samples per grain.
+        """Return the grey levels (rows, columns) of the sheet's texture, with two samples per
+        grain.
 
-        The texture is the sum of fine and coarse noise; the left side is brighter.
+        The texture is the sum of fine and coarse noise. The left side is brighter.
         """
         size = [
             2 + int(np.ceil(4.0 * half_m / sheet.grain_m))
@@ -561,8 +587,8 @@ class TwinCamera:
     ) -> None:
         """Draw the sheet, which lies in the world plane z = 0, on the canvas.
 
-        slopes: x/z and y/z (height, width, 2) of the pixels' rays.
-        pose: camera_from_world (4, 4).
+        grain: grey levels of the sheet's texture. slopes (height, width, 2): x/z and y/z of the
+        pixels' rays. pose (4, 4): camera_from_world.
         """
         plane_from_ray = np.linalg.inv(pose[:3, [0, 1, 3]])
         on_plane = slopes @ plane_from_ray[:, :2].T + plane_from_ray[:, 2]
@@ -605,8 +631,8 @@ def rasterize_ball(
 ) -> Singles:
     """Return the fraction (rows, columns) of each pixel's light that comes from a ball.
 
-    centres: positions (n, 3) of the ball during the exposure, in the camera frame, m; the result is
-    the mean over these positions.
+    centres (n, 3): positions of the ball during the exposure, camera frame, m. The result is the
+        mean over these positions.
     spread_px: standard deviation s of the blur.
 
     A ray passes a centre at the distance d = |ray x centre| / |ray|. For a disc of radius r, the
@@ -630,7 +656,7 @@ def rasterize_ball(
 
 
 def quantize(levels: Singles) -> Image:
-    """Round an array of grey levels to integers, and limit them to 0..255."""
+    """Round grey levels to integers, and limit them to the range 0 to 255."""
     return np.minimum(np.maximum(np.rint(levels), 0.0), 255.0).astype(np.uint8)
 
 
@@ -651,8 +677,8 @@ def _wipe(eye: CameraView, windows: list[Window]) -> None:
 def disjoint(windows: list[Window]) -> list[Window]:
     """Return windows that do not overlap and cover the same pixels as the given windows.
 
-    Two overlapping windows are joined. If the joined window would be too large (EMPTY_FRACTION),
-    the overlap is removed from one of the two windows.
+    Two overlapping windows are joined. If the joined window would be too large (see
+    EMPTY_FRACTION), the overlap is removed from one of both windows.
     """
     apart: list[Window] = []
     pending = list(windows)
@@ -687,7 +713,7 @@ def _overlap(a: Window, b: Window) -> bool:
 
 
 def _beyond(one: Window, other: Window) -> list[Window]:
-    """Return the up to four parts of window `one` that lie outside window `other`."""
+    """Return the parts (at most four) of the window `one` that are outside the window `other`."""
     (rows, columns), (cut_rows, cut_columns) = one, other
     between = slice(max(rows.start, cut_rows.start), min(rows.stop, cut_rows.stop))
     parts = [

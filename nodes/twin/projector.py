@@ -1,7 +1,7 @@
-"""Simulate a projector that lights a flat sheet; compute the errors of its calibration.
+"""Simulate a projector that illuminates a flat sheet, and compute the errors of its calibration.
 
-The projector model shares no code with that of the nodes, which the simulator serves to test. A
-plane represents the sheet, because an untouched sheet lies flat between two parallel edges.
+The projector model shares no code with that of the nodes, because the simulator is used to test the
+nodes. A plane represents the sheet, because an untouched sheet between two parallel edges is flat.
 """
 
 from __future__ import annotations
@@ -28,17 +28,19 @@ from flexsheet.nodes.twin.pixels import Sensor, quantize
 from flexsheet.nodes.twin.rig import pixels_of, slopes_of
 
 RAYS = 2
-"""The number of rays per camera pixel in each direction."""
+"""The number of rays per camera pixel along each image axis."""
 
 ROOM_LEVEL, LIT_LEVEL, DARK_LEVEL = 14.0, 150.0, 9.0
-"""Three grey levels: the room behind the sheet, the level that full projector light adds to the
-sheet, and the sheet where black is projected."""
+"""The grey levels of three parts of an image: the room behind the sheet, the light that a white
+projector pixel adds, and the sheet where black is projected."""
 
 SPREAD_PX = 0.5
-"""The blur (standard deviation) of a projected pixel on the sheet, due to lens and rubber."""
+"""The blur (standard deviation, projector pixels) of a projected pixel on the sheet, due to lens
+and rubber."""
 
 WINDOW_MARGIN = 0.05
-"""The margin around the outline of the sheet in an image, in slopes x/z and y/z of rays."""
+"""The margin around the outline of the sheet in an image, in units of the ray slopes x/z and
+y/z."""
 
 FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
 OFFSET_DEVIATION_M, ROTATION_DEVIATION_RAD = 0.004, 0.006
@@ -47,9 +49,9 @@ RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
 
 
 def make_true_projector(projector: Projector, *, seed: int) -> Projector:
-    """Return a copy of the scene's projector with random deviations, as real devices have.
+    """Return a copy of the scene's projector with random deviations, like those of real devices.
 
-    The deviations of the pose are those of a measurement by tape. Deviations are normally
+    The pose deviates as if it had been measured with a tape measure. Deviations are normally
     distributed and limited to two standard deviations.
     """
     random = np.random.default_rng(seed)
@@ -90,7 +92,7 @@ def sheet_poses(count: int) -> list[Floats]:
     poses = []
     for number in range(count):
         share = number / max(count - 1, 1)
-        towards = 2.399963 * number  # golden angle: all tilt directions differ
+        towards = 2.399963 * number  # Multiples of the golden angle give different tilt directions.
         tilt = 0.0 if number == 0 else 0.15 + 0.25 * share
         turn = rotation_from_vector(tilt * np.array([np.cos(towards), np.sin(towards), 0.0]))
         depth_m = 0.05 * np.cos(np.pi * number * 0.618)
@@ -99,10 +101,12 @@ def sheet_poses(count: int) -> list[Floats]:
 
 
 class LitSheet:
-    """A stereo camera in front of a flat sheet that the projector lights from behind."""
+    """A simulation of a stereo camera in front of a flat sheet that the projector illuminates from
+    behind.
+    """
 
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
-        """Store the simulated devices.
+        """Store the parameters of the simulated devices.
 
         camera, projector: true parameters. seed: random seed of the image noise.
         """
@@ -118,9 +122,10 @@ class LitSheet:
     def pair(
         self, patterns: Sequence[Image], world_from_sheet: Floats, points: Floats | None = None
     ) -> tuple[list[Image], list[Image]]:
-        """Render the left and right images of patterns projected on the sheet at a pose (4, 4).
+        """Render the left and right images of patterns that are projected onto the sheet at a pose
+        (4, 4).
 
-        points: points (n, 3) of a sheet that its weight bends; None: the sheet is flat.
+        points (n, 3): points of a sheet that sags by its weight, m; None for a flat sheet.
         """
         bend = None if points is None else _fit_bend(apply(inverse(world_from_sheet), points))
         world_from_left = pose_matrix(self._camera.world_from_left)
@@ -164,7 +169,7 @@ class LitSheet:
     def _find_window(
         self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats
     ) -> tuple[slice, slice]:
-        """Return the rows and columns of the image that can show the sheet.
+        """Return the ranges of image rows and columns in which the sheet can be visible.
 
         Return the whole image if a part of the sheet is behind the camera.
         """
@@ -187,10 +192,11 @@ class LitSheet:
     def _lit_by(
         self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats, bend: Floats | None
     ) -> tuple[Singles, Singles, NDArray[np.bool_]]:
-        """Return the projector columns and rows that light the sheet where camera rays hit it.
+        """Return the projector columns and rows that illuminate the sheet at the points that camera
+        rays hit.
 
-        rays: x/z and y/z (rows, columns, 2) in the camera frame. The third result states whether
-        each ray hits the sheet.
+        rays: x/z and y/z (rows, columns, 2) in the camera frame. The third result is whether each
+        ray hits the sheet.
         """
         directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
         directions = directions @ world_from_eye[:3, :3].T
@@ -213,7 +219,9 @@ class LitSheet:
 
 
 def _fit_bend(points: Floats) -> Floats:
-    """Fit the height z of points (n, 3) in the sheet's frame by a polynomial in x and y (5, 5)."""
+    """Return the coefficients (5, 5) of a polynomial z(x, y) that is fitted to points (n, 3) in the
+    sheet's frame.
+    """
     powers = polynomial.polyvander2d(points[:, 0], points[:, 1], [4, 4])
     return np.asarray(np.linalg.lstsq(powers, points[:, 2], rcond=None)[0].reshape(5, 5))
 
@@ -221,7 +229,7 @@ def _fit_bend(points: Floats) -> Floats:
 def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Intersect rays (..., 3) from a point with the x-y plane of a pose (4, 4).
 
-    Return the points (..., 3), and whether they lie in front of the origin of the rays.
+    Return the points (..., 3), and whether they are in front of the origin of the rays.
     """
     normal = plane[:3, 2]
     slant = directions @ normal
@@ -231,7 +239,7 @@ def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats,
 
 
 def pixels_lighting(projector: Projector, points: Floats) -> Floats:
-    """Return the projector pixels (..., 2) that light world points (..., 3).
+    """Return the projector pixels (..., 2) that illuminate world points (..., 3), m.
 
     The points must be in front of the projector.
     """
@@ -243,11 +251,12 @@ def pixels_lighting(projector: Projector, points: Floats) -> Floats:
 def errors_at_eye(
     believed: Projector, true: Projector, eye: Floats, planes: Sequence[Floats], half_m: float
 ) -> Floats:
-    """Return the distances (n,), m, of projected points from their intended positions for an eye.
+    """Return the distances (n,), m, between the intended and the actual positions of projected
+    points, as an eye sees them.
 
-    The distances are measured on the imaginary screen, the world plane z = 0. The points form a
-    grid of +-half_m on each plane (4, 4). The calibrated projector `believed` determines the pixels
-    of the points, and the projector `true` casts the light of these pixels.
+    The distances are measured on the imaginary screen, which is the world plane z = 0. The points
+    form a grid of +-half_m on each plane (4, 4). The pixels are computed with the calibrated
+    projector `believed`. The projector `true` projects these pixels.
     """
     axis = np.linspace(-half_m, half_m, 9)
     flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)

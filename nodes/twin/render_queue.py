@@ -1,11 +1,13 @@
-"""Queue the frames that the simulated eye renders: one per label, correction and viewpoint."""
+"""Queue the frames that the simulated eye renders, one for each label, correction method and
+viewpoint.
+"""
 
 from __future__ import annotations
 
 from typing import Generic, TypeVar
 
 Key = tuple[str, ...]
-"""The label, correction and viewpoint of a frame, which identify a rendering job."""
+"""The label, correction method and viewpoint of a frame. They identify a rendering job."""
 
 J = TypeVar("J")
 
@@ -54,7 +56,9 @@ class RenderQueue(Generic[J]):
         self._jobs[key] = job
 
     def next(self) -> tuple[Key, J]:
-        """Return key and content of the oldest job without removing the job from the queue."""
+        """Return the key and the content of the oldest job, without removing the job from the
+        queue.
+        """
         return next(iter(self._jobs.items()))
 
     def finish(self, key: Key, now_ns: int) -> None:

@@ -1,8 +1,8 @@
-"""Simulate the stereo camera's true geometry and lenses.
+"""Simulate the true geometry and the true lenses of the stereo camera.
 
-The section `camera` of a scene corresponds to a data sheet. The simulated device deviates from it,
-and only a calibration determines the deviations. The camera model shares no code with that of the
-nodes, which the simulator serves to test.
+The section `camera` of a scene corresponds to a data sheet. The simulated device deviates from the
+data sheet, and only a calibration determines the deviations. The camera model shares no code with
+that of the nodes, because the simulator is used to test the nodes.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ FOCAL_DEVIATION = 0.005
 """The relative standard deviation of the focal length between devices of one model."""
 
 ASPECT_DEVIATION = 0.0005
-"""The relative standard deviation of fy from fx, which is small since pixels are nearly square."""
+"""The relative standard deviation of fy from fx. It is small because pixels are nearly square."""
 
 CENTRE_DEVIATION_PX = 4.0
-"""The standard deviation of the principal point between devices, in an image 640 px wide."""
+"""The standard deviation (px) of the principal point between devices, for an image width of 640
+px."""
 
 # k1 and k2 of typical lenses with 66 degrees of horizontal field of view, which data sheets omit.
 RADIAL = (-0.30, 0.11)
@@ -37,10 +38,10 @@ RADIAL_DEVIATION = (0.015, 0.01)
 
 TANGENTIAL_DEVIATION = 0.0004
 OFFSET_DEVIATION_M = 0.0001
-"""The standard deviation, per axis, of the right camera's position."""
+"""The standard deviation, per axis, of the right camera's position relative to the data sheet."""
 
 ROTATION_DEVIATION_RAD = 0.004
-"""The standard deviation, per axis, of the right camera's rotation: 0.23 degrees."""
+"""The standard deviation, per axis, of the right camera's rotation relative to the data sheet."""
 
 NEWTON_STEPS = 12
 
@@ -48,8 +49,9 @@ NEWTON_STEPS = 12
 def make_true_camera(camera: StereoCamera) -> StereoCamera:
     """Return true camera parameters, which deviate at random from those in the scene.
 
-    The random seed is the device name. The deviations are normally distributed and limited to two
-    standard deviations. The pose of the left camera, image size, rate and exposure are unchanged.
+    The random seed is derived from the device name. The deviations are normally distributed and
+    limited to two standard deviations. The pose of the left camera, image size, rate and exposure
+    are unchanged.
     """
     name = hashlib.sha256(camera.device.encode()).digest()
     random = np.random.default_rng(np.frombuffer(name, dtype=np.uint32))
@@ -87,9 +89,9 @@ def make_true_camera(camera: StereoCamera) -> StereoCamera:
 
 
 def pixels_of(lens: Lens, slopes: Floats) -> Floats:
-    """Project rays to pixels (..., 2) with Brown's distortion.
+    """Project rays to pixels (..., 2) of a lens with Brown's distortion.
 
-    slopes: x/z and y/z of the rays (..., 2).
+    slopes (..., 2): x/z and y/z of the rays.
     """
     return np.stack(project_ray(lens, slopes[..., 0], slopes[..., 1]), axis=-1)
 
@@ -97,7 +99,7 @@ def pixels_of(lens: Lens, slopes: Floats) -> Floats:
 def project_ray(lens: Lens, u: T, v: T) -> tuple[T, T]:
     """Return the pixel column and row of a ray, or arrays of both for arrays of rays.
 
-    u, v: x/z and y/z of the ray. For a single ray, floats are many times faster than arrays.
+    u, v: x/z and y/z of the ray. For a single ray, Python floats are much faster than arrays.
     """
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v
@@ -108,9 +110,10 @@ def project_ray(lens: Lens, u: T, v: T) -> tuple[T, T]:
 
 
 def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
-    """Return the derivatives dx/du, dx/dv and dy/dv of Brown's distortion; dy/du equals dx/dv.
+    """Return the derivatives dx/du, dx/dv and dy/dv of Brown's distortion, where dy/du equals
+    dx/dv.
 
-    u, v: x/z and y/z of the ray; x, y: the slopes after distortion.
+    u, v: x/z and y/z of the ray. x and y are these slopes after the distortion.
     """
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v
@@ -133,8 +136,8 @@ def pixels_per_slope(lens: Lens, slope_x: float, slope_y: float) -> float:
 def slopes_of(lens: Lens, pixels: Floats) -> Floats:
     """Return the slopes x/z and y/z (..., 2) of the rays through pixels (..., 2).
 
-    The function inverts `pixels_of` by Newton's method. The result is valid wherever the distortion
-    is injective.
+    The function inverts `pixels_of` by Newton's method. The result is valid where different rays
+    have different pixels.
     """
     x_px, y_px = pixels[..., 0], pixels[..., 1]
     # Separate arrays, because numpy is about twice as fast with contiguous ones.

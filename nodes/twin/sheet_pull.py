@@ -1,6 +1,6 @@
-"""Displace the flanges (last links of the arms) by the tension and weight of the sheet.
+"""Displace the flanges (last links of the arms) by the tension and the weight of the sheet.
 
-The apparatus holds the true parameters of the simulated hardware.
+An apparatus contains the true parameters of the simulated hardware.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from flexsheet.nodes.twin.force_history import ForceHistory
 from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, TrueRubber, solve
 
 CELLS = 8
-"""The number of node intervals per side of the sheet's mesh. Without a finger, the force differs by
-1 % from the force with 32 intervals."""
+"""The number of intervals between nodes along each side of the sheet's mesh. Without a finger, the
+force differs by 1 % from the force with 32 intervals."""
 
 STRETCHES = (1.0, 1.01, 1.03, 1.06, 1.1, 1.15, 1.2, 1.3)
 
 
 def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> TrueRubber:
-    """Make the simulated sheet from its true dimensions and material."""
+    """Return the true dimensions and material of the simulated sheet."""
     gradient = (0.0, 0.0) if apparatus is None else apparatus.sheet.thickness_gradient_ratio
     return TrueRubber(
         sheet.width_m,
@@ -38,18 +38,22 @@ def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> TrueRubber:
 
 
 def true_friction(apparatus: Apparatus | None) -> float | None:
-    """Return the friction coefficient of finger and sheet, or None if touched rubber sticks."""
+    """Return the friction coefficient between finger and sheet, or None if touched rubber
+    sticks.
+    """
     return None if apparatus is None else apparatus.sheet.friction_coefficient
 
 
 @dataclass(slots=True)
 class SheetPull:
-    """The force with which the sheet pulls on both arms, and the compliance of the arms.
+    """A model of the sheet's tension on both arms, and of the resulting displacement of compliant
+    arms.
 
-    The force of a finger on the sheet is neglected, since it is small compared with the tension.
-    distances_m, forces_n: (n,) tension as a function of the distance between the clamped edges.
+    The force of a finger on the sheet is neglected, because it is small compared with the tension.
+
+    distances_m, forces_n (n,): tension as a function of the distance between the clamped edges.
     compliances_m_per_n: displacement of the left and right flange per force.
-    weight_n: (3,) weight of the sheet; each flange carries half of it.
+    weight_n (3,): weight of the sheet. Each flange carries half of the weight.
     history: hysteresis and creep of the tension; None for elastic rubber.
     """
 
@@ -64,7 +68,7 @@ class SheetPull:
     def of(cls, sheet: SheetSpec, apparatus: Apparatus) -> Self | None:
         """Compute the tension of the true sheet with the membrane model.
 
-        Return None if both arms are rigid, because nothing is displaced then.
+        Return None if both arms are rigid, because then no flange is displaced.
         """
         arms = apparatus.arms
         compliances = arms.left.flange_compliance_m_per_n, arms.right.flange_compliance_m_per_n
@@ -86,7 +90,8 @@ class SheetPull:
         )
 
     def force_n(self, distance_m: float) -> float:
-        """Return the tension (N) of a sheet whose edges would be at `distance_m` with rigid arms.
+        """Return the tension (N) of a sheet whose edges would have the distance `distance_m` on
+        rigid arms.
 
         The compliant flanges move until the sheet and the arms are in equilibrium.
         """
@@ -95,7 +100,10 @@ class SheetPull:
         return float(np.interp(distance_m, rigid_m, forces_n))
 
     def _remember(self, distance_m: float, time_s: float) -> None:
-        """Update the hysteresis and creep, if modelled, with the tension at a distance."""
+        """Add the tension at a distance of the edges to the history of hysteresis and creep.
+
+        This method has no effect if hysteresis and creep are not modelled.
+        """
         if self.history is None:
             return
         elastic_n = self.force_n(distance_m) / self._rubber_ratio
@@ -111,7 +119,7 @@ class SheetPull:
         *,
         time_s: float = 0.0,
     ) -> tuple[Floats, Floats]:
-        """Return both flange poses (4, 4), displaced by the sheet's tension and weight.
+        """Return both flange poses (4, 4) after displacement by the sheet's tension and weight.
 
         The flanges are not rotated. time_s: time of the poses, which must not decrease.
         """

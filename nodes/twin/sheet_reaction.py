@@ -1,9 +1,10 @@
-"""Tabulate the force of the simulated sheet on a finger, to look it up every millisecond.
+"""Tabulate the force of the simulated sheet on a finger, because the force is needed every
+millisecond.
 
 The membrane model takes a tenth of a second per push. The table contains the normal force of pushes
-along the sheet's normal. The force is the product of two factors. One is the force at the sheet's
-centre for several stretch ratios. The other is the ratio of the force at other positions to the
-force at the centre, at the mean stretch.
+along the sheet's normal. The force is the product of two factors. The first factor is the force at
+the sheet's centre for several stretch ratios. The second factor is the ratio of the force at other
+positions to the force at the centre, for the mean stretch ratio.
 """
 
 from __future__ import annotations
@@ -25,13 +26,14 @@ from flexsheet.nodes.twin.sheet_surface import lagrange
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 VERSION = 1
-"""The version of the computation; cached tables of other versions are computed again."""
+"""The version of the computation. Cached tables of other versions are computed again."""
 
 CELLS = 16
-"""The number of cells per side of the mesh. With 32 cells, the force differs by 1 to 4 %."""
+"""The number of finite elements along each side of the sheet. With 32 elements, the force differs
+by 1 to 4 %."""
 
 DEPTH_FRACTIONS = np.array([0.04, 0.12, 0.25, 0.45, 0.7, 1.0])
-"""The depths of the solved pushes, as fractions of the scene's maximum push depth."""
+"""The depths of the computed pushes, as fractions of the scene's maximum push depth."""
 
 POSITION_FRACTIONS = np.array([0.0, 0.2, 0.375])
 """The distances of the pushes from the sheet's centre, as fractions of its width and height."""
@@ -43,12 +45,13 @@ DEPTH_STEPS = 256
 
 @dataclass(frozen=True, slots=True)
 class SheetReaction:
-    """The normal force (N) of the sheet on a finger over stretch, position and indentation.
+    """A table of the normal force (N) of the sheet on a finger over stretch ratio, position and
+    indentation.
 
     width_m, height_m: dimensions of the sheet at rest, (1,). stretches (s,): stretch ratios.
-    depths_m (d,): depths in equal steps from 0. centre_n (s, d): force at the centre. ratios
-    (p, p, d): ratio of the force at POSITION_FRACTIONS of width and height to the force at the
-    centre. The sheet is assumed to be symmetric.
+    depths_m (d,): depths in equal steps from 0. centre_n (s, d): force at the centre. ratios (p, p,
+    d): ratio of the force at POSITION_FRACTIONS of width and height to the force at the centre. The
+    sheet is assumed to be symmetric.
     """
 
     width_m: Floats
@@ -79,7 +82,9 @@ class SheetReaction:
 def load_or_compute_reaction(
     scene: Scene, apparatus: Apparatus | None, cache_dir: Path | None = None
 ) -> SheetReaction:
-    """Return the force table of a scene's true sheet from the cache, or compute it in 10 s."""
+    """Return the force table of a scene's true sheet from the cache, or compute it. The computation
+    takes 10 s.
+    """
     true_scene = apply_apparatus(scene, apparatus)
     sheet = true_scene.sheet
     rubber = replace(
@@ -109,14 +114,17 @@ def load_or_compute_reaction(
 def compute_reaction(
     rubber: TrueRubber, stretches: Floats, depths_m: Floats, *, finger_radius_m: float
 ) -> SheetReaction:
-    """Compute the force table with the membrane model; the sheet's weight is neglected.
+    """Compute the force table with the membrane model. The sheet's weight is neglected.
 
     stretches: stretch ratios (s,). depths_m: push depths (n,). Raises NotConvergedError if the
-    shallow pushes have no solution.
+    iteration does not converge for shallow pushes.
     """
 
     def push_n(stretch: float, across: float, along: float) -> Floats:
-        """Return the forces (n,), N, at a position in fractions of the sheet's width and height."""
+        """Return the normal forces (n,), N, of a push at all depths.
+
+        across, along: position, as fractions of the sheet's width and height from its centre.
+        """
         half_m = 0.5 * stretch * rubber.width_m
         edges = [transform(np.eye(3), [side * half_m, 0.0, 0.0]) for side in (-1.0, 1.0)]
         at = 2.0 * across * half_m, along * rubber.height_m

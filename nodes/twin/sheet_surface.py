@@ -1,6 +1,7 @@
-"""Compute the surface of the unloaded sheet: the plane between its edges, and the sag by weight.
+"""Compute the surface of the unloaded sheet: the plane between its edges, and its sag by weight.
 
-The sag is computed with the simulator's membrane, which shares no code with the nodes' sag model.
+The sag is computed with the membrane model of the simulator, which shares no code with the sag
+model of the nodes.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 CELLS = 8
-"""The number of membrane elements per side. The sag at the usable height differs by 0.3 % from the
-sag with 32 elements."""
+"""The number of finite elements along each side of the sheet. In the usable part of the sheet, the
+sag differs by 0.3 % from that with 32 elements."""
 
 STRETCH_NODES = 4
 LEANS = np.array([0.35, 0.7, 1.0])
-"""The vertical components of the sheet normal in the sag table; the sag is zero at 0."""
+"""The vertical components of the sheet's unit normal in the sag table. At 0, the sag is zero."""
 
 STRETCH_MARGIN = 0.005
 """The extension of the sag table beyond the scene's range of stretch ratios at both ends."""
@@ -34,8 +35,10 @@ STRETCH_MARGIN = 0.005
 
 @dataclass(frozen=True, slots=True)
 class SheetPlanes:
-    """The planes at n times: points (n, 3) m, unit normals and x axes (n, 3), and distances between
-    the clamped edges (n,) m. For planes through the edges, the points are midway between both
+    """The planes of the sheet at n times.
+
+    The attributes are points (n, 3), m, unit normals (n, 3), x axes (n, 3), and distances (n,)
+    between the clamped edges, m. For planes through the edges, the points are midway between the
     edges.
     """
 
@@ -48,7 +51,8 @@ class SheetPlanes:
 def make_edge_plane(left: Floats, right: Floats) -> Floats:
     """Return the pose (4, 4) of the plane through both edges (4, 4) of the sheet.
 
-    The origin is midway between the edges, x points to the right edge and z towards the user.
+    The origin is midway between the edges. x points to the right edge, and z points towards the
+    user.
     """
     across = right[:3, 3] - left[:3, 3]
     across = across / np.linalg.norm(across)
@@ -59,7 +63,7 @@ def make_edge_plane(left: Floats, right: Floats) -> Floats:
 
 
 class SagTable:
-    """A table of the unloaded sheet's sag over stretch, tilt and position."""
+    """A table of the unloaded sheet's sag over stretch ratio, tilt and position."""
 
     def __init__(
         self, rubber: TrueRubber, min_stretch_ratio: float, max_stretch_ratio: float
@@ -76,7 +80,8 @@ class SagTable:
     def evaluate(
         self, distances_m: Floats, leans: Floats, x_m: Floats, y_m: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the sag (n,), in m, along the normal, and its derivatives along x and y (n,).
+        """Return the sag (n,), m, along the normal, and its derivatives (n,) with respect to x and
+        y.
 
         distances_m: distances (n,) between the edges. leans: vertical components (n,) of the sheet
         normals. x_m, y_m: positions (n,) relative to the sheet's centre.
@@ -98,14 +103,16 @@ class SagTable:
 def _compute_tension(stretch: Floats) -> Floats:
     """Return the normalized tension (n,) of a uniaxially stretched neo-Hookean sheet.
 
-    The product of sag and tension hardly depends on the stretch, which makes its interpolation
+    The product of sag and tension depends little on the stretch. Therefore its interpolation is
     accurate.
     """
     return stretch - stretch**-2
 
 
 def lagrange(nodes: Floats, at: Floats | float) -> Floats:
-    """Return the values (nodes, ...) of the Lagrange polynomials of `nodes` at positions (...)."""
+    """Return the values (n, ...) of the n Lagrange polynomials of `nodes` (n,) at positions
+    (...).
+    """
     factors = [
         np.prod([(at - other) / (node - other) for other in nodes if other != node], axis=0)
         for node in nodes
@@ -116,9 +123,10 @@ def lagrange(nodes: Floats, at: Floats | float) -> Floats:
 def _solve_sag(
     rubber: TrueRubber, stretch: float, lean: float
 ) -> scipy.interpolate.RectBivariateSpline:
-    """Solve the sag (m) of a tilted sheet as a function of x and y.
+    """Compute the sag (m) of a tilted sheet as a function of x and y.
 
-    x: position between the edges (0..1). y: m. lean: vertical component of the sheet normal.
+    x is the position between the edges from 0 to 1, and y is the position along the edges in m.
+    lean: vertical component of the sheet's unit normal.
     """
     cosine = np.sqrt(1.0 - lean**2)
     rotation = np.array([[1.0, 0.0, 0.0], [0.0, cosine, lean], [0.0, -lean, cosine]])
@@ -137,7 +145,10 @@ def _cached_table(rubber: TrueRubber, low: float, high: float) -> SagTable:
 
 @dataclass(frozen=True, slots=True)
 class SheetSurface:
-    """The surface of a scene's unloaded sheet. table: its sag; None for a sheet without weight."""
+    """The surface of a scene's unloaded sheet.
+
+    table: sag of the sheet; None for a sheet without weight.
+    """
 
     table: SagTable | None
 
@@ -150,9 +161,11 @@ class SheetSurface:
         return cls(_cached_table(rubber, max(low - STRETCH_MARGIN, 1.01), high + STRETCH_MARGIN))
 
     def find_tangent_planes(self, planes: SheetPlanes, points: Floats, up: Floats) -> SheetPlanes:
-        """Return the tangent planes of the sheet at the projections of points (n, 3) onto it.
+        """Return the tangent planes of the sheet at the projections of points (n, 3) onto the
+        sheet.
 
-        planes: planes through the edges. up: unit vector (3,) against gravity, in the same frame.
+        planes: planes through the edges. up (3,): unit vector against gravity, in the frame of the
+        planes.
         """
         if self.table is None:
             return planes

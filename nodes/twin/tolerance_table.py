@@ -1,11 +1,11 @@
 """List the tolerances of real hardware, and generate random apparatuses from them.
 
-An apparatus holds the true parameters of the simulated hardware, as deviations from the parameters
-in the scene, which the nodes assume. The option `--apparatus seed:N` generates a random apparatus
-from this table. Each row has its own stream of random numbers, so a new row changes no other value.
-Seeds 0 to 99 are for development; no method may be tuned on any other seed. A calibrated apparatus
-describes a laboratory that has calibrated its devices. Its deviations are the residual errors of
-the calibrations.
+An apparatus contains the true parameters of the simulated hardware, as deviations from the
+parameters in the scene. The nodes assume the parameters in the scene. The option `--apparatus
+seed:N` generates a random apparatus from this table. Each row has its own stream of random numbers,
+so a new row changes no other value. Seeds 0 to 99 are for development. No method may be tuned on
+other seeds. A calibrated apparatus describes a laboratory that has calibrated its devices. Its
+deviations are the residual errors of the calibrations.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
 
 MAX_DEVIATION_SIGMAS = 3.0
-"""The maximum deviation of a random sample, in standard deviations. A laboratory would notice and
-correct a larger deviation."""
+"""The maximum deviation of a random sample, in standard deviations. A real laboratory would notice
+and correct a larger deviation."""
 
 
 class Profile(StrEnum):
@@ -40,20 +40,24 @@ class Profile(StrEnum):
 
 
 class Distribution(Protocol):
-    """An interface of a probability distribution of one quantity."""
+    """The interface of a probability distribution of one quantity."""
 
     def draw(self, random: np.random.Generator) -> Any:
         """Return a random sample."""
         ...
 
     def at(self, sigmas: float) -> Any:
-        """Return the quantile that corresponds to `sigmas` standard deviations of a normal one."""
+        """Return the quantile that corresponds to `sigmas` standard deviations of a normal
+        distribution.
+        """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """A normal distribution, limited to MAX_DEVIATION_SIGMAS and to the range `low` to `high`."""
+    """A normal distribution, truncated at MAX_DEVIATION_SIGMAS and at the limits `low` and
+    `high`.
+    """
 
     mean: float
     sigma: float
@@ -70,7 +74,7 @@ class Normal:
 
 @dataclass(frozen=True, slots=True)
 class LogNormal:
-    """A log-normal distribution, limited to MAX_DEVIATION_SIGMAS."""
+    """A log-normal distribution, truncated at MAX_DEVIATION_SIGMAS."""
 
     median: float
     sigma_ln: float
@@ -85,7 +89,7 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True)
 class HalfNormal:
-    """A half-normal distribution (absolute normal values), limited to MAX_DEVIATION_SIGMAS."""
+    """A half-normal distribution (of absolute normal values), truncated at MAX_DEVIATION_SIGMAS."""
 
     sigma: float
 
@@ -128,7 +132,7 @@ class LogUniform:
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """A choice of one of a few values in ascending order, all equally likely."""
+    """A discrete distribution over a few values in ascending order, with equal probabilities."""
 
     values: tuple[float, ...]
 
@@ -142,7 +146,7 @@ class OneOf:
 
 @dataclass(frozen=True, slots=True)
 class Always:
-    """A constant value, without tolerance."""
+    """A distribution that always gives the same value, for parameters without tolerance."""
 
     value: float | str
 
@@ -160,12 +164,13 @@ class Tolerance:
     key: dotted path in the apparatus; "*" stands for both arms or both lenses.
     unit, scale: unit in tables, and the factor from SI units to this unit.
     modern: distribution of every component, or a tuple with one distribution per component.
-    source, calibrated_source: source of the numbers.
-    paper: distribution for the profile `paper`; None: the distribution `modern`.
+    source, calibrated_source: literature or data sheet from which the numbers are taken.
+    paper: distribution for the profile `paper`; None if it equals `modern`.
     calibrated: distribution after calibration; None if no calibration affects the parameter.
-    pair: distribution of the difference between the arms; each arm adds its own sample of `pair` to
-        the common sample. None: the samples of both arms are independent.
-    frame_periods: profiles in which the sample is in periods of the true camera rate, not seconds.
+    pair: distribution of the deviation of each arm from the common sample of both arms; None if the
+        samples of both arms are independent.
+    frame_periods: profiles in which the unit of the sample is the period of the true camera instead
+        of seconds.
     """
 
     key: str
@@ -345,21 +350,24 @@ NOT_SIMULATED: dict[str, str] = {
     "finger.hand_damping_ratio": _ONLY_COUPLED,
     "finger.hand_stiffness_n_per_m": _ONLY_COUPLED,
 }
-"""The keys of an apparatus that have no effect in the shipped graphs, and the reason for each."""
+"""The keys of an apparatus that have no effect in the launch files of this package, with the reason
+for each key."""
 
 
 def expand_key(key: str) -> tuple[str, ...]:
-    """Return the paths that a key stands for: one for each side if the key contains "*"."""
+    """Return the dotted paths that a key represents. A key with "*" represents one path for each
+    side.
+    """
     return tuple(key.replace("*", side) for side in ("left", "right")) if "*" in key else (key,)
 
 
 def sample_apparatus(
     scene: Scene, seed: int, *, profile: Profile = Profile.MODERN, calibrated: bool = False
 ) -> Apparatus:
-    """Generate a random apparatus for a scene; equal arguments give equal results.
+    """Generate a random apparatus (true hardware parameters) for a scene.
 
-    All profiles use the same random numbers for the same seed, with and without calibration, so
-    that results can be compared in pairs.
+    Equal arguments give equal results. With and without calibration, all profiles use the same
+    random numbers for the same seed. Therefore results can be compared in pairs.
     """
     values = nominal_apparatus(scene).model_dump(mode="json")
     for row in TOLERANCES.values():
@@ -377,11 +385,12 @@ def deviate_apparatus(
     profile: Profile = Profile.MODERN,
     calibrated: bool = False,
 ) -> Apparatus:
-    """Make an apparatus in which only the parameter `key` deviates from the scene.
+    """Make an apparatus (true hardware parameters) in which only the parameter `key` deviates from
+    the scene.
 
     sigmas: size of the deviation, in standard deviations of a normal distribution. All components
-    of a vector, and both arms or lenses, deviate equally. Raises KeyError for a key that is not in
-    the tolerance table.
+    of a vector deviate equally, and so do both arms or lenses. Raises KeyError for a key that is
+    not in the tolerance table.
     """
     row = TOLERANCES[key]
     given = row.of(profile, calibrated=calibrated)
@@ -419,7 +428,9 @@ def _draw_row(
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:
-    """Return the random generator of the parameter `name`; the parameters are independent."""
+    """Return the random generator of the parameter `name`, which is independent of those of other
+    parameters.
+    """
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 

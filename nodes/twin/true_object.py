@@ -1,7 +1,7 @@
 """Compute the surface of the virtual object, at rest or deformed, to verify the displayed images.
 
-The skin is the surface mesh of the soft-body solver. The object has a separate, finer mesh here,
-which follows the displacement of the skin.
+The skin is the surface mesh of the soft-body solver. This module uses a separate, finer mesh, which
+follows the displacement of the skin.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from flexsheet.nodes.models.shapes.triangles import find_degenerate, nearest_in_
 Indices = NDArray[np.intp]
 
 AROUND, ALONG = 160, 40
-"""The number of vertices around the x axis, and the number of vertex rows along the x axis. Rounded
+"""The number of vertices around the x axis, and the number of vertex rows along the x axis. Round
 shapes have twice as many rows."""
 PLANE_CELLS = 64
 MAX_EDGE_M = 0.004
 """The maximum edge length of the triangles of a mesh object after subdivision."""
 NEAREST_VERTICES = 3
-"""The number of skin vertices near a point whose triangles are searched for the nearest point."""
+"""The number of skin vertices near a point. Their triangles are searched for the nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrueObject:
     """A mesh of the virtual object's surface at one time.
 
-    vertices: (vertices, 3) in the world frame; they are doubled along sharp edges.
-    triangles: (triangles, 3) indices of vertices, facing outward.
-    normals: (vertices, 3) unit normals.
-    sunk_m: (vertices,) depth by which each vertex is pushed in.
-    colour: (3,) red, green, blue in full light, 0 to 1.
+    vertices (v, 3): positions in the world frame, m. They are duplicated along sharp edges.
+    triangles (t, 3): indices of vertices, counter-clockwise as seen from outside.
+    normals (v, 3): unit normals.
+    sunk_m (v,): depths by which the vertices are pushed in.
+    colour (3,): red, green and blue in full light, from 0 to 1.
     """
 
     vertices: Floats
@@ -49,7 +49,9 @@ class TrueObject:
 
 
 class TrueBody:
-    """The virtual object of a scene, of any shape; a plane is the rectangle that can be touched."""
+    """The virtual object of a scene, which may have any shape. A plane is a rectangle of the
+    touchable size.
+    """
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object
@@ -80,10 +82,12 @@ class TrueBody:
     def displaced(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer], displacement: Floats
     ) -> TrueObject:
-        """Return the deformed object: each point moves with the nearest point of the skin at rest.
+        """Return the deformed object, each point of which moves with the nearest point of the skin
+        at rest.
 
-        skin_vertices: (skin vertices, 3) at rest, m.
-        displacement: (skin vertices, 3), m, interpolated linearly in skin_triangles (triangles, 3).
+        skin_vertices (s, 3): vertices of the skin (solver's surface mesh) at rest, m.
+        skin_triangles (t, 3): triangles in which the displacement is interpolated linearly.
+        displacement (s, 3): displacement of the vertices, m.
 
         Raises ValueError if displacement and skin have different shapes, or if all triangles of the
         skin have zero area.
@@ -99,7 +103,8 @@ class TrueBody:
     def _on_skin(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer]
     ) -> tuple[Indices, Floats]:
-        """Return three skin vertices (vertices, 3) and weights (vertices, 3) per object vertex.
+        """Return, for each object vertex, the indices (v, 3) and weights (v, 3) of three skin
+        vertices.
 
         Both arrays are cached until the skin changes.
         """
@@ -122,10 +127,10 @@ class TrueBody:
 
 
 def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
-    """Find the point of a mesh that is nearest to each of the points (points, 3).
+    """Find the points of a mesh that are nearest to `points` (n, 3).
 
-    Return the triangle corners (points, 3) and barycentric weights (points, 3) of the nearest
-    points. Raises ValueError if all triangles have zero area.
+    Return the triangle corners (n, 3) and barycentric weights (n, 3) of the nearest points. Raises
+    ValueError if all triangles have zero area.
     """
     triangles = triangles[~find_degenerate(vertices, triangles)]
     if not len(triangles):
@@ -181,7 +186,9 @@ def _turned() -> Floats:
 
 
 def _tube(radius_m: float, length_m: float) -> tuple[Floats, Indices]:
-    """Return vertices and triangles of a closed cylinder along x; rim vertices are doubled."""
+    """Return the vertices and triangles of a closed cylinder along x. The vertices on the rims are
+    duplicated.
+    """
     side = np.repeat(radius_m * _turned()[None], ALONG + 1, axis=0)
     side[..., 0] = length_m * np.linspace(-0.5, 0.5, ALONG + 1)[:, None]
     count = AROUND * (ALONG + 1)
@@ -206,10 +213,10 @@ def _rectangle(width_m: float, height_m: float) -> tuple[Floats, Indices]:
 
 
 def _directions() -> Floats:
-    """Return unit vectors (directions, 3) that cover the sphere.
+    """Return unit vectors (n, 3) that cover the sphere.
 
-    The vectors are ordered in rows around the x axis, from -x to +x. The vectors -x and +x come
-    last.
+    The vectors are ordered in rows around the x axis, from -x to +x. The last two vectors are -x
+    and +x.
     """
     polar = np.pi * np.arange(1, 2 * ALONG) / (2 * ALONG)
     rows = np.sin(polar)[:, None, None] * _turned()
@@ -218,7 +225,9 @@ def _directions() -> Floats:
 
 
 def _star(vertices: Floats) -> tuple[Floats, Indices]:
-    """Return vertices and triangles of a closed surface with one vertex per direction vector."""
+    """Return the vertices and triangles of a closed surface with one vertex per unit vector of
+    `_directions`.
+    """
     rows, count = 2 * ALONG - 1, len(vertices)
     first, last = np.arange(AROUND), (rows - 1) * AROUND + np.arange(AROUND)
     caps = [_fan(first, count - 2), _fan(last[::-1], count - 1)]
@@ -226,9 +235,9 @@ def _star(vertices: Floats) -> tuple[Floats, Indices]:
 
 
 def _cast_rays(geometry: Geometry, shape: Shape) -> Floats:
-    """Return the points (directions, 3), m, where rays from the centre leave a solid.
+    """Return the points (n, 3), m, at which rays from the centre leave a solid.
 
-    The solid must be star-shaped: each of its points must be visible from the centre.
+    The solid must be star-shaped, so that all of its points are visible from the centre.
     """
     away = _directions()
     match geometry:
@@ -248,7 +257,7 @@ def _cast_rays(geometry: Geometry, shape: Shape) -> Floats:
 
 
 def _cut_up(vertices: Floats, triangles: Indices) -> tuple[Floats, Indices]:
-    """Divide each triangle into four, repeatedly, until no edge is longer than `MAX_EDGE_M`."""
+    """Divide each triangle into four repeatedly until no edge is longer than `MAX_EDGE_M`."""
     while True:
         corners = vertices[triangles]
         longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())

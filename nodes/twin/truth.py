@@ -1,7 +1,7 @@
 """Replace the assumed parameters of a scene by the true parameters of the simulated hardware.
 
-The scene describes the object and the devices as the nodes assume them. The apparatus contains the
-deviations of the simulated devices from the scene.
+The scene describes the object and the devices according to the assumptions of the nodes. The
+apparatus contains the deviations of the simulated devices from the scene.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from flexsheet.nodes.node import NodeParameters
 
 
 class SimulatorParameters(NodeParameters):
-    """The parameters of a simulator node, which only simulators have."""
+    """The parameters that all simulator nodes have in common."""
 
     apparatus: Apparatus | None = Field(
         default=None,
@@ -45,10 +45,11 @@ class SimulatorParameters(NodeParameters):
 
 
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
-    """Return the true time (s) at which the projector shows a frame, minus the assumed time.
+    """Return the true time at which the projector shows a frame, minus the assumed time, in
+    seconds.
 
-    The renderer's assumed latency is stored in the frame; without a displayed frame, it is the
-    nominal latency. The result is 0 without an apparatus.
+    The latency that the renderer assumes is stored in the frame. Without a displayed frame, the
+    nominal latency is used. The result is 0 without an apparatus.
     """
     if apparatus is None:
         return 0.0
@@ -59,11 +60,12 @@ def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> fl
 
 
 def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
-    """Return the scene with the true devices, or the scene itself if there is no apparatus.
+    """Return the scene with the true parameters of the devices, or the scene itself without an
+    apparatus.
 
     Virtual objects and requirements in the scene are unchanged. The returned camera has the lenses
-    of its data sheet plus the apparatus offsets; `make_true_camera` adds the deviations of the
-    individual camera.
+    of its data sheet plus the offsets in the apparatus. The function `make_true_camera` adds the
+    deviations of the individual camera.
     """
     if apparatus is None:
         return scene
@@ -168,8 +170,8 @@ def _true_arm(arm: ArmSpec, truth: ArmTruth) -> ArmSpec:
 def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[float, ...]) -> Pose:
     """Return a pose that is translated in its parent frame and rotated about its own origin.
 
-    shift_m: translation (3,). rotation_rad: rotation vector (3,); zero leaves the angles exactly
-    unchanged.
+    shift_m: translation (3,). rotation_rad: rotation vector (3,). With a zero vector, the angles
+    are exactly unchanged.
     """
     rpy_rad = pose.rpy_rad
     if any(rotation_rad):
@@ -179,10 +181,10 @@ def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[fl
 
 
 def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
-    """Return the same hardware, described in the world frame that the stereo camera defines.
+    """Express the true hardware parameters in the world frame that the stereo camera defines.
 
-    Calibrations define the world by the left camera, whose pose in the scene is then exact. The
-    pose errors of the camera therefore become opposite pose errors of arms, projector and eyes. The
+    Calibrations define the world frame by the left camera. Therefore the pose of this camera in the
+    scene is exact, and its pose errors become opposite pose errors of arms, projector and eyes. The
     finger's path, the direction of gravity and the finger's tilt have the same coordinates in the
     new world frame.
     """
@@ -234,7 +236,9 @@ def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
 
 
 def check_truth(scene: Scene, apparatus: Apparatus) -> list[tuple[tuple[str, ...], Any, str, str]]:
-    """List the impossible values of an apparatus in its scene: (key, value, problem, remedy)."""
+    """List the values of an apparatus that are impossible in its scene, as (key, value, problem,
+    remedy).
+    """
     base = apparatus.nominal or scene
     found: list[tuple[tuple[str, ...], Any, str, str]] = []
     radius_m = base.finger.radius_m + apparatus.finger.radius_offset_m

@@ -1,4 +1,4 @@
-"""Simulate a viewer who, with one eye closed, aligns a bead with a point on the sheet."""
+"""Simulate a viewer who closes one eye and aligns a bead with a point on the sheet."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from flexsheet.nodes.twin.finger import SineSum
 from flexsheet.nodes.twin.membrane import DeformedSheet
 
 MIN_SWAY_FREQUENCY_RATIO = 0.1
-"""The lowest frequency of the head's sway, relative to the highest frequency."""
+"""The ratio of the lowest to the highest frequency of the head's random motion."""
 
 ALIGNMENT_RAD = 1e-3
-"""The standard deviation per axis of the angle between two points that appear aligned to an eye.
+"""The standard deviation, per axis, of the angle between two points that appear aligned to an eye.
 
 A bead 0.13 m in front of a sheet at 0.4 m is out of focus by 1.2 dioptres. With a pupil of 3 mm the
 bead appears as a disc of 3.6 mrad. A person can locate the centre of the disc to about a quarter of
@@ -40,7 +40,9 @@ class HeadSway:
 
     @classmethod
     def drawn(cls, eyes: EyesTruth, seed: int) -> Self | None:
-        """Generate the random motion for true eye parameters; return None for a head at rest."""
+        """Generate a random head motion from the true eye parameters; return None for a head at
+        rest.
+        """
         if not eyes.sway_m:
             return None
         band_hz = (MIN_SWAY_FREQUENCY_RATIO * eyes.sway_frequency_hz, eyes.sway_frequency_hz)
@@ -52,12 +54,18 @@ class HeadSway:
 
 
 class Viewer:
-    """A person who has the true eyes of a scene and aligns points by sight."""
+    """A simulated person whose eyes have the true positions of a scene, and who aligns points by
+    sight.
+    """
 
     def __init__(
         self, true_scene: Scene, sway: HeadSway | None, random: np.random.Generator
     ) -> None:
-        """Store the eyes of the scene and the motion of the head, None for a head at rest."""
+        """Store the eyes of the scene and the motion of the head.
+
+        sway: motion of the head; None for a head at rest. random: generator of the alignment
+        errors.
+        """
         self._eyes, self._sway, self._random = true_scene.eyes, sway, random
 
     def locate_eye(self, side: Side, time_s: float) -> Floats:
@@ -67,7 +75,9 @@ class Viewer:
         return np.asarray(self._eyes.centre_world_m + aside_m * np.eye(3)[0] + moved)
 
     def align(self, side: Side, bead: Floats, sheet: DeformedSheet, time_s: float) -> Floats | None:
-        """Return the world point (3,), m, of the sheet that an eye sees behind a bead (3,).
+        """Return the point (3,) of the sheet, world frame, m, that an eye sees behind a bead.
+
+        bead (3,): position, world frame, m.
 
         The point contains a random alignment error. Return None if the sheet is not behind the
         bead.
@@ -75,7 +85,7 @@ class Viewer:
         eye = self.locate_eye(side, time_s)
         error = rotation_from_vector(self._random.normal(0.0, ALIGNMENT_RAD, 3))
         direction = error @ (bead - eye)
-        # A single ray; the two pixel steps only have to be linearly independent of its direction.
+        # The two pixel steps may have any directions that are linearly independent of the ray.
         rays = Rays(eye, direction, np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 1, 1)
         hits = first_hits(rays, sheet.positions.reshape(-1, 3), sheet.triangles())
         if hits.triangle[0, 0] < 0:
