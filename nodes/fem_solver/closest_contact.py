@@ -1,7 +1,7 @@
 """Find the contact point of a fingertip on a smooth shape.
 
-If the fingertip is deep inside the shape, the nearest surface point is ambiguous. The choice
-therefore depends on the previous contact point, called the anchor.
+If the fingertip is deep inside the shape, the nearest surface point is ambiguous. Therefore the
+choice depends on the previous contact point, which is called the anchor.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class ContactQuery:
 
     surface (3,), normal (3,): pushed surface point, m, and its outward normal. depth_m: depth of
     the fingertip below this point along the normal, which is negative outside the object. beyond_m:
-    distance of the fingertip past the edge of the surface. drag_m (3,): displacement of the
+    distance of the fingertip beyond the edge of the surface. drag_m (3,): displacement of the
     fingertip along the surface since it started to stick to the point; None for a sliding finger.
     """
 
@@ -51,9 +51,9 @@ def locate(
 
     anchor: anchor that the previous call returned, or None. The contact point is usually the
     nearest surface point. It is the anchor if the fingertip is near the centre of curvature. It is
-    also the anchor if the nearest point is on the far side of the body. A finger pushed through a
-    body therefore stays in contact with the side that it entered. Raise ValueError for a point that
-    is not finite.
+    also the anchor if the nearest point is on the far side of the body. Therefore a finger that is
+    pushed through a body remains in contact with the side that it entered. Raise ValueError for a
+    point that is not finite.
     """
     if not np.isfinite(point).all():
         raise ValueError(
@@ -105,7 +105,9 @@ def slide_anchor(
 def _make_query(
     point: Floats, surface_point: Floats, normal: Floats, on_edge: bool
 ) -> ContactQuery:
-    """Return the contact of a fingertip at `point` with the tangent plane of a surface point."""
+    """Return the contact of a fingertip at `point` (3,) with the tangent plane of a surface point
+    (3,).
+    """
     depth = float((surface_point - point) @ normal)
     surface = point + depth * normal
     return ContactQuery(

@@ -1,4 +1,4 @@
-"""Solve the contact of a fingertip sphere with a linear soft body, without friction.
+"""Solve the contact of a spherical fingertip with a linear soft body.
 
 The skin (the surface of the body) is sampled at fixed contact points, which are closer together
 than the nodes of the mesh. At each point, a penalty pressure is proportional to the penetration
@@ -7,10 +7,10 @@ that remains after the skin has moved. The nodal forces f minimise the strictly 
     1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2
 
 C is the nodal compliance, and W contains the shape functions at the contact points. t_q is the
-penetration of the rigid finger at point q before the skin moves; d_q is the penalty stiffness times
+penetration of the rigid finger at point q before the skin moves. d_q is the penalty stiffness times
 the area of the point. The solution is unique, does not depend on the finger's path, and is
-Lipschitz continuous in the finger's position. A semismooth Newton iteration (Qi & Sun 1993) finds
-it by solving a few small dense systems.
+Lipschitz continuous in the finger's position. A semismooth Newton iteration (Qi & Sun 1993)
+computes it by solving a few small dense systems.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from flexsheet.nodes.fem_solver.mesh.solid import triangle_shape_functions
 from flexsheet.nodes.models.shapes import Shape
 
 PENALTY_RATIO = 40.0
-"""The ratio of the penalty stiffness (Pa/m) to Young's modulus per finger radius."""
+"""The penalty stiffness (Pa/m) of the contact, divided by Young's modulus per finger radius."""
 POINT_SPACING_RATIO = 0.4
 """The maximum spacing of the contact points, in finger radii."""
 FLANK_RATIO = 0.9
-"""The distance from the push axis (finger radii) beyond which a tangent cone replaces the
-sphere."""
+"""The distance from the push axis, in finger radii, beyond which the spherical fingertip is
+approximated by a tangent cone."""
 FACING = (0.2, 0.6)
-"""The range of the cosine between skin normal and contact normal in which the weight of the
-penetration rises from 0 to 1."""
+"""The range of the cosine of the angle between skin normal and contact normal in which the weight
+of the penetration rises from 0 to 1."""
 PAD_RATIO = 1.1
 """The half width of the contact patch at the end of the linear range, in finger radii."""
 TANGENTIAL_COMPLIANCE_RATIO = 0.004
-"""The tangential displacement of a sticking contact point whose tangential force equals its normal
-force, in finger radii."""
+"""The tangential compliance of a sticking contact point. It is the displacement, in finger radii,
+at which the tangential force equals the normal force."""
 FULL_STEPS = 8
 MAX_ITERATIONS = 40
 CURVE_FRACTIONS = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
@@ -54,8 +54,8 @@ class SkinResponse:
     contact_nodes (m,): indices into `rest` of the nodes that the finger can touch. normals (m, 3):
     outward normals at these nodes. faces (f, 6): six-node triangles, as indices into
     `contact_nodes`. compliance (m, m): inward displacement of node i (m) per inward force on node j
-    (N); symmetric. influence (m, 3 s) float32: displacement of the whole skin per inward force on
-    each contact node.
+    (N). The matrix is symmetric. influence (m, 3 s) float32: displacement of the whole skin per
+    inward force on each contact node.
     """
 
     rest: Floats
@@ -85,9 +85,9 @@ class Response:
     """The response of a soft body to one finger position, in the mesh frame.
 
     displacement (s, 3): displacement of the skin nodes, m. force_n (3,): force on the finger.
-    stiffness_n_per_m: force per depth at the end of the linear range. force_curve (n, 2): depth (m)
-    and force (N). push_depth_m: depth of the push. in_range: whether the method is valid for the
-    push.
+    stiffness_n_per_m: force divided by depth at the end of the linear range. force_curve (n, 2):
+    depth (m) and force (N). push_depth_m: depth of the push. in_range: whether the method is valid
+    for the push.
     """
 
     displacement: Singles
@@ -112,24 +112,29 @@ class SoftBodyMethod(Protocol):
     def at_rest(self) -> Singles: ...
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return the stiffness (N/m) of the touchable skin nearest to a surface point (3,)."""
+        """Return the stiffness (N/m) of the touchable skin at the point nearest to a surface point
+        (3,).
+        """
         ...
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force-depth curve (n, 2) of the touchable skin nearest to a point (3,).
+        """Return the force-depth curve (n, 2) of the touchable skin at the point nearest to a
+        surface point (3,).
 
         The columns are depth (m) and force (N). Both start at 0 and never decrease.
         """
         ...
 
     def respond(self, query: ContactQuery) -> Response:
-        """Compute the response of the skin to a contact."""
+        """Compute the displacement of the skin and the contact force for a contact with the
+        finger.
+        """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class NormalContact:
-    """The solution of a frictionless contact.
+    """The solution of a frictionless contact between skin and finger.
 
     nodes (k,): indices of the loaded contact nodes. forces (k,): inward forces on these nodes, N.
     force_n (3,): total force on the finger. The other fields describe the q contact points under
@@ -161,8 +166,8 @@ class Drag:
 def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
     """Limit a push depth smoothly (with continuous slope) to less than `largest_m`.
 
-    Depths up to `linear_m` are returned unchanged; beyond it, the result approaches `largest_m`
-    exponentially.
+    Depths up to `linear_m` are returned unchanged. For larger depths, the result approaches
+    `largest_m` exponentially.
     """
     if depth_m <= linear_m:
         return depth_m
@@ -173,7 +178,7 @@ def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
 def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
     """Return the depths (m) at which a force curve is sampled.
 
-    The depths are dense up to `linear_m`. From there, they increase geometrically to the larger of
+    The depths are dense up to `linear_m`. Larger depths increase geometrically up to the maximum of
     `largest_m` and `push_m`.
     """
     max_push_m = largest_m if push_m is None else max(push_m, largest_m)
@@ -196,7 +201,9 @@ def sample_triangle(divisions: int) -> tuple[Floats, Floats]:
 
 
 class SphereContact:
-    """A solver of the contact between a linear body and a spherical fingertip, without state."""
+    """A solver of the frictionless contact between a linear body and a spherical fingertip. It has
+    no state.
+    """
 
     def __init__(
         self,
@@ -236,8 +243,8 @@ class SphereContact:
         The penetration is negative outside the finger. points, normals (q, 3): skin points and
         their outward normals. centre (3,): centre of the sphere. direction (3,): outward surface
         normal at the contact. Skin that faces away from this direction has no penetration. Beyond
-        `FLANK_RATIO` of its radius, the sphere is replaced by its tangent cone. Each value is
-        therefore finite and has a continuous slope.
+        `FLANK_RATIO` of its radius, the sphere is replaced by its tangent cone. Therefore each
+        value is finite and has a continuous slope.
         """
         offset = centre - points
         along = np.einsum("qi,qi->q", offset, normals)
@@ -295,7 +302,7 @@ class DragContact:
     """A solver of the tangential contact of a finger that sticks to the skin.
 
     Tangential springs connect the contact points to the finger. The stiffness of a spring is
-    proportional to the normal force at its point. The tangential forces therefore start and end at
+    proportional to the normal force at its point. Therefore the tangential forces start and end at
     zero. They do not affect the normal forces.
     """
 
@@ -307,7 +314,7 @@ class DragContact:
         self._full_load_slip_m = TANGENTIAL_COMPLIANCE_RATIO * finger_radius_m
 
     def solve(self, contact: NormalContact, drag: Floats) -> Drag:
-        """Return the tangential forces for a given normal contact.
+        """Return the tangential forces of a sticking finger for a given normal contact.
 
         drag (3,): displacement of the finger since it started to stick, m.
         """
@@ -335,8 +342,8 @@ def solve_penalty_contact(
     The energy of the forces f is 1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2. weights W (q,
     k): shape functions. compliance C (k, k): m/N. penalty d (q,): N/m. depths t (q,): m. Newton's
     method starts from Hertz's estimate that points deeper than half of the maximum depth are in
-    contact. After `FULL_STEPS` steps, a line search damps the method. Raise ArithmeticError if it
-    does not converge.
+    contact. After `FULL_STEPS` steps, a line search damps the method. Raise ArithmeticError if the
+    method does not converge.
     """
     compliance_at_points = weights @ compliance
     identity = np.eye(len(compliance))
@@ -447,7 +454,9 @@ class LinearSoftBody:
         self._smoothing2 = max(float(max_edge_m), finger_radius_m) ** 2
 
     def respond(self, query: ContactQuery) -> Response:
-        """Compute the response of the skin to a contact."""
+        """Compute the displacement of the skin and the contact force for a contact with the
+        finger.
+        """
         depth = saturate_depth(query.depth_m, self._linear, self._largest)
         contact = self.contact.solve(query, depth)
         curve = self.force_curve(query.surface)
@@ -474,13 +483,14 @@ class LinearSoftBody:
         )
 
     def _clears_bounds(self, surface: Floats) -> bool:
-        """Return whether all skin near a surface point (3,) is touchable."""
+        """Return whether the finger may touch all skin near a surface point (3,)."""
         if not len(self._bounds):
             return True
         return bool(np.square(self._bounds - surface).sum(axis=1).min() >= self._pad2)
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return the force per depth (N/m) at the end of the linear range near a point (3,).
+        """Return the force divided by depth (N/m) at the end of the linear range near a surface
+        point (3,).
 
         The value does not depend on the current push and is available before contact.
         """
@@ -495,14 +505,20 @@ class LinearSoftBody:
         return np.column_stack([self._depths, self._weights(surface) @ self._corner_forces])
 
     def _weights(self, surface: Floats) -> Floats:
-        """Return Gaussian weights of the mesh corners for a point (3,), normalized to sum 1."""
+        """Return Gaussian weights of the mesh corners for a surface point (3,). The weights add up
+        to 1.
+        """
         squared = np.square(self._points - surface).sum(axis=1)
         weights = np.exp((squared.min() - squared) / (0.5 * self._smoothing2))
         result: Floats = weights / weights.sum()
         return result
 
     def _forces(self, point: Floats, normal: Floats) -> Floats:
-        """Return the normal force (n,), N, at the depths of the force curve, without decreases."""
+        """Return the normal force (n,), N, at the depths of the force curve.
+
+        The force never decreases with depth. point, normal (3,): surface point (m) and its outward
+        normal.
+        """
         shallow = self._depths[: len(CURVE_FRACTIONS) + 1]
         solved = np.append(shallow, [0.5 * (self._linear + self._largest), self._largest])
         forces = np.zeros(len(solved))
@@ -518,9 +534,9 @@ class LinearSoftBody:
         return result
 
     def _sum(self, table: Singles, rows: Ints, forces: Floats) -> Singles:
-        """Return the skin displacement (3 s,), m, under several nodal forces.
+        """Return the displacement (3 s,), m, of s skin nodes that several nodal forces cause.
 
-        table: influence matrix. rows, forces (k,): row indices and forces (N).
+        table: influence matrix, m/N. rows, forces (k,): row indices and forces (N).
         """
         scaled = (forces / self._modulus).astype(np.float32)
         total = np.zeros(table.shape[1], dtype=np.float32)
@@ -535,7 +551,8 @@ class LinearSoftBody:
 def unit_linear_body(
     response: SkinResponse, shape: Shape, bounds: Floats, finger_radius_m: float
 ) -> LinearSoftBody:
-    """Return the linear method for a modulus of 1 Pa that is linear up to one finger radius.
+    """Return the linear method for a Young's modulus of 1 Pa and a linear range of one finger
+    radius.
 
     bounds (b, 3): positions of skin nodes that must not be touched.
     """

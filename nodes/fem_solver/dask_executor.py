@@ -1,7 +1,7 @@
 """Provide an executor that runs functions on the workers of a `dask.distributed` scheduler.
 
-A worker needs only the same version of this project: each job contains its input data. Import this
-module where it is used, because importing `distributed` takes half a second.
+A worker needs only the same version of this project, because each job contains its input data.
+Import this module where it is used, because the import of `distributed` takes half a second.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import distributed
 from flexsheet.nodes.fem_solver import precompute_table
 
 untyped: Any = distributed
-"""The module `distributed` with the type Any, because the module has no annotations."""
+"""The module `distributed`, declared with the type Any because it has no annotations."""
 
 CONNECT_S = 10.0
 """The timeout for the connection to a scheduler and for its first worker, in seconds."""
@@ -27,7 +27,7 @@ TRIES = 3
 
 
 class SchedulerError(precompute_table.WorkersError):
-    """An error that is raised if the workers of a dask scheduler cannot be used."""
+    """Raised if the workers of a dask scheduler cannot be used."""
 
     code = "scheduler"
     remedy = "Check the scheduler's address, and that its workers run the same version."
@@ -40,7 +40,9 @@ class SchedulerError(precompute_table.WorkersError):
 
 
 class DaskExecutor(Executor):
-    """An executor on the workers of a dask scheduler that can also stop running functions."""
+    """An executor that runs functions on the workers of a dask scheduler, and can stop running
+    functions.
+    """
 
     def __init__(self, client: distributed.Client) -> None:
         self._client = client
@@ -66,10 +68,10 @@ class DaskExecutor(Executor):
 
 @contextmanager
 def connect_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[Executor]:
-    """Connect to a scheduler and yield an executor on its workers.
+    """Connect to a dask scheduler, and yield an executor on its workers.
 
-    The running jobs are stopped at the end of the context. address: address of the scheduler, such
-    as tcp://host:8786. connect_s: timeout. Raise SchedulerError if the scheduler does not answer or
+    Running jobs are stopped when the context exits. address: address of the scheduler, such as
+    tcp://host:8786. connect_s: timeout. Raise SchedulerError if the scheduler does not answer or
     has no worker, or if a worker has another version of this project.
     """
     try:
@@ -114,7 +116,9 @@ def _require_same_code(client: distributed.Client, address: str) -> None:
 
 
 def _run_stoppable(name: str, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-    """Run a function in a worker so that a dask event can stop it."""
+    """Run a function in a dask worker. The function can query whether a dask event requests a
+    stop.
+    """
     stop_event = untyped.Event(name)
     token = precompute_table.stop_requested.set(stop_event.is_set)
     try:

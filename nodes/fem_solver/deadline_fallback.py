@@ -1,4 +1,4 @@
-"""Select a method that is fast enough to meet a deadline."""
+"""Select a soft-body method that is fast enough to meet a deadline."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Sequence
 LATE_STEPS = 5
 """The number of consecutive late responses after which another method is selected."""
 RETRY_STEPS = 600
-"""The number of responses by another method after which the best method is tried again."""
+"""The number of responses of a fallback method after which the best method is tried again."""
 SMOOTHING = 0.1
 """The weight of the newest duration in the exponentially smoothed mean duration."""
 
 
 class DeadlineFallback:
-    """A selector that chooses a method by the durations of recent responses."""
+    """A selector that chooses a method according to the durations of recent responses."""
 
     def __init__(self, names: Sequence[str], budget_s: float) -> None:
-        """Select the first method.
+        """Start with the first method of a list.
 
         names: names of the methods, in order of decreasing quality. budget_s: maximum duration of a
         response.

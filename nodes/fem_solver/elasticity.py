@@ -15,14 +15,14 @@ from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.mesh import EDGES
 
 MAX_POISSON_RATIO = 0.4999
-"""The maximum Poisson's ratio. For larger ratios, rounding errors destroy the solution."""
+"""The maximum Poisson's ratio. For larger ratios, rounding errors make the solution useless."""
 MIN_VOLUME_RATIO = 1e-6
 """The minimum ratio of an element's Jacobian determinant to the cube of its edge length. For
-flatter elements, rounding errors destroy the solution."""
+flatter elements, rounding errors make the solution useless."""
 
 
 class SolidMeshError(FlexsheetError, ValueError):
-    """An error that is raised for a mesh with inverted elements or insufficient support."""
+    """Raised for a mesh with inverted elements or insufficient support."""
 
     code = "solid-mesh"
     remedy = "Increase skin_spacing_m, or fix more of the object; see docs/soft-body-reference.md."

@@ -1,4 +1,5 @@
-"""Compute energy, forces and tangent of a compressible neo-Hookean solid of 10-node tetrahedra.
+"""Compute the energy, forces and tangent stiffness of a compressible neo-Hookean solid of 10-node
+tetrahedra.
 
 The energy per undeformed volume (Bonet & Wood, "Nonlinear Continuum Mechanics for Finite Element
 Analysis", 2nd ed., sec. 6.4.3) is
@@ -6,7 +7,7 @@ Analysis", 2nd ed., sec. 6.4.3) is
     psi = mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2
 
 lambda and mu are Lame's constants, F is the deformation gradient, and J its determinant. The first
-Piola-Kirchhoff stress is P = mu F + (lambda ln J - mu) F^-T; for small strains it reduces to
+Piola-Kirchhoff stress is P = mu F + (lambda ln J - mu) F^-T. For small strains, it reduces to
 Hooke's law. The energy grows without bound as J -> 0, so no element inverts at finite energy.
 """
 
@@ -31,7 +32,7 @@ NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
 
 
 class InvertedElementError(FlexsheetError, ArithmeticError):
-    """An error that is raised for a displacement that inverts an element."""
+    """Raised for a displacement that inverts an element."""
 
     code = "inverted-element"
     remedy = "Use smaller load steps. Deep pushes may have no solution."
@@ -43,7 +44,7 @@ class NeoHookeanSolid:
     def __init__(
         self, nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
     ) -> None:
-        """Precompute the shape function gradients and the volumes of the elements.
+        """Compute the shape function gradients and the volumes of the elements.
 
         nodes (n, 3), m, elements (e, 10): mesh. Raise SolidMeshError for inverted elements, and
         ValueError for an invalid material.
@@ -68,8 +69,8 @@ class NeoHookeanSolid:
     def deformation(self, displacement: Floats) -> tuple[Floats, Floats]:
         """Return the deformation gradient F (e, 8, 3, 3) and its determinant J (e, 8).
 
-        Both are evaluated at the quadrature points. displacement (n, 3): displacement of the nodes,
-        m.
+        Both are evaluated at the 8 quadrature points of each of the e elements. displacement (n,
+        3): displacement of the nodes, m.
         """
         moved = displacement[self.elements].transpose(0, 2, 1)
         gradient = moved[:, None] @ self._gradients
@@ -130,8 +131,8 @@ class NeoHookeanSolid:
     def stiffen(self, matrices: Floats, weight: float) -> None:
         """Add a positive definite stiffness to element matrices (e, 30, 30), in place.
 
-        The added stiffness is the Laplacian of the displacement times `weight` and the shear
-        modulus. It regularizes a tangent stiffness that is not positive definite.
+        The added stiffness is that of the Laplacian of the displacement, multiplied by `weight` and
+        the shear modulus. It regularizes a tangent stiffness that is not positive definite.
         """
         blocks = matrices.reshape(-1, 10, 3, 10, 3)
         for axis in range(3):
@@ -162,7 +163,9 @@ class NeoHookeanSolid:
 
 
 def determinants(matrices: Floats) -> Floats:
-    """Return the determinants (...) of matrices (..., 3, 3), faster than `numpy.linalg.det`."""
+    """Return the determinants (...) of matrices (..., 3, 3). This function is faster than
+    `numpy.linalg.det`.
+    """
     a, b, c = matrices[..., 0, :], matrices[..., 1, :], matrices[..., 2, :]
     result: Floats = (
         a[..., 0] * (b[..., 1] * c[..., 2] - b[..., 2] * c[..., 1])

@@ -1,10 +1,11 @@
-"""Factor the stiffness matrix of a mesh, given by element matrices, by multifrontal Cholesky.
+"""Factor the stiffness matrix of a mesh by a multifrontal Cholesky method. The matrix is given by
+element matrices.
 
 Nested dissection bisects the set of elements recursively (George 1973). The degrees of freedom that
-two halves share are eliminated after those inside the halves. The elimination of a half leaves a
-dense Schur complement on its boundary, which is added to the matrix of its parent (Duff & Reid
-1983). Nearly all work is dense linear algebra. The elimination order is computed once per mesh and
-reused for every stiffness matrix of a Newton iteration.
+two halves share are eliminated after the degrees of freedom inside the halves. The elimination of a
+half leaves a dense Schur complement on its boundary, which is added to the matrix of its parent
+(Duff & Reid 1983). Nearly all work is dense linear algebra. The elimination order is computed once
+per mesh and reused for every stiffness matrix of a Newton iteration.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ NO_CHILDREN: tuple[int, ...] = ()
 
 
 class IndefiniteError(FlexsheetError, ArithmeticError):
-    """An error that is raised for a stiffness matrix that is not positive definite."""
+    """Raised for a stiffness matrix that is not positive definite."""
 
     code = "indefinite"
     remedy = "Fix the body at its base. Check that Poisson's ratio is below 0.5."
@@ -51,14 +52,17 @@ class Front:
 
 @dataclass(frozen=True, slots=True)
 class Factors:
-    """The Cholesky factors L of a stiffness matrix K = L L^T, stored in the precision of K."""
+    """The Cholesky factors L of a stiffness matrix K = L L^T, which are stored in the precision of
+    K.
+    """
 
     fronts: list[Front]
     diagonal: list[Floats]
     off_diagonal: list[Floats]
 
     def solve(self, loads: Floats) -> Floats:
-        """Return the displacements of n nodes under loads (3n,) or (3n, k).
+        """Return the displacements of n nodes under loads (3n,) or (3n, k) on their degrees of
+        freedom.
 
         The result has the shape of the loads and is 0 at fixed nodes.
         """
@@ -98,7 +102,9 @@ class _Part:
 
 
 class NestedDissection:
-    """The elimination order for a mesh with given fixed nodes."""
+    """An elimination order of the stiffness matrix of a mesh, which reduces the work of the
+    factorization.
+    """
 
     def __init__(self, nodes: Floats, elements: Ints, fixed: Bools) -> None:
         """Compute the elimination order.
@@ -191,7 +197,9 @@ class NestedDissection:
         return len(self._parts) - 1, present, counts
 
     def _bisect(self, members: Ints) -> tuple[Ints, Ints]:
-        """Divide elements along the axis for which the two halves share fewest nodes."""
+        """Divide elements into two halves along the axis for which these halves share the fewest
+        nodes.
+        """
         cuts = []
         for axis in range(3):
             order = members[np.argsort(self._centres[members, axis], kind="stable")]
@@ -231,7 +239,7 @@ def _add_block(dense: Floats, part: Floats, positions: Ints) -> None:
     """Add the lower triangle of a matrix to the lower triangle of a larger matrix.
 
     dense: larger matrix, which is changed. part (k, k): added matrix. positions (k,): rows and
-    columns in `dense`, in increasing order. Entries above the diagonal are undefined.
+    columns in `dense`, in increasing order. Entries of the result above the diagonal are undefined.
     """
     starts = np.concatenate([[0], np.flatnonzero(np.diff(positions) != 1) + 1, [len(positions)]])
     if len(starts) > MAX_RUNS:

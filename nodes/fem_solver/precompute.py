@@ -1,8 +1,8 @@
 """Compute and cache the response of the skin to a unit force on every touchable node.
 
 The skin is the surface of the soft body. The name of the cache file contains a digest of the
-inputs. Young's modulus is no input. The response is stored for 1 Pa, because it is inversely
-proportional to Young's modulus.
+inputs. Young's modulus is not an input. The response is stored for a modulus of 1 Pa, because it is
+inversely proportional to Young's modulus.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ VERSION = 3
 CHUNK_LOADS = 128
 ELEMENT_BYTES = 30 * 30 * 8
 MESH_STEPS, FACTOR_STEPS = 1, 4
-"""The durations of meshing and of factoring the stiffness, in units of the duration of one load.
-They are used for progress reports."""
+"""The approximate durations of meshing and of factoring the stiffness matrix, in units of the
+duration of one load. They are used for progress reports."""
 
 Progress = Callable[[int, int, "WorkBudget"], None]
 """A callback that receives the number of finished steps, the total number and the required
-resources. It is first called before the work starts, and may raise `Interrupted` to stop the
-work."""
+resources. The first call is before the work starts. The callback may raise `Interrupted` to stop
+the work."""
 
 
 class WorkBudget(Protocol):
@@ -47,7 +47,7 @@ class WorkBudget(Protocol):
 
 
 class Interrupted(Exception):
-    """An exception that is raised when a computation is stopped on request.
+    """Raised when a computation is stopped on request.
 
     Finished parts remain stored.
     """
@@ -55,7 +55,7 @@ class Interrupted(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoftBodySpec:
-    """The inputs of a precomputation of the linear response.
+    """The inputs of the precomputation of a body's linear response.
 
     sticking: whether the response to tangential forces is also computed, for a finger that sticks
     to the skin. Both responses together need three times the memory.
@@ -74,7 +74,7 @@ class SoftBodySpec:
         return [VERSION, self.mesh.key(), self.poisson_ratio, self.sticking]
 
     def key(self) -> str:
-        """Return a digest of the inputs and of `VERSION`."""
+        """Return a digest of the inputs and of `VERSION`, which identifies the result."""
         return make_digest(self.depends_on())
 
 
@@ -156,11 +156,12 @@ def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
 def compute(
     spec: SoftBodySpec, progress: Progress, checkpoints: CheckpointStore | None = None
 ) -> SoftBodyModel:
-    """Mesh the object, factor its stiffness and solve for one unit force per touchable node.
+    """Mesh the object, factor its stiffness matrix, and compute the response to a unit force on
+    each touchable node.
 
-    checkpoints: store of finished parts, from which an interrupted computation can
-    continue. Raise SolidMeshError for a body without sufficient support, ValueError for an
-    invalid material or size, and MemoryError if the free memory is insufficient.
+    checkpoints: store of finished parts, from which an interrupted computation can continue. Raise
+    SolidMeshError for a body without sufficient support, ValueError for an invalid material or
+    size, and MemoryError if the free memory is insufficient.
     """
     from flexsheet.nodes.fem_solver.elasticity import (
         element_stiffness,
@@ -234,12 +235,12 @@ def _solve_unit_loads(
     get_part: Callable[[int, Callable[[], Part]], Part],
     advance: Callable[[int], None],
 ) -> tuple[Singles, Floats]:
-    """Solve for unit forces in p directions on each of m contact nodes.
+    """Compute the displacements for unit forces in p directions on each of m contact nodes.
 
     directions (m, p, 3): unit vectors. get_part: function that loads the stored part with an index,
     or computes and stores it. advance: function that receives the number of newly finished loads.
-    Return two arrays of displacements per force, m/N. They belong to the s skin nodes (m p, 3 s),
-    and to the contact nodes along each direction (m p, m p).
+    Return two arrays of displacements per force, m/N: those of the s skin nodes (m p, 3 s), and
+    those of the contact nodes along each direction (m p, m p).
     """
     each = directions.shape[1]
     loads = len(mesh.contact_nodes) * each
@@ -279,7 +280,8 @@ def make_tangents(normals: Floats) -> Floats:
 def require_memory(required_bytes: int, what: str, remedy: str) -> None:
     """Raise MemoryError if the computer has less free memory than required.
 
-    what: computation that needs the memory, for the error text. remedy: advice for the error text.
+    what: name, in the error text, of the computation that needs the memory. remedy: advice in the
+    error text.
     """
     import psutil
 
@@ -292,7 +294,7 @@ def require_memory(required_bytes: int, what: str, remedy: str) -> None:
 
 
 STORED_NAMES = {"contact_nodes": "touch", "influence": "table"}
-"""The names in the cache file that differ from the field names, by field name."""
+"""The names in the cache file, by field name, for the fields whose names differ."""
 
 
 def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:

@@ -1,7 +1,7 @@
 """Compute reference solutions for the soft-body benchmark, and tables around a single point.
 
 Both consist of solutions of Newton's method for pushes at or near one surface point. Worker
-processes compute them, and the cache stores them.
+processes compute these solutions, and the cache stores them.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ class ReferenceSolution:
         return bool((np.abs(depths - depth_m) < 1e-9).any())
 
     def evaluate(self, depth_m: float, points: Floats) -> tuple[Floats, float]:
-        """Return the displacement (q, 3), m, of skin points (q, 3), and the normal force for 1 Pa.
+        """Return the displacement (q, 3), m, of skin points (q, 3), and the normal force (N) for a
+        Young's modulus of 1 Pa.
 
         depth_m: push depth, which must be one of the depths of the snapshot.
         """
@@ -115,10 +116,10 @@ def make_even_job(
 def solve_cached_jobs(
     jobs: Sequence[SnapshotJob], cache_dir: Path, on_progress: Progress
 ) -> list[Snapshot]:
-    """Load the snapshots of jobs from the cache, or solve and cache them.
+    """Load the snapshots of jobs from the cache. Compute and cache the missing snapshots.
 
     on_progress: function that receives the number of finished jobs and the total number. Raise
-    OSError if a written cache file cannot be read.
+    OSError if a cache file cannot be read after it was written.
     """
     cache = CheckpointStore(cache_dir)
     names = [f"soft-body-push-{_digest(job)}" for job in jobs]
@@ -160,8 +161,8 @@ def _digest(*jobs: SnapshotJob) -> str:
 class LocalTable:
     """A nonlinear table of a body that is filled only near one surface point.
 
-    Near this point, its values equal those of the full table. It needs only the few snapshots of
-    the attribute `jobs`.
+    Near this point, the values equal those of the full table. Only the few snapshots of the
+    attribute `jobs` are needed.
     """
 
     def __init__(

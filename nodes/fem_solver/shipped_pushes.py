@@ -1,8 +1,10 @@
-"""Load the pushes of the coarse table that are shipped for some scenes.
+"""Load precomputed pushes (snapshots) of the coarse table, which are shipped with the package for
+some scenes.
 
-A scene with shipped pushes has a coarse table without solving a push. The files are in the folder
-`pushes`, by the key of the table; `python -m benchmarks.ship_pushes` writes them. A file is not
-used if anything that its pushes depend on has changed, because then the key differs.
+For these scenes, the coarse table is available without a long computation. The files are in the
+folder `pushes`, and are named by the key of the table. The command `python -m
+benchmarks.ship_pushes` writes them. The key changes with every input of the pushes, so an outdated
+file is not used.
 """
 
 from __future__ import annotations
@@ -21,11 +23,11 @@ from flexsheet.nodes.fem_solver.table import Table
 KEYS = ("rest", "faces", "depths_m", "moved", "scale_m", "force_n", "reached")
 FOLDER = Path(__file__).with_name("pushes")
 LEVELS = 32767
-"""The number of steps in which a displacement is stored, up to the largest of its depth."""
+"""The number of quantization steps between zero and the largest displacement at a depth."""
 
 
 def shipped_path(entry: Specification[Table]) -> Path:
-    """Return the path of the file for a table, which may not exist."""
+    """Return the path of the file with the shipped snapshots of a table. The file may not exist."""
     return FOLDER / entry.path(FOLDER).name
 
 

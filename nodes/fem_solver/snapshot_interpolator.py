@@ -1,9 +1,9 @@
 """Interpolate snapshots between their sample points, in order to fill a nonlinear table.
 
-A snapshot is the solution for pushes at one sample point to several depths. Near the finger, its
-displacement field is transported: shifted and rotated from the solved sample point to the new one.
-Far from the finger it is not transported, because the ends and supports of the body do not move
-with the finger.
+A snapshot is the solution for pushes at one sample point to several depths. Near the finger, the
+displacement field is transported, which means that it is shifted and rotated from the sample point
+to the new point. Far from the finger, the field is not transported, because the ends and supports
+of the body do not move with the finger.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ displacement field decreases from 1 to 0."""
 NEIGHBOURS = 7
 CANDIDATES = 4
 RIDGE = 1e-2
-"""The relative ridge penalty on the slopes of the local fit, which may be underdetermined."""
+"""The relative ridge penalty on the slopes of the local fit. It is necessary because the fit may be
+underdetermined."""
 FACE_COORDINATES = np.array(
     [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]]
 )
@@ -79,7 +80,7 @@ def minimal_rotation(start: Floats, end: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class PlacedSnapshot:
-    """A snapshot with its sample point and a search structure for its mesh."""
+    """A snapshot together with its sample point and a search structure for its mesh."""
 
     sample: SamplePoint
     snapshot: Snapshot
@@ -89,8 +90,8 @@ class PlacedSnapshot:
 class SnapshotInterpolator:
     """An interpolator of snapshots between sample points.
 
-    The interpolator combines transported displacement fields with weights from moving least
-    squares.
+    The interpolator shifts and rotates the displacement fields, and combines them with weights from
+    moving least squares.
     """
 
     def __init__(
@@ -110,9 +111,9 @@ class SnapshotInterpolator:
     def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Singles, Floats, float]:
         """Interpolate the snapshots at a new sample point.
 
-        rest (s, 3): undeformed skin nodes, m; calls with the same array are faster. Return the
+        rest (s, 3): undeformed skin nodes, m. Calls with the same array are faster. Return the
         displacement (k, s, 3), m, and the force (k, 3), N, for 1 Pa at k depths. The last result is
-        the number of converged depths, as a weighted mean over the snapshots used.
+        the weighted mean of the numbers of converged depths of the used snapshots.
         """
         if rest is not self._rest:
             self._rest, self._fixed = rest, {}
@@ -177,7 +178,10 @@ class SnapshotInterpolator:
 
 
 def _evaluate(solved: PlacedSnapshot, points: Floats) -> Singles:
-    """Return the displacement (k, q, 3), m, of a snapshot at its skin points nearest to points."""
+    """Return the displacement (k, q, 3), m, of a snapshot at k depths.
+
+    The displacement is evaluated at the skin points nearest to `points` (q, 3).
+    """
     nodes, weights = solved.locator.weights(points)
     moved = solved.snapshot.moved[:, nodes]
     result: Singles = np.einsum("qa,kqai->kqi", weights.astype(np.float32), moved)
@@ -185,7 +189,7 @@ def _evaluate(solved: PlacedSnapshot, points: Floats) -> Singles:
 
 
 def _tangents(towards_user: Floats) -> list[int]:
-    """Return the indices of the two axes with the largest angles to a direction (3,)."""
+    """Return the indices of the two coordinate axes with the largest angles to a direction (3,)."""
     return [axis for axis in range(3) if axis != int(np.abs(towards_user).argmax())]
 
 

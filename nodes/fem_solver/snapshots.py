@@ -1,7 +1,7 @@
 """Define and solve the snapshots from which the nonlinear table of a soft body is built.
 
 A snapshot is the solution for pushes at one surface point (sample point) to several depths, for a
-neo-Hookean material. It is solved for a Young's modulus of 1 Pa, because the modulus only scales
+neo-Hookean material. It is computed for a Young's modulus of 1 Pa, because the modulus only scales
 the forces. A job contains all inputs of a snapshot as arrays, so another process or computer can
 solve it.
 """
@@ -36,30 +36,32 @@ NEAR_RATIO = 1.5
 STATIONS = (0.0, 0.4, 0.7, 0.9)
 """The positions of the sample points along a cylinder, as fractions of its half length."""
 ANGLE_STEP_RAD, RIM_RAD = 0.42, 0.25
-"""The angle between sample points around a cylinder, and the angle between the last sample point
-and the edge of the touchable skin."""
+"""The angle between sample points around a cylinder, and the angle between the outermost sample
+point and the edge of the touchable skin."""
 APART_RATIO, RIM_RATIO = 2.2, 0.9
-"""The distance between sample points of shapes other than cylinders, and their minimum distance
-from skin that cannot be touched, in finger radii."""
+"""The distance between sample points, and their minimum distance from skin that cannot be touched,
+in finger radii. They apply to shapes other than cylinders."""
 TOLERANCE, MAX_STEP_RATIO, MIN_STEP_FRACTION = 1e-3, 1.0, 0.25
-"""The tolerance and the maximum and minimum load step, which are looser than for a reference
-solution. They change the force by at most 0.04 %, and halve the computation time."""
+"""The settings of Newton's method for snapshots: the tolerance, and the maximum and minimum load
+step. They are less strict than those of a reference solution. This changes the force by at most
+0.04 % and halves the computation time."""
 MIN_VOLUME_RATIO = 0.2
-"""The volume ratio of the most compressed element below which a push ends, because the solution at
-the next depth would not converge."""
+"""The volume ratio of the most compressed element below which a push ends. Below this ratio, the
+solution at the next depth would not converge."""
 QUICK_DEPTHS_M = (0.0025, 0.005, 0.010)
 QUICK_COUNT = 9
-"""The depths and the number of sample points of the coarse table, which is computed first."""
+"""The number of sample points of the coarse table, which is computed first. `QUICK_DEPTHS_M`
+contains its push depths."""
 FINE_DEPTHS_M = (0.0007, 0.0015, 0.003, 0.005, 0.010)
 FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
-"""The parameters of the push on a fine mesh that corrects the forces. They are the depths, the
-ratio of the skin spacing to that of a snapshot, the radius of the fine region in finger radii, and
-the growth of the element size per distance (m/m)."""
+"""The parameters of the fine mesh that corrects the forces. They are the ratio of its skin spacing
+to that of a snapshot, the radius of its fine region (finger radii), and its growth of the element
+size per distance (m/m). `FINE_DEPTHS_M` contains the push depths."""
 SAME_RATIO = 1e-6
 
 
 class SnapshotCancelledError(Exception):
-    """An error that is raised when the solution of a snapshot is cancelled."""
+    """Raised when the computation of a snapshot is cancelled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +78,7 @@ class SnapshotJob:
 
     nodes (n, 3), m, elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
     six-node triangles that the finger can touch. depths_m: push depths. mirror_axes: axes of planes
-    of symmetry through the sample point, on one side of which the mesh is; 0 for x = 0 and 1 for
+    of symmetry through the sample point if the mesh is only one side of them, 0 for x = 0 and 1 for
     y = 0.
     """
 
@@ -116,7 +118,7 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
     solution is cancelled, SolidMeshError for inverted elements, and ValueError for an invalid
     material.
     """
-    from flexsheet.nodes.fem_solver.newton import NeoHookeanBody  # late: scipy is slow to import
+    from flexsheet.nodes.fem_solver.newton import NeoHookeanBody  # scipy is slow to import
 
     body = NeoHookeanBody(
         job.nodes,
@@ -161,7 +163,9 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
 
 
 def _unfold_snapshot(snapshot: Snapshot, sample: SamplePoint, axis: int) -> Snapshot:
-    """Return the snapshot of a whole body from that of its half on one side of a plane."""
+    """Return the snapshot of a whole body from the snapshot of its half on one side of a plane of
+    symmetry.
+    """
     signs = np.ones(3)
     signs[axis] = -1.0
     image, _ = reflect_snapshot(snapshot, sample, signs)
@@ -180,8 +184,8 @@ def _unfold_snapshot(snapshot: Snapshot, sample: SamplePoint, axis: int) -> Snap
 def find_mirror_planes(mesh: SolidMesh) -> list[Floats]:
     """Find the mirror symmetries of a body and its support about the planes x = 0 and y = 0.
 
-    Return one vector (3,) for each symmetry, with
-    -1 for mirrored coordinates and 1 for the others. The first vector is the identity (1, 1, 1).
+    Return one vector (3,) for each symmetry, with -1 for mirrored coordinates and 1 for other
+    coordinates. The first vector is the identity (1, 1, 1).
     """
     from scipy.spatial import cKDTree
 
@@ -233,7 +237,8 @@ def choose_sample_points(
 def order_by_spread(
     samples: list[SamplePoint], mirrors: list[Floats], towards_user: Floats
 ) -> list[SamplePoint]:
-    """Order sample points so that the first points of the result cover the skin best.
+    """Order sample points so that the first points of the result cover the skin as evenly as
+    possible.
 
     The first point is nearest to the centre of the side that faces the user. Each next point is
     farthest from all previous points and their mirror images (farthest point sampling). mirrors:
@@ -354,7 +359,7 @@ def _make_focused_mesh(
 def _mirror_axes(sample: SamplePoint) -> tuple[int, ...]:
     """Return the axes of the planes of symmetry of a cylinder that contain a push.
 
-    The planes are x = 0 and, since the support is centred on -z, y = 0.
+    The possible planes are x = 0 and y = 0, because the support is centred on -z.
     """
     return tuple(
         axis for axis in (0, 1) if max(abs(sample.point[axis]), abs(sample.normal[axis])) < SAME_M
@@ -372,7 +377,7 @@ def make_job_on_mesh(
 ) -> SnapshotJob:
     """Return the job for pushes at a sample point to several depths with a given mesh.
 
-    mirror_axes: axes of planes of symmetry, on one side of which the mesh is.
+    mirror_axes: axes of planes of symmetry if the mesh is only one side of them.
     """
     return SnapshotJob(
         nodes=mesh.nodes,
@@ -392,7 +397,7 @@ def reflect_snapshot(
 ) -> tuple[Snapshot, SamplePoint]:
     """Return the mirror images of a snapshot and of its sample point.
 
-    signs (3,): -1 for mirrored coordinates, and 1 for the others.
+    signs (3,): -1 for mirrored coordinates, and 1 for other coordinates.
     """
     faces = snapshot.faces
     if signs.prod() < 0.0:

@@ -1,6 +1,6 @@
 """Build the soft body of a scene, with the linear method or the nonlinear table.
 
-Precomputed data is loaded from the cache, or computed and stored there.
+Precomputed data is loaded from the cache. Missing data is computed and stored in the cache.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from flexsheet.nodes.fem_solver import body, precompute, precompute_table
 from flexsheet.nodes.fem_solver.table import Table
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
-"""A soft-body method, or `auto` for the nonlinear table if it is cached, otherwise linear."""
+"""A soft-body method, or `auto`. `auto` selects the nonlinear table if it is cached, and the linear
+method otherwise."""
 
 SKIN_SPACING_M = 0.003
 """The distance between skin nodes if neither a parameter nor the scene specifies it, in metres."""
@@ -35,9 +36,10 @@ def choose_method(
 ) -> tuple[MethodChoice, float]:
     """Choose the method and the skin spacing (m) from a scene and the parameters of a node.
 
-    method, skin_spacing_m: parameters, for which `auto` leaves the choice to the scene. If the
-    scene chooses the linear method, that is used even if a table is cached. Otherwise, `auto` uses
-    a cached table. compute_table: whether a missing table is computed if the method is `auto`.
+    method, skin_spacing_m: parameters of the node. `auto` selects the value in the scene. If the
+    scene selects the linear method, this method is used even if a table is cached. Otherwise,
+    `auto` selects a cached table. compute_table: whether a missing table is computed if the method
+    is `auto`.
     """
     choice = scene.methods.soft_body
     by_scene_m = None if choice is None else choice.skin_spacing_m
@@ -49,11 +51,11 @@ def choose_method(
 
 @dataclass(slots=True)
 class SoftBodyFactory:
-    """A factory of soft bodies that keeps the last precomputed model in memory.
+    """A factory of soft bodies, which stores the last precomputed model in memory.
 
     workers: number of processes that compute a table; 0 means one per core. scheduler: address of a
     dask scheduler whose workers compute the table instead. If the cache in `cache_dir` is empty,
-    each method takes seconds to minutes.
+    each call of a method takes seconds to minutes.
     """
 
     skin_spacing_m: float
@@ -105,7 +107,9 @@ class SoftBodyFactory:
     def _load_model(
         self, spec: precompute.SoftBodySpec, progress: Callable[[int, int, Any], None]
     ) -> precompute.SoftBodyModel:
-        """Return the last model if it has the same inputs. Otherwise, load or compute the model."""
+        """Return the model of a specification. Use the last model if its inputs are equal;
+        otherwise, load or compute the model.
+        """
         # Read `_model` only once: another thread whose result is no longer needed may replace it.
         last, key = self._model, spec.key()
         if last is None or last[0] != key:
@@ -163,10 +167,12 @@ class SoftBodyFactory:
 
     @contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
-        """Yield the executor of snapshots, and the number of its workers on this computer."""
+        """Yield the executor that computes snapshots, and the number of its workers on this
+        computer.
+        """
         if self.scheduler is not None:
             from flexsheet.nodes.fem_solver.dask_executor import (
-                connect_workers,  # late: it is slow to import
+                connect_workers,  # imported late, because it is slow to import
             )
 
             with connect_workers(self.scheduler) as executor:
@@ -181,4 +187,4 @@ FACTORY_PARAMETERS = {one.name for one in fields(SoftBodyFactory) if one.init} -
     "cache_dir",
     "skin_spacing_m",
 }
-"""The names of the node parameters that are passed to the factory unchanged."""
+"""The names of the node parameters that the constructor of `SoftBodyFactory` receives unchanged."""

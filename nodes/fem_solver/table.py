@@ -1,14 +1,13 @@
 """Compute the response to pushes from a precomputed nonlinear table.
 
 For pushes at every touchable node to several depths, the table contains the force and the
-displacement of the skin (the surface of the body). Shape functions of the mesh interpolate
-between nodes, and cubics with a continuous slope between depths. The response is therefore a
-continuous function of the finger's position. One response reads 24 rows of the table: six nodes at
-four depths. (A proper orthogonal decomposition over depth would have to read more. It needs nine of
-thirteen modes for an error of 0.1 mm, because the contact area grows with depth.)
+displacement of the skin (the surface of the body). Shape functions of the mesh interpolate between
+nodes. Cubic polynomials with a continuous slope interpolate between depths. Therefore the response
+is a continuous function of the finger's position. One response reads 24 rows of the table, which
+belong to six nodes at four depths.
 
 The table is filled with solutions of Newton's method, called snapshots, at several tens of sample
-points. They are interpolated to the other nodes (`snapshot_interpolator`). At small depths the
+points. The module `snapshot_interpolator` interpolates them to the other nodes. At small depths the
 linear method is used instead.
 """
 
@@ -40,22 +39,22 @@ from flexsheet.nodes.fem_solver.snapshots import FINE_RATIO, SAME_RATIO, SampleP
 from flexsheet.nodes.models.interpolation import smoothstep
 
 LINEAR_DEPTHS_M = (0.0007,)
-"""The depths of the table that no snapshot has."""
+"""The depths of the table that are not contained in the snapshots."""
 BLEND_M = (0.0007, 0.0015)
 """The range of depths in which the table changes from the linear response to the snapshots."""
 MIN_COSINE = -0.25
 """The minimum cosine of the angle between the deformed and the undeformed normal of a triangle."""
 END_SPAN_M = 0.00125
-"""The depth of the deepest solution below the end of the valid range. The responses to pushes
-beyond the valid range approach the deepest solution."""
+"""The distance (m) of the deepest solution below the end of the valid depth range. The responses to
+deeper pushes approach this solution."""
 FADE_RATIO = 2.0
-"""The distance beyond the edge of the touchable skin within which the displacement decreases to
-zero, in finger radii."""
+"""The distance beyond the edge of the touchable skin, in finger radii, over which the displacement
+decreases to zero."""
 CANDIDATE_FACES = 4
 MESH_ORDER = 2.0
-"""The order of convergence of the force with the element size."""
+"""The assumed order of convergence of the force with the element size."""
 FILLED_NODES = 48
-"""The maximum number of contact nodes of one job that fills a table."""
+"""The maximum number of contact nodes in one job that computes a part of a table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +73,7 @@ class Table:
 
 
 def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
-    """Return the memory that a table needs, in bytes.
+    """Return the memory, in bytes, that a nonlinear table needs.
 
     loads: number of contact nodes. skin_nodes: number of skin nodes. depths: number of depths of a
     snapshot.
@@ -101,7 +100,7 @@ class FilledNodes:
     """The interpolated snapshots at n nodes and k depths.
 
     moved (n, k, 3 s): displacements of s skin nodes, m. force_n (n, k, 3): forces. reached (n,):
-    mean number of depths at which the snapshots used converged. valid (n,): number of depths at
+    mean number of depths at which the used snapshots converged. valid (n,): number of depths at
     which the displacement is valid.
     """
 
@@ -128,8 +127,8 @@ def interpolate_nodes(job: FillJob) -> FilledNodes:
 
 
 Interpolate = Callable[[Sequence[FillJob]], Iterable[FilledNodes]]
-"""A function that interpolates at the nodes of jobs, in this or other processes. It returns the
-results in the order of the jobs."""
+"""A function that interpolates snapshots at the nodes of jobs, in this process or in other
+processes. It returns the results in the order of the jobs."""
 
 
 def fill_table(
@@ -195,9 +194,9 @@ def find_mirror_images(
     """Find the contact nodes whose pushes are mirror images of pushes at earlier contact nodes.
 
     points (n, 3): contact nodes, m. rest (s, 3): undeformed skin nodes, m. mirrors: vectors (3,) of
-    signs, one for each mirror symmetry of the body; those that do not map all skin nodes to skin
-    nodes are ignored. For each node found, return the index of the earlier node, the signs, and
-    the index of the mirror image of each skin node (s,).
+    signs, one for each mirror symmetry of the body. Symmetries that do not map all skin nodes to
+    skin nodes are ignored. For each contact node found, return the index of the earlier node, the
+    signs, and the index of the mirror image of each skin node (s,).
     """
     from scipy.spatial import cKDTree
 
@@ -227,8 +226,8 @@ def compute_force_factors(
 ) -> Floats:
     """Return the factors (L,) that correct the forces of a table at its depths (L,), m.
 
-    The table's meshes are too coarse for small contacts, and its forces are therefore too large.
-    Each factor is the ratio of an estimate of the true force to the table's force at the same
+    The meshes of the table are too coarse for small contacts. Therefore the forces in the table are
+    too large. Each factor is an estimate of the true force divided by the table's force at the same
     point. The estimate is a Richardson extrapolation of order 2 from the meshes of the table and of
     the fine push. At depths where the table contains the linear response, the estimate is the force
     of the fine push. Beyond the depths of the fine push, the factor is constant.
@@ -257,8 +256,8 @@ def _blend_levels(
 ) -> tuple[Singles, Floats]:
     """Blend interpolated snapshots with the linear response at small depths.
 
-    solved (k, 3 s), pushed (k, 3): displacement (m) and force (N) at the last k of the L depths.
-    Return the displacement (L, 3 s) and the force (L, 3) at all depths.
+    solved (k, 3 s), pushed (k, 3): interpolated displacement (m) and force (N) at the last k of the
+    L depths. Return the displacement (L, 3 s) and the force (L, 3) at all depths.
     """
     moved = np.zeros((len(depths), solved.shape[1]), dtype=np.float32)
     force = np.zeros((len(depths), 3))
@@ -276,7 +275,7 @@ def _blend_levels(
 
 
 def _reach_m(reached: float, depths: Floats) -> float:
-    """Return the maximum depth (m) with a valid solution.
+    """Return the maximum depth (m) with a valid interpolated solution.
 
     reached: number of converged depths, which may be fractional. depths (k,): depths, m.
     """
@@ -284,13 +283,14 @@ def _reach_m(reached: float, depths: Floats) -> float:
 
 
 class CubicInterpolator:
-    """A cubic interpolator over increasing depths, with continuous slope.
+    """An interpolator over increasing depths by cubic polynomials with a continuous slope.
 
-    The slope at a depth is that of the parabola through its value and the two neighbouring values.
+    The slope at a depth of the table is that of the parabola through the values at this depth and
+    the two adjacent depths.
     """
 
     def __init__(self, depths_m: Floats) -> None:
-        """Precompute the cubic polynomials for at least four depths (L,), m."""
+        """Compute the cubic polynomials for depths (L,), m. At least four depths are required."""
         count = len(depths_m)
         self._depths = depths_m.tolist()
         values = np.eye(count)
@@ -306,9 +306,9 @@ class CubicInterpolator:
             self._powers.append(np.array(rows)[:, first : first + 4])
 
     def weights_at(self, depth_m: float) -> tuple[int, Floats]:
-        """Return the index of a first depth and four weights for the interpolation at a depth (m).
+        """Return an index i and four weights (4,) for the interpolation at a depth (m).
 
-        The weights (4,) apply to the first depth and the three next depths of the table.
+        The weights apply to the depths i to i + 3 of the table.
         """
         level = min(max(bisect_right(self._depths, depth_m) - 1, 0), len(self._depths) - 2)
         t = (depth_m - self._depths[level]) / (self._depths[level + 1] - self._depths[level])
@@ -316,7 +316,8 @@ class CubicInterpolator:
 
 
 def count_valid_levels(rest: Floats, moved: Singles, triangles: NDArray[np.int32]) -> int:
-    """Count the depths up to the first one with an invalid interpolated skin displacement.
+    """Return the number of depths before the first depth with an invalid interpolated skin
+    displacement.
 
     rest (s, 3): undeformed skin nodes, m. moved (L, s, 3): displacement at each depth, m. triangles
     (t, 3): skin triangles. A displacement is invalid if a triangle is rotated by more than the
@@ -338,10 +339,11 @@ def count_valid_levels(rest: Floats, moved: Singles, triangles: NDArray[np.int32
 
 
 def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
-    """Return the distance (m) between a point (3,) and the edges of a triangle.
+    """Return the distance (m) between a point (3,) and the edges of a triangle, and the nearest
+    point.
 
-    corners (3, 3): corners of the triangle. The second result is the nearest point on the edges, in
-    local coordinates (2,) of the triangle.
+    corners (3, 3): corners of the triangle. The nearest point on the edges is given in local
+    coordinates (2,) of the triangle.
     """
     starts, edge_vectors = corners, np.roll(corners, -1, axis=0) - corners
     along = np.clip(
@@ -356,7 +358,7 @@ def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
 
 
 class TableSoftBody:
-    """A soft-body method that interpolates in a nonlinear table."""
+    """A soft-body method that interpolates responses in a nonlinear table."""
 
     def __init__(
         self,
@@ -410,7 +412,9 @@ class TableSoftBody:
         self._reach_and_bound = np.column_stack([self.reach_m, np.minimum(bound_distance, 1.0)])
 
     def respond(self, query: ContactQuery) -> Response:
-        """Compute the response of the skin to a contact."""
+        """Compute the displacement of the skin and the contact force for a contact with the
+        finger.
+        """
         nodes, weights, off = self.project_to_surface(query.surface)
         curve = self._curve_at(nodes, weights)
         stiffness = float(curve[len(CURVE_FRACTIONS), 1]) / self._linear
@@ -471,11 +475,16 @@ class TableSoftBody:
         return self._faces[best], weights, 0.0
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return the force per depth (N/m) at `linear_depth_m` near a surface point (3,)."""
+        """Return the force divided by depth (N/m) at the depth `linear_depth_m` near a surface
+        point (3,).
+        """
         return float(self.force_curve(surface)[len(CURVE_FRACTIONS), 1]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force-depth curve (n, 2) near a surface point (3,): depth (m), force (N)."""
+        """Return the force-depth curve (n, 2) near a surface point (3,).
+
+        The columns are depth (m) and force (N).
+        """
         nodes, weights, _ = self.project_to_surface(surface)
         return self._curve_at(nodes, weights)
 

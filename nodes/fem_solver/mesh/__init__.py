@@ -1,4 +1,4 @@
-"""Mesh the virtual object of a scene; `solid.SolidMesh` describes the result.
+"""Mesh the virtual object of a scene. The class `solid.SolidMesh` describes the result.
 
 spec = mesh_spec(scene, skin_spacing_m)     # `spec.key()` identifies the mesh
 mesh_budget(spec)                           # nodes and memory, before any work

@@ -11,16 +11,17 @@ from flexsheet.nodes.fem_solver.mesh.quality import MIN_JACOBIAN_RATIO, min_jaco
 from flexsheet.nodes.fem_solver.mesh.solid import EDGES, boundary_faces
 
 MAX_SAG_RATIO = 0.25
-"""The maximum displacement of the midpoint of an edge, divided by the length of the edge. A surface
-point at a larger distance is on another side of a thin part."""
+"""The maximum displacement of an edge's midpoint, divided by the length of the edge. A surface
+point at a larger distance is on the opposite side of a thin part."""
 
 
 def curve_edges(nodes: Floats, elements: Ints, nearest: Callable[[Floats], Floats]) -> Floats:
-    """Move midpoints of boundary edges to the nearest surface points and return all nodes (n, 3).
+    """Move the midpoints of boundary edges to the nearest surface points, and return all nodes (n,
+    3).
 
     nodes (n, 3), m, elements (e, 10): mesh with straight edges. nearest: function that returns the
     nearest surface points. The edges of an element remain straight if its Jacobian determinant
-    would fall below `MIN_JACOBIAN_RATIO` times the determinant of the straight element.
+    would decrease below `MIN_JACOBIAN_RATIO` times the determinant of the straight element.
     """
     middles = np.unique(boundary_faces(elements)[:, 3:])
     result = nodes.copy()

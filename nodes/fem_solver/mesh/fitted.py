@@ -3,11 +3,12 @@
 The method follows Molino, Bridson, Teran, Fedkiw ("A crystalline, red green strategy for meshing
 highly deformable objects with tetrahedra", 2003), on a bisected lattice:
 
-1. Lattice tetrahedra are bisected to the required sizes, and more where the surface is sharply
-   curved.
-2. Lattice vertices deep enough inside the surface form the core. All tetrahedra with a core vertex
-   are used, so every tetrahedron has a corner inside and at most one boundary face. Where the
-   boundary touches itself in an edge or a vertex (a pinch), vertices are removed from the core.
+1. Lattice tetrahedra are bisected to the required sizes, and to smaller sizes where the surface is
+    sharply curved.
+2. Lattice vertices that are deep enough inside the surface form the core. All tetrahedra with a
+    core vertex are used. Therefore every tetrahedron has a corner inside and at most one boundary
+    face. Where the boundary touches itself in an edge or a vertex (a pinch), vertices are removed
+    from the core.
 3. The boundary is moved to the surface while the element shapes are optimized (`smoothing`).
 
 The method is deterministic. Parts thinner than the smallest elements are omitted.
@@ -45,14 +46,16 @@ SURFACE_DISTANCE_RATIO = 0.5
 """The maximum distance between the surface and the nearest corner of a surface element, divided by
 the longest edge of the element."""
 CORE_DEPTH_RATIO = 0.4
-"""The minimum depth of a core vertex below the surface, divided by its shortest edge."""
+"""The minimum depth of a core (interior) vertex below the surface, divided by the length of the
+shortest edge at this vertex."""
 MAX_THINNED_FRACTION = 0.05
-"""The maximum fraction of core vertices that may be removed from an object of sufficient
-thickness."""
+"""The maximum fraction of core (interior) vertices that may be removed. If more are removed, the
+object is too thin."""
 GOOD_RATIO = 0.2
 ATTEMPTS = 5
-"""The maximum number of fits. If the radius ratio of an element is below `GOOD_RATIO`, its core
-vertex nearest to the surface is removed and the fit is repeated. The best fit is used."""
+"""The maximum number of attempts to fit a mesh. If the radius ratio of an element is below
+`GOOD_RATIO`, its interior vertex nearest to the surface is removed, and the fit is repeated. The
+best fit is used."""
 
 
 class _SurfaceCache:
@@ -67,7 +70,8 @@ class _SurfaceCache:
         return self.origin + vertices * (self.cell_m / CELL)
 
     def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
-        """Return signed distance (n,), m, normal (n, 3) and curvature (n,), 1/m, of the surface.
+        """Return the signed distance (n,), m, the normal (n, 3) and the curvature (n,), 1/m, of the
+        surface.
 
         The values belong to the surface points nearest to the lattice vertices (n, 3).
         """
@@ -134,7 +138,8 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
 def limit_sizes_by_curvature(sizes: Floats, bend: Floats, grading: Grading) -> Floats:
     """Limit element sizes (n,), m, to `CURVATURE_SIZE_RATIO` times the radius of curvature.
 
-    bend (n,): curvatures, 1/m. grading: element sizes that determine the lower bound of the result.
+    bend (n,): curvatures, 1/m. grading: required element sizes, which determine the lower bound of
+    the result.
     """
     finest = np.maximum(
         CURVATURE_SIZE_RATIO / np.maximum(bend, 1e-9), MIN_SIZE_RATIO * grading.element_m
@@ -185,7 +190,8 @@ def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
 
 
 def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
-    """Return the tetrahedra (k, 4) with a core vertex, after the removal of pinches.
+    """Return the tetrahedra (k, 4) that have a core (interior) vertex, after the removal of
+    pinches.
 
     Vertices where the boundary touches itself are removed from `core` (n,), in place. distance
     (n,): signed distance (m) of the vertices from the surface. Raise UnfitMeshError if the object
@@ -210,7 +216,7 @@ def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
 def _find_pinches(faces: Ints) -> Ints:
     """Return the vertices (k,) at which a boundary of faces (f, 3) touches itself.
 
-    The edges of such a vertex belong to more than two faces, or its faces form more than one fan.
+    At such a vertex, an edge belongs to more than two faces, or the faces form more than one fan.
     """
     edges, uses = np.unique(
         np.sort(faces[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1),

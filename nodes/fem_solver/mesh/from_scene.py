@@ -1,4 +1,5 @@
-"""Mesh the virtual object of a scene: specify the mesh, estimate its resources and build it.
+"""Specify the mesh of a scene's virtual object, estimate the required resources, and build the
+mesh.
 
 The skin is the surface of the object. Its spacing is the distance between neighbouring skin nodes.
 """
@@ -47,18 +48,18 @@ VERSION = 1
 TOUCH_MARGIN_RAD = 0.45
 """The angle by which the touchable skin extends beyond the maximum tilt of the working range."""
 SLAB_DEPTHS = 2.0
-"""The ratio of the depth of a slab for a half-space to the push depth of the scene."""
+"""The depth of the slab that represents a half-space, divided by the push depth of the scene."""
 MIN_THICKNESS_SPACINGS = 4.0
-"""The minimum thickness of the object in skin spacings, which equals two elements."""
+"""The minimum thickness of the object, in skin spacings. It corresponds to two elements."""
 MAX_NODES = 250_000
 BYTES_PER_NODE = 6000
-"""The peak memory per node while meshing, as measured by `benchmarks.meshing`."""
+"""The maximum memory (bytes) per node during meshing, as measured by `benchmarks.meshing`."""
 SAMPLES = 16
 """The number of samples per side of the bounding box in the estimate of the number of nodes."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
 CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
-"""The measured ratios of the number of nodes to an estimate by integration. The first two apply to
-inner and skin nodes. The other two apply to the sum, for a cylinder and for a mesh file."""
+"""The measured ratios of the number of nodes to its estimate, for a cylinder and for a mesh file.
+`INNER_FACTOR` and `SKIN_FACTOR` apply to inner nodes and skin nodes before these factors."""
 MAX_LOST_FRACTION = 0.1
 """The maximum fraction of an object's volume that its mesh may omit."""
 
@@ -70,7 +71,7 @@ class MeshSpec:
     touch_angle_rad: maximum angle between the normal of touchable skin and the direction to the
     user. skin_spacing_m: distance between skin nodes. towards_user: unit vector to the user, mesh
     frame. down: downward direction for a base support, object frame. rotation_rad: rotation of the
-    mesh frame of a cylinder about the x axis of the object. slab_depth_m: depth of the slab that
+    mesh frame of a cylinder about the object's x axis. slab_depth_m: depth of the slab that
     represents a half-space.
     """
 
@@ -166,14 +167,16 @@ def _cylinder_rotation_rad(scene: Scene) -> float:
 
 
 def _rounded(vector: Floats) -> Vector:
-    """Round a vector, so that small numerical differences do not change a digest of it."""
+    """Round the components of a vector, so that small numerical differences do not change the
+    digest of a mesh.
+    """
     # Adding zero converts -0.0 to 0.0.
     x, y, z = (float(value) + 0.0 for value in np.round(vector, 12))
     return x, y, z
 
 
 def mesh_budget(spec: MeshSpec) -> MeshBudget:
-    """Estimate the resources for building a mesh, in at most a second.
+    """Estimate the resources that are needed to build a mesh. The estimate takes at most a second.
 
     Raise UnfitMeshError for a skin spacing that does not fit the object or requires more than
     `MAX_NODES` nodes.
@@ -184,7 +187,7 @@ def mesh_budget(spec: MeshSpec) -> MeshBudget:
 def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     """Estimate the number of nodes of the mesh, within a factor of two.
 
-    Nodes are half an element size apart. The number of inner nodes is therefore about the integral
+    Nodes are half an element size apart. Therefore the number of inner nodes is about the integral
     of (2 / element size)^3 over the volume. The number of skin nodes is about the integral of (2 /
     element size)^2 over the surface. Measured factors such as `INNER_FACTOR` correct both numbers.
     Raise UnfitMeshError for a skin spacing that does not fit the object or requires more than
@@ -246,11 +249,11 @@ def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
 
 
 def build_mesh(spec: MeshSpec) -> SolidMesh:
-    """Build the mesh of a specification.
+    """Build the mesh that a specification describes.
 
     Raise UnfitMeshError for a skin spacing that does not fit the object or requires more than
-    `MAX_NODES` nodes. Also raise it if the object is too thin for the elements, or if the support
-    fixes too few nodes or all touchable skin.
+    `MAX_NODES` nodes. Also raise this error if the object is too thin for the elements, or if the
+    support fixes too few nodes or all touchable skin.
     """
     geometry = spec.geometry
     shape = make_shape(dict(geometry))

@@ -1,4 +1,6 @@
-"""Define the element sizes of a mesh: small at touchable skin, larger at the back and inside."""
+"""Define the element sizes of a mesh, which are small at touchable skin and larger at the back and
+inside.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,10 @@ class Grading:
 
     @property
     def element_m(self) -> float:
-        """Return the minimum element size, m: two spacings, because edges have a midpoint node."""
+        """Return the minimum element size, m.
+
+        The size is two node spacings, because edges have a midpoint node.
+        """
         return 2.0 * self.skin_spacing_m
 
     def touchable(self, normals: Floats) -> Bools:

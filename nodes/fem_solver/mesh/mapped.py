@@ -1,13 +1,13 @@
 """Mesh sphere, ellipsoid, rounded box and slab by mapping the vertices of a bisected lattice.
 
 Let u be the coordinates of a lattice vertex, scaled so that the lattice is the cube [-1, 1]^3. With
-s = max |u_i|, w = u / s is a point on the surface of the cube. The vertex is mapped to
+s = max |u_i|, the point w = u / s is on the surface of the cube. The vertex is mapped to
 
     x(u) = c u + s^2 (X(w) - c w)
 
-X maps the surface of the cube to that of the solid (`CuboidMap.surface`). c are half extents
-(`CuboidMap.inner_m`); near the centre, the lattice is only scaled by them. Symmetric solids get
-symmetric meshes.
+X maps the surface of the cube to that of the solid (`CuboidMap.surface`). c contains half extents
+(`CuboidMap.inner_m`). Near the centre, the lattice is only scaled by c. The meshes of symmetric
+solids are symmetric.
 """
 
 from __future__ import annotations
@@ -35,20 +35,22 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
 from flexsheet.nodes.models.shapes import CuboidMap, Shape
 
 COARSENINGS = (8.0, 4.0, 2.0, 1.0, 0.85, 0.7)
-"""The tried widths of the lattice cells before bisection, divided by the minimum element size."""
+"""The widths of the lattice cells before bisection that are tried, divided by the minimum element
+size."""
 ANCHORS = (30.0, 3.0, 0.3, 0.0)
 """The stiffnesses of the springs that hold corners at their mapped positions. The
 first value for which the radius ratios of all elements exceed `GOOD_RATIO` is used."""
 GOOD_RATIO = 0.2
 MAX_SURPLUS_RATIO = 2.0
-"""The maximum number of elements of a lattice, divided by that of the smallest lattice."""
+"""The maximum number of elements of a lattice, divided by the number of elements of the smallest
+lattice."""
 
 
 def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:
     """Map lattice vertices (n, 3) to points (n, 3), m, in the solid.
 
     half_cells (3,): half the number of lattice cells along each axis. The second result contains
-    the surface points (n, 3), m, on the rays from the centre through the vertices.
+    the points (n, 3), m, at which rays from the centre through the vertices intersect the surface.
     """
     u = vertices / (CELL * half_cells)
     weight = np.abs(u).max(axis=1, keepdims=True)
@@ -62,7 +64,7 @@ def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Fl
     """Return nodes (n, 3), m, object frame, and elements (e, 10) of the solid inside a shape.
 
     template: map from the cube to the shape. grading: required element sizes. Raise UnfitMeshError
-    if the elements of all meshes are too distorted.
+    if the elements of all tried meshes are too distorted.
     """
 
     def positions(vertices: Ints, half_cells: Ints) -> tuple[Floats, Floats]:

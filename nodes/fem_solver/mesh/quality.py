@@ -9,12 +9,14 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats, Ints
 
 MIN_RADIUS_RATIO = 0.1
-"""The minimum radius ratio of all elements of an accepted mesh."""
+"""The minimum radius ratio (3 times the inscribed radius over the circumscribed radius) of all
+elements of an accepted mesh."""
 MIN_JACOBIAN_RATIO = 0.1
-"""The minimum ratio of the Jacobian determinants of a curved and the straight element."""
+"""The minimum Jacobian determinant of a curved element, divided by that of the element with
+straight edges."""
 
 _EDGE_OF = np.array([[-1, 4, 6, 7], [4, -1, 5, 8], [6, 5, -1, 9], [7, 8, 9, -1]])
-"""The index of the node at the midpoint of the edge between two corners of an element."""
+"""The node index of the midpoint of the edge between two corners (row and column) of an element."""
 
 
 def signed_volumes(points: Floats, tetrahedra: Ints) -> Floats:

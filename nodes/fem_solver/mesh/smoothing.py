@@ -1,12 +1,12 @@
 """Optimize the shape of tetrahedra while their boundary is moved to a surface.
 
 The objective is the sum of w^2 over all tetrahedra. w = (|A|^2 / 3)^(3/2) / det A is the inverse
-mean ratio, a measure of distortion. The matrix A maps a regular tetrahedron to the actual one. w is
-1 for a regular tetrahedron of any size and infinite for a flat one, so elements never become
-inverted (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp, "Tetrahedral mesh
-improvement via optimization of the element condition number", 2002). Springs along the surface
-normals pull the boundary corners to the surface, and the corners can slide along it. The stiffness
-of the springs increases in several rounds.
+mean ratio, a measure of distortion. The matrix A maps a regular tetrahedron to the actual
+tetrahedron. w is 1 for a regular tetrahedron of any size, and infinite for a flat tetrahedron.
+Therefore elements never become inverted (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and
+Knupp, "Tetrahedral mesh improvement via optimization of the element condition number", 2002).
+Springs along the surface normals pull the boundary corners to the surface. The corners can slide
+along the surface. The stiffness of the springs increases in several rounds.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ Surface = Callable[[Floats], tuple[Floats, Floats]]
 normals."""
 
 SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-"""The spring stiffness in each round for a boundary that is initially up to one element off the
-surface. The unit of length is the median edge length."""
+"""The spring stiffness in each round for a boundary whose initial distance from the surface is up
+to one element. The unit of length is the median edge length."""
 SPRINGS_ON_SURFACE = (300.0, 1000.0, 3000.0)
 """The spring stiffness in each round for a boundary that is initially on the surface."""
 MIN_FINAL_RADIUS_RATIO = 0.15
-"""The minimum radius ratio of an element after its corners are moved onto the surface."""
+"""The minimum radius ratio (a measure of quality) of an element after its corners are moved onto
+the surface."""
 ROUND_STEPS = 20
 MEMORY = 8
 """The number of previous steps and gradient changes that the L-BFGS method uses."""
@@ -59,13 +60,13 @@ def smooth_mesh(
     springs: tuple[float, ...],
     anchor: float,
 ) -> Floats:
-    """Improve the shape of tetrahedra and return the new positions (n, 3), in m, of their corners.
+    """Improve the shape of tetrahedra, and return the new positions (n, 3), m, of their corners.
 
     corners (n, 3), m, tetrahedra (e, 4): mesh with positive volumes. hull: indices of the corners
     that move to the surface. surface: function that finds the nearest surface points. springs:
-    spring stiffness in each round. anchor: stiffness of springs from each corner to its start
-    position, which preserve the variation of element sizes. If an element would have a radius ratio
-    below `MIN_FINAL_RADIUS_RATIO`, its corners are not moved fully onto the surface.
+    spring stiffness in each round. anchor: stiffness of springs from each corner to its initial
+    position. These springs preserve the variation of element sizes. If an element would have a
+    radius ratio below `MIN_FINAL_RADIUS_RATIO`, its corners are not moved fully onto the surface.
     """
     sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
     unit = float(np.median(np.linalg.norm(sides, axis=1)))
@@ -100,7 +101,7 @@ def smooth_mesh(
 
 
 def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
-    """Return the sum of squared inverse mean ratios of all tetrahedra and its gradient (n, 3).
+    """Return the sum of the squared inverse mean ratios of all tetrahedra, and its gradient (n, 3).
 
     The sum is infinite if a tetrahedron is inverted.
     """
@@ -125,8 +126,8 @@ def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
 def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) -> Floats:
     """Minimize an energy by `ROUND_STEPS` steps of L-BFGS with a backtracking line search.
 
-    points (n, 3): start. energy: function that returns the energy and its gradient (n, 3). The line
-    search accepts infinite energies, unlike that of scipy. Source: Nocedal and
+    points (n, 3): start. energy: function that returns the energy and its gradient (n, 3). Unlike
+    the line search of SciPy, this line search accepts infinite energies. Source: Nocedal and
     Wright, Numerical Optimization, alg. 7.5.
     """
     value, gradient = energy(points)

@@ -1,7 +1,7 @@
 """Define solid meshes of 10-node tetrahedra and the roles of their surface nodes.
 
-The nodes of an element are its corners, then the midpoints of its edges, in the order of VTK.
-Midpoints of edges on a curved surface are on the true surface; all other edges are straight.
+The nodes of an element are its corners, then the midpoints of its edges, in the order of VTK. The
+midpoints of edges on a curved surface are on the true surface. All other edges are straight.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from flexsheet.nodes.arrays import Bools, Floats, Ints
 EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
 """The corners of the edges whose midpoints are the nodes 4 to 9 of a tetrahedron."""
 FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]])
-"""The nodes of the faces of a tetrahedron. Each face has three corners, counter-clockwise if seen
-from outside, and then the midpoints of the edges between these corners."""
+"""The nodes of the faces of a tetrahedron. Each row contains three corners, counter-clockwise as
+seen from outside, and then the midpoints of the edges between these corners."""
 SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 """The division of a six-node triangle into four flat triangles over the same nodes."""
 SAME_M = 1e-9
-"""The maximum distance of a node from a plane in which it is, in metres."""
+"""The maximum distance (m) from a plane at which a node counts as a point of this plane."""
 
 
 class UnfitMeshError(FlexsheetError, ValueError):
-    """An error that is raised for an object that cannot be meshed as specified."""
+    """Raised for an object that cannot be meshed as specified."""
 
     code = "unfit-mesh"
     remedy = "Choose a coarser or finer spacing, or repair the surface."
@@ -38,9 +38,9 @@ class SolidMesh:
 
     nodes (n, 3): positions, m, mesh frame. elements (e, 10): node indices. fixed (n,): whether each
     node is fixed. skin (s,): nodes on the surface. skin_triangles (t, 3): indices into `skin`,
-    ordered for outward normals. contact_nodes (m,): nodes that the finger can touch, a sorted
-    subset of `skin`. contact_normals (m, 3): outward normals at these nodes. contact_faces (f, 6):
-    six-node triangles as indices into `contact_nodes`, ordered for outward normals.
+    ordered for outward normals. contact_nodes (m,): sorted indices of the nodes on the skin that
+    the finger can touch. contact_normals (m, 3): outward normals at these nodes. contact_faces (f,
+    6): six-node triangles as indices into `contact_nodes`, ordered for outward normals.
     """
 
     nodes: Floats
@@ -88,9 +88,10 @@ def boundary_faces(elements: Ints) -> Ints:
 
 
 def nodes_in_planes(nodes: Floats, mirror_axes: tuple[int, ...]) -> Bools:
-    """Return whether each node is in each plane of symmetry through the origin (n, 3).
+    """Return whether each node is in each plane of symmetry through the origin, as an array (n, 3).
 
-    nodes (n, 3), m. mirror_axes: axes of the planes; the other columns of the result are false.
+    nodes (n, 3): positions, m. mirror_axes: axes of the planes. The other columns of the result are
+    false.
     """
     inside: Bools = np.abs(nodes) < SAME_M
     inside[:, [axis for axis in range(3) if axis not in mirror_axes]] = False
@@ -130,7 +131,8 @@ def orient_tetrahedra(corners: Floats, tetrahedra: Ints) -> Ints:
 
 
 def number_slabs(nodes: Floats, elements: Ints) -> Ints:
-    """Return the index of the slab (n,) that contains each node, along the longest axis.
+    """Divide the mesh into slabs along its longest axis, and return the slab index (n,) of each
+    node.
 
     The nodes of one element are in at most two successive slabs. Raise UnfitMeshError if the mesh
     consists of several separate components.
@@ -156,12 +158,12 @@ def number_slabs(nodes: Floats, elements: Ints) -> Ints:
 def make_solid_mesh(
     nodes: Floats, elements: Ints, *, touchable: Bools, fixed: Bools, normals: Floats
 ) -> SolidMesh:
-    """Sort the nodes by slab, find the skin and the touchable part, and return the mesh.
+    """Sort the nodes by slab, find the skin and its touchable part, and return the mesh.
 
-    touchable, fixed (n,): whether each boundary node can be touched, and whether it is fixed.
-    normals (n, 3): outward normals at touchable nodes. A face is touchable if all its nodes are
-    touchable and none is fixed. Raise UnfitMeshError if no face is touchable or the mesh has
-    separate components.
+    touchable, fixed (n,): whether each node can be touched, and whether each node is fixed. normals
+    (n, 3): outward normals at touchable nodes. A face is touchable if all its nodes are touchable
+    and none is fixed. Raise UnfitMeshError if no face is touchable, or if the mesh consists of
+    several components.
     """
     level = number_slabs(nodes, elements)
     order = np.lexsort((nodes[:, 2], nodes[:, 1], nodes[:, 0], level))

@@ -1,4 +1,4 @@
-"""Select the skin nodes that are fixed by the support that a scene describes."""
+"""Select the skin nodes that the support described in a scene fixes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ TOLERANCE_M = 1e-9
 def select_fixed(
     support: Support, points: Floats, normals: Floats, *, towards_user: Floats, down: Floats
 ) -> Bools:
-    """Return whether each skin point (n, 3) is fixed (n,).
+    """Return whether the support fixes each skin point, as an array (n,).
 
-    All vectors are in the object frame. normals (n, 3): outward unit normals at the points.
-    towards_user (3,): unit vector to the user. down (3,): downward vector of any length, for a base
-    support. Raise UnfitMeshError if all fixed points are collinear.
+    All vectors are in the object frame. points (n, 3): skin points, m. normals (n, 3): outward unit
+    normals at the points. towards_user (3,): unit vector to the user. down (3,): downward vector of
+    any length, for a base support. Raise UnfitMeshError if all fixed points are collinear.
     """
     chosen: Bools
     match support:
@@ -52,7 +52,9 @@ def select_fixed(
 
 
 def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
-    """Raise UnfitMeshError if all chosen points are collinear, because the body could rotate."""
+    """Raise UnfitMeshError if all chosen points are collinear, because the body could rotate about
+    this line.
+    """
     some = points[chosen]
     extent = float(np.ptp(points, axis=0).max())
     if len(some) >= 3:
