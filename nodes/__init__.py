@@ -1,7 +1,8 @@
-"""Provide the nodes, one folder each: `node.py` connects ports, other modules compute.
+"""Provide the nodes, each in its own folder.
 
-`NODES` lists the nodes that a launch file can name. A class is imported when it is used, so that a
-process does not load the libraries of other nodes.
+In a folder, `node.py` connects the ports, and the other modules contain the computations. `NODES`
+lists the node types that a launch file can name. A node class is imported only when it is used, so
+that a process does not load the libraries of other nodes.
 """
 
 from __future__ import annotations
@@ -18,9 +19,11 @@ if TYPE_CHECKING:
 
 
 class NodeRole(StrEnum):
-    """Role of a node for the launcher, the doctor and the replay, independent of its class name.
+    """The role of a node in the graph. The launcher, `flexsheet doctor` and the replay use the role
+    instead of the class name.
 
-    A node class declares it as `role`. A class that publishes ArmState is an arm bridge by default.
+    A node class declares its role as the attribute `role`. A class that publishes ArmState is an
+    arm bridge by default.
     """
 
     ARM_BRIDGE = "arm_bridge"
@@ -34,10 +37,11 @@ class NodeRole(StrEnum):
 
 
 class OmissionReason(StrEnum):
-    """Reason why a node of a launch file is not started.
+    """The reason why a node of a launch file is not started.
 
     rigid_object: the scene's object has no material. no_image: the scene has no projector.
-    no_reader: no node reads its topics. no_writer: the nodes that write its inputs are omitted.
+    no_reader: no node reads the node's topics. no_writer: the nodes that write the node's inputs
+    are omitted.
     """
 
     RIGID_OBJECT = "rigid_object"
@@ -67,18 +71,20 @@ NODES: dict[str, str] = {
 
 
 class UnknownNodeError(FlexsheetError, KeyError):
-    """A node type that is not in `NODES`; the message suggests a similar one."""
+    """Raised for a node type that is not in `NODES`. The error text suggests a similar node
+    type.
+    """
 
     code = "unknown-node"
     remedy = "`flexsheet node types` prints all names."
 
 
 def node_class(name: str) -> type[Node]:
-    """Import the class of a node type, which is a name in `NODES` or "module:Class".
+    """Import and return the class of a node type, which is a name in `NODES` or "module:Class".
 
     Module names without the package, such as "nodes.planner.node" in old launch files and bags, are
-    accepted. Raises UnknownNodeError for an unknown name, ImportError or AttributeError for a
-    missing module or class.
+    accepted. Raises UnknownNodeError for an unknown name, ImportError for a missing module, and
+    AttributeError for a missing class.
     """
     path = NODES.get(name, name)
     module_name, _, class_name = path.partition(":")

@@ -1,4 +1,6 @@
-"""Define names of array types; docstrings state the shapes and units."""
+"""Define names of array types. The shapes and units of arrays are stated in the docstrings that use
+them.
+"""
 
 from __future__ import annotations
 

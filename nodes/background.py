@@ -8,9 +8,9 @@ MAX_NICE = 19
 
 
 def enter_background() -> None:
-    """Give this process the highest niceness and batch scheduling, so that others run first.
+    """Give this process the lowest priority: the highest niceness, and batch scheduling.
 
-    A process of the batch class never preempts a running process when it wakes up.
+    A process with batch scheduling never interrupts a running process when it wakes up.
     """
     os.setpriority(os.PRIO_PROCESS, 0, MAX_NICE)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

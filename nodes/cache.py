@@ -1,7 +1,7 @@
-"""Cache computed results on disk, in one file of arrays per result.
+"""Cache computed results on disk, one file of arrays for each result.
 
-Files are written atomically and checked when they are read.  A long computation stores checkpoints
-in a folder beside the file, and continues from them after an interruption.
+Files are written atomically and checked when they are read. A long computation stores checkpoints
+in a folder beside the file. After an interruption, it continues from these checkpoints.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ Arrays = Mapping[str, NDArray[Any]]
 T = TypeVar("T")
 
 DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
-"""Exceptions that can occur when a truncated, modified or foreign file is read."""
+"""The exceptions that can occur when a damaged file, or a file of another program, is read."""
 
 CACHED_S = 1.0
-"""Time after the start in which finished steps count as cached; the estimate excludes them."""
+"""The time after the start, in seconds, in which finished steps count as loaded from the cache. The
+estimate of the remaining time ignores these steps."""
 MINUTE_S = 60.0
 
 
@@ -39,16 +40,17 @@ def default_cache_dir() -> Path:
 
 
 def make_digest(value: object) -> str:
-    """Return a digest of a JSON value; equal values have equal digests."""
+    """Return a hash of a JSON value as text. Equal values have equal hashes."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
 
 
 @dataclass(frozen=True, slots=True)
 class Specification(Generic[T]):
-    """Key of a cached result, and its conversion to arrays and back.
+    """The key of a cached result, and the functions that convert the result to arrays and back.
 
     kind: first part of the file name. depends_on: JSON value of all inputs, including the version
-    of the code that computes the result. decode: raises one of `DAMAGE` for invalid arrays.
+    of the code that computes the result. decode: function from arrays to the result, which raises
+    one of the exceptions `DAMAGE` for invalid arrays.
     """
 
     kind: str
@@ -57,20 +59,26 @@ class Specification(Generic[T]):
     decode: Callable[[dict[str, NDArray[Any]]], T]
 
     def path(self, cache_dir: Path | None) -> Path:
-        """Return the path of the result's file. cache_dir: None for the user's cache."""
+        """Return the path of the file that stores the result.
+
+        cache_dir: folder of the cache; None for the cache of the user.
+        """
         return (
             cache_dir or default_cache_dir()
         ) / f"{self.kind}-{make_digest(self.depends_on)}.npz"
 
     def checkpoints(self, cache_dir: Path | None) -> CheckpointStore:
-        """Return the store for checkpoints of the computation of this result."""
+        """Return the store for checkpoints of the computation of this result.
+
+        cache_dir: folder of the cache; None for the cache of the user.
+        """
         return CheckpointStore(self.path(cache_dir).with_suffix(".parts"))
 
 
 def cached(specification: Specification[T], cache_dir: Path | None, compute: Callable[[], T]) -> T:
-    """Return the cached result; if there is none, compute and store it, and delete checkpoints.
+    """Return the cached result. If there is none, compute and store it, and delete its checkpoints.
 
-    Raises OSError if the result cannot be written, and the exceptions of `compute`.
+    Raises OSError if the result cannot be written, and the exceptions that `compute` raises.
     """
     result = load_cached(specification, cache_dir)
     if result is None:
@@ -81,7 +89,10 @@ def cached(specification: Specification[T], cache_dir: Path | None, compute: Cal
 
 
 def load_cached(specification: Specification[T], cache_dir: Path | None) -> T | None:
-    """Return the cached result; None if the file does not exist or is damaged (logged)."""
+    """Return the cached result, or None if the file does not exist or is damaged.
+
+    A damaged file is logged.
+    """
     path = specification.path(cache_dir)
     content = load_arrays(path)
     if content is None:
@@ -94,19 +105,24 @@ def load_cached(specification: Specification[T], cache_dir: Path | None) -> T | 
 
 
 def save_cached(specification: Specification[T], cache_dir: Path | None, result: T) -> Path:
-    """Store a result and return its file. Raises OSError if the file cannot be written."""
+    """Store a result, and return the path of its file. Raises OSError if the file cannot be
+    written.
+    """
     path = specification.path(cache_dir)
     save_arrays(path, specification.encode(result))
     return path
 
 
 def encode_fields(result: Any) -> dict[str, NDArray[Any]]:
-    """Return the array fields of a dataclass by name."""
+    """Return the array fields of a dataclass instance, by name."""
     return {one.name: np.asarray(getattr(result, one.name)) for one in fields(result)}
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Return the arrays of a file; None if it does not exist or is damaged (logged)."""
+    """Return the arrays of a file by name, or None if the file does not exist or is damaged.
+
+    A damaged file is logged.
+    """
     try:
         # Reading a member of the archive to its end verifies its CRC-32.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -119,14 +135,14 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
 
 
 def warn_damaged(path: Path, error: Exception) -> None:
-    """Log that a file is damaged and that its content is computed again."""
+    """Log a warning that a file is damaged and that its content is computed again."""
     structlog.get_logger().warning(
         "damaged cache file, its content is computed again", path=str(path), error=repr(error)
     )
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:
-    """Write arrays to a file atomically.
+    """Write arrays to a file atomically, so that other processes never read an incomplete file.
 
     Raises OSError if the file cannot be written.
     """
@@ -144,7 +160,7 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Delete the temporary files of processes that were killed during a write."""
+    """Delete the temporary files of processes that ended while they were writing the file."""
     import psutil
 
     for leftover in path.parent.glob(f".{path.stem}.*.tmp"):
@@ -155,22 +171,22 @@ def _remove_leftovers(path: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointStore:
-    """Store for finished parts of a computation; each part is one file in a folder."""
+    """A store for the finished parts of a computation. Each part is one file in a folder."""
 
     folder: Path
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """Return a stored part of the computation; None if it does not exist or is damaged."""
+        """Return the arrays of a stored part, or None if the part does not exist or is damaged."""
         return load_arrays(self._path(name))
 
     def save(self, name: str, arrays: Arrays) -> None:
-        """Store a part of the computation. Raises OSError if the file cannot be written."""
+        """Store the arrays of a part. Raises OSError if the file cannot be written."""
         save_arrays(self._path(name), arrays)
 
     def get(
         self, name: str, compute: Callable[[], dict[str, NDArray[Any]]]
     ) -> dict[str, NDArray[Any]]:
-        """Return a stored part, or compute and store it."""
+        """Return the arrays of a stored part. If the part is not stored, compute and store it."""
         part = self.load(name)
         if part is None:
             part = compute()
@@ -178,7 +194,7 @@ class CheckpointStore:
         return part
 
     def remove(self) -> None:
-        """Delete all parts."""
+        """Delete all stored parts of the computation."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _path(self, name: str) -> Path:
@@ -186,16 +202,19 @@ class CheckpointStore:
 
 
 class EtaEstimator:
-    """Estimator of a long computation's remaining time from its finished steps."""
+    """An estimator of the remaining time of a long computation, from the number of finished
+    steps.
+    """
 
     def __init__(self) -> None:
         self._total = self._last = self._cached = 0
         self._start_s = 0.0
 
     def text(self, done: int, total: int, now_s: float) -> str:
-        """Return the progress at the time now_s as text, such as "40 %, about 3 min left".
+        """Return the progress as text, such as "40 %, about 3 min left".
 
-        If `total` changes, or `done` decreases, a new estimate starts.
+        done, total: numbers of steps. now_s: current time. If `total` changes or `done` decreases,
+        a new estimate starts.
         """
         if total != self._total or done < self._last:
             self._total, self._start_s = total, now_s

@@ -1,4 +1,4 @@
-"""Check positions that programs outside the graph send; these are not trusted."""
+"""Check positions that programs outside the graph send, because such programs are not trusted."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from flexsheet.messages.types import Eye
 from flexsheet.nodes.arrays import Floats
 
 MAX_EYE_OFFSET_M = 1.0
-"""Maximum distance of an external eye position from that in the scene."""
+"""The maximum distance (m) of an external eye position from the eye position in the scene."""
 
 MIN_PERIOD_S = 0.001
-"""Minimum time between two accepted messages of one input."""
+"""The minimum time (s) between two accepted messages of one input."""
 
 QUATERNION_TOLERANCE = 1e-3
 
 
 class Rejection(StrEnum):
-    """Reason for rejecting an external message."""
+    """The reason why an external message is rejected."""
 
     NO_SCENE = "no_scene"
     MALFORMED = "malformed"
@@ -42,22 +42,25 @@ class RejectedError(ValueError):
 
 
 def check_period(at_ns: int, newest_ns: int | None) -> None:
-    """Raise RejectedError if a message is not at least MIN_PERIOD_S newer than the last one."""
+    """Raise RejectedError if a message is not at least MIN_PERIOD_S newer than the last message.
+
+    at_ns, newest_ns: times of this message and the last message; None if there is no last message.
+    """
     if newest_ns is not None and at_ns < newest_ns + MIN_PERIOD_S * 1e9:
         raise RejectedError(Rejection.NOT_NEWER)
 
 
 def check_finite(values: Floats) -> Floats:
-    """Return the values; raise RejectedError if one is not finite."""
+    """Return the given values. Raises RejectedError if a value is not finite."""
     if not np.isfinite(values).all():
         raise RejectedError(Rejection.NOT_FINITE)
     return values
 
 
 def rotate_x_axis(quaternion: Floats) -> Floats:
-    """Return the x axis (3,) of a frame with an orientation (4,) x, y, z, w; raise RejectedError.
+    """Return the x axis (3,) of a frame whose orientation is the quaternion (x, y, z, w).
 
-    The quaternion must have length 1 within QUATERNION_TOLERANCE.
+    Raises RejectedError unless the length of the quaternion is 1 within QUATERNION_TOLERANCE.
     """
     length = float(np.linalg.norm(check_finite(quaternion)))
     if abs(length - 1.0) > QUATERNION_TOLERANCE:
@@ -67,7 +70,12 @@ def rotate_x_axis(quaternion: Floats) -> Floats:
 
 
 def make_eye(centre_world_m: Floats, right_world: Floats, scene: Scene) -> Eye:
-    """Make a message of the eyes; raise RejectedError if they are implausibly far away."""
+    """Make a message with the position of the user's eyes.
+
+    centre_world_m (3,): midpoint of the eyes. right_world (3,): unit vector from the left to the
+    right eye. Raises RejectedError if the position is not finite, or too far from that in the
+    scene.
+    """
     check_finite(centre_world_m)
     if np.linalg.norm(centre_world_m - scene.eyes.centre_world_m) > MAX_EYE_OFFSET_M:
         raise RejectedError(Rejection.OUTSIDE_RANGE)

@@ -1,4 +1,4 @@
-"""Limit how often a node's log repeats a warning or an error."""
+"""Limit the number of times that the log of a node repeats a warning or an error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import structlog
 LIMITED_LEVELS = {"warning", "error", "critical"}
 REPORT_PERIOD_S = 60.0
 MAX_DISTINCT = 1000
-"""Maximum number of distinct records that are counted; beyond it, the least recent is dropped."""
+"""The maximum number of distinct log records that are counted. If there are more, the least recent
+record is forgotten."""
 
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 _IGNORED_KEYS = {"exc_info", "count"}
@@ -25,17 +26,18 @@ Key = tuple[tuple[str, str], ...]
 
 @dataclass(slots=True)
 class Repeats:
-    """Number of occurrences of a log record, and the time (s) at which it was last logged."""
+    """The number of occurrences of a log record, and the time (s) at which it was last logged."""
 
     count: int = 0
     logged_s: float = float("-inf")
 
 
 class RepeatLimiter:
-    """structlog processor that passes only the 1st, 10th, 100th, ... of equal records.
+    """A structlog processor that passes only the 1st, 10th, 100th, ... of equal log records.
 
-    A repeated record also passes once in REPORT_PERIOD_S. Records that differ only in numbers are
-    equal. Repeated records that pass contain their `count` since the start of the node.
+    In addition, a repeated record passes once in REPORT_PERIOD_S. Records that differ only in
+    numbers count as equal. Repeated records that pass contain the number of occurrences since the
+    start of the node as `count`.
     """
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:

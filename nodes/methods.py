@@ -1,6 +1,7 @@
-"""Define method families for benchmarks: interchangeable methods and a common reference.
+"""Define method families for benchmarks. A family consists of interchangeable methods and a common
+reference.
 
-A node's folder contains its methods as plain functions, and their `Family`. The module
+The folder of a node contains the methods as plain functions, and their `Family`. The module
 `launch.methods.charts` plots the time of each method against its error over the scene's working
 range.
 """
@@ -18,19 +19,20 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Scene
 
 MAX_TRIAL_S, MIN_REPEATS = 3.0, 3
-"""Time after which a trial is not repeated further, and minimum number of repetitions."""
+"""The time (s) after which a trial is not repeated further, and the minimum number of
+repetitions."""
 
 NORMAL_95 = 1.96
-"""Half-width of the central 95 % interval of a normal distribution, in standard deviations."""
+"""The half-width of the central 95 % interval of a normal distribution, in standard deviations."""
 
 Progress = Callable[[int, int], None]
 Case = dict[str, float | int | str]
-"""Conditions of a measurement by name, for instance {"depth_mm": 10}."""
+"""The conditions of a measurement by name, for instance {"depth_mm": 10}."""
 
 
 @dataclass(frozen=True, slots=True)
 class Interval:
-    """Estimated value with the limits of its 95 % confidence interval."""
+    """An estimated value with the limits of its 95 % confidence interval."""
 
     value: float
     low: float
@@ -41,7 +43,10 @@ class Interval:
 
 
 def estimate_rms(errors: NDArray[np.float64]) -> Interval:
-    """Estimate the root mean square of independent errors (n,) from the spread of their squares."""
+    """Estimate the root mean square of independent errors (n,), with its confidence interval.
+
+    The interval is computed from the spread of the squared errors.
+    """
     squares = np.square(errors)
     mean = float(squares.mean())
     spread = NORMAL_95 * float(squares.std()) / np.sqrt(len(squares))
@@ -50,7 +55,10 @@ def estimate_rms(errors: NDArray[np.float64]) -> Interval:
 
 
 def estimate_median(values: Sequence[float]) -> Interval:
-    """Estimate the median; the limits are order statistics (the range for fewer than 6 values).
+    """Estimate the median of values, with its confidence interval.
+
+    The limits of the interval are order statistics. For fewer than 6 values, they are the minimum
+    and the maximum.
 
     Source: Conover, Practical Nonparametric Statistics, 1999, section 3.2.
     """
@@ -62,14 +70,15 @@ def estimate_median(values: Sequence[float]) -> Interval:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Measurement of one method at one case: `run` is timed, `error` evaluates its result.
+    """A measurement of one method at one case.
 
-    error: function from the result of `run` to the error in the unit of the method family, with an
-    interval if the error is estimated from random samples. in_range: whether the method's valid
-    range includes the case. in_scene: whether the scene's working range includes the case. size:
-    size of the solved problem ({"skin_nodes": 1210}), reported with the case. extra_metrics:
-    function from the result of `run` to further figures, with units in their names.
-    reference_uncertainty: uncertainty of the reference by figure: "error" or an extra metric.
+    run: function whose time is measured. error: function from the result of `run` to the error in
+    the unit of the method family. It returns an interval if the error is estimated from random
+    samples. in_range: whether the method's valid range includes the case. in_scene: whether the
+    scene's working range includes the case. size: size of the solved problem, such as
+    {"skin_nodes": 1210}. extra_metrics: function from the result of `run` to further results, with
+    units in their names. reference_uncertainty: uncertainty of the reference, by the name of the
+    result ("error" or an extra metric).
     """
 
     method: str
@@ -84,19 +93,19 @@ class Trial:
 
 
 def prepare_nothing(scene: Scene, on_progress: Progress) -> None:
-    """Do nothing; this is the default of `Family.prepare`."""
+    """Do nothing. This function is the default of `Family.prepare`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """Set of interchangeable methods whose errors are measured against one reference.
+    """A set of interchangeable methods whose errors are measured against one reference.
 
-    trials: function that yields the trials of all methods over a scene's working range; each must
-        be run before the next one is requested.
+    trials: function that yields the trials of all methods over a scene's working range. A trial
+        must be run before the next trial is requested.
     tolerance: function that returns the scene's tolerance for the error, in `unit`.
-    sweep_key: key of a property of the cases; a separate plot shows the errors against this
-        property. None: no such plot.
-    prepare: function that computes and caches the data for `trials`; it reports its progress.
+    sweep_key: key of a property of the cases. A separate plot shows the errors against this
+        property. None: there is no such plot.
+    prepare: function that computes and caches the data for `trials`, and reports its progress.
     """
 
     name: str
@@ -111,10 +120,11 @@ class Family:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """Measured time and error of one method at one case; see `Trial`.
+    """The measured time and error of one method at one case. The class `Trial` describes further
+    fields.
 
-    params: the case and the size of the solved problem. median_range_s, error_range: limits of the
-    95 % confidence intervals; None: the value is exact, or its spread was not measured.
+    params: case and size of the solved problem. median_range_s, error_range: limits of the 95 %
+    confidence intervals; None if the value is exact or its spread was not measured.
     """
 
     method: str
@@ -139,9 +149,9 @@ class Point:
 
 
 def measure(trial: Trial, *, repeats: int) -> Point:
-    """Time `repeats` runs of a trial after a warm-up run, and evaluate the result.
+    """Measure the time of `repeats` runs of a trial after a warm-up run, and evaluate the error.
 
-    Slow trials are repeated less often, see `MAX_TRIAL_S`.
+    Slow trials are repeated less often (see `MAX_TRIAL_S`).
     """
     result = trial.run()
     durations: list[float] = []
@@ -169,14 +179,14 @@ def measure(trial: Trial, *, repeats: int) -> Point:
 
 
 def clip_range(end: float, values: Sequence[float]) -> tuple[float, ...]:
-    """Return those values that are below the end of a working range, followed by the end."""
+    """Return the values that are below the end of a working range, followed by the end itself."""
     return (*(value for value in values if value < end * (1.0 - 1e-6)), end)
 
 
 def pareto_front(points: Sequence[Point]) -> list[str]:
     """Return the methods that are Pareto-optimal in at least one case of their valid range.
 
-    They are sorted by the maximum of their median times.
+    The methods are sorted by the maximum of their median times.
     """
     usable = [point for point in points if point.in_range]
     front = {
@@ -190,9 +200,10 @@ def pareto_front(points: Sequence[Point]) -> list[str]:
 
 
 def dominates(one: Sequence[Interval], other: Sequence[Interval]) -> bool:
-    """Return whether `one` has at least one lower cost than `other`, and no higher cost.
+    """Return whether the costs `one` dominate the costs `other`.
 
-    Costs with overlapping confidence intervals count as equal.
+    This is the case if at least one cost is lower, and no cost is higher. Costs with overlapping
+    confidence intervals count as equal.
     """
     pairs = list(zip(one, other, strict=True))
     better = any(mine.high < theirs.low for mine, theirs in pairs)

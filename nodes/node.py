@@ -1,4 +1,5 @@
-"""Define the base class of nodes: ports are annotations, handlers are methods named after ports.
+"""Define the base class of nodes. Ports are declared as annotations, and handlers are methods that
+are named after ports.
 
     class Follower(Node):
         "Publish a sheet target 10 cm above the finger."
@@ -10,10 +11,11 @@
         def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
             self.sheet_target.publish(..., source_ns=header.source_ns)
 
-A node does not use sockets.  Its arguments are parameters, a clock and a function that sends
-messages.  The same class therefore runs live (`nodes.runner`), in replay and in a unit test.
-Handlers are functions or coroutines.  Only one call of a coroutine handler runs at a time.  On a
-topic with the delivery `latest`, it skips messages that were superseded during its last call.
+A node does not use sockets. Its arguments are parameters, a clock and a function that sends
+messages. Therefore the same class runs live (`nodes.runner`), in a replay and in a unit test.
+Handlers are functions or coroutines. Only one call of a coroutine handler runs at a time. On a
+topic with the delivery `latest`, the handler does not receive messages that were superseded during
+its last call.
 """
 
 from __future__ import annotations
@@ -57,18 +59,21 @@ RATE_WINDOW_NS = 1_000_000_000
 EVERY_QUEUE_LENGTH = 1000
 MAX_LOG_ROWS = 20_000
 RESEND_NS = 5_000_000_000
-"""Time after the start in which each status contains the full execution log, for late recorders."""
+"""The time (ns) after the start in which each status contains the full execution log. Therefore
+recorders that start late receive the full log, too."""
 
 
 class NodeParameters(LimitedModel):
-    """Base class for a node's parameters; subclasses declare them as fields with defaults."""
+    """The base class for the parameters of a node. Subclasses declare parameters as fields with
+    defaults.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 @dataclass(slots=True)
 class PortCounts:
-    """Counters of one input or output, which the status message reports."""
+    """The counters of one input or output, which the status message reports."""
 
     messages: int = 0
     dropped: int = 0
@@ -103,7 +108,7 @@ class PortCounts:
 
 
 class ExecutionLog:
-    """Log of the order of a node's handler calls, with which a replay repeats them.
+    """A log of the order of a node's handler calls. A replay repeats the calls in this order.
 
     `flexsheet.messages.types.Status.execution_log` describes the rows.
     """
@@ -120,7 +125,9 @@ class ExecutionLog:
         self._rows.append((-1 - number, 0, 0, self._clock.now_ns()))
 
     def drain(self) -> NDArray[np.int64]:
-        """Return the rows (n, 4), and delete them if RESEND_NS have passed since the start."""
+        """Return the rows (n, 4) of the log. Delete them if RESEND_NS have passed since the
+        start.
+        """
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
         if self._clock.now_ns() > self._started_ns + RESEND_NS:
             self._rows.clear()
@@ -128,12 +135,13 @@ class ExecutionLog:
 
 
 class Input(Generic[M]):
-    """Subscribed topic with its latest message, header and counters.
+    """A subscribed topic with its latest message, header and counters.
 
     All timestamps are converted to this host's clock.
-    clock_problem: why the conversion is not reliable, or "".
-    has_ended: whether the connection to the writer has ended since the last message; only of the
-        `watched_inputs` of a node.
+
+    clock_problem: reason why the conversion is not reliable, or "".
+    has_ended: whether the connection to the writer has ended since the last message. It is updated
+        only for the `watched_inputs` of a node.
     """
 
     def __init__(self, topic: Topic, clock: Clock) -> None:
@@ -147,9 +155,12 @@ class Input(Generic[M]):
         self._clock = clock
 
     def age_s(self) -> float:
-        """Return the time since the source timestamp of the latest message; infinite before it.
+        """Return the time (s) since the source timestamp of the latest message.
 
-        If the offset of the sender's clock is unknown, return the time since the reception instead.
+        The time is infinite before the first message.
+
+        If the offset of the sender's clock is unknown, return the time since the message was
+        received.
         """
         if self.header is None:
             return float("inf")
@@ -164,7 +175,7 @@ class Input(Generic[M]):
 
 
 class Output(Generic[M]):
-    """Publisher of a topic, which adds sequence numbers and timestamps to the messages."""
+    """A publisher of a topic, which adds sequence numbers and timestamps to the messages."""
 
     def __init__(
         self, topic: Topic, clock: Clock, send: Send, *, writer: str, epoch: int, plan: str
@@ -175,7 +186,11 @@ class Output(Generic[M]):
         self._writer, self._epoch, self._plan = writer, epoch, plan
 
     def publish(self, message: M, *, source_ns: int | None = None) -> Header:
-        """Publish a message; source_ns: time of the measurement it follows from (default: now)."""
+        """Publish a message, and return its header.
+
+        source_ns: time of the measurement from which the message was computed; None for the current
+            time.
+        """
         now_ns = self._clock.now_ns()
         header = Header(
             sequence=self.counts.messages + 1,
@@ -193,7 +208,10 @@ class Output(Generic[M]):
 
 @dataclass(frozen=True, slots=True)
 class Port:
-    """Input or output that a node class declares; direction: "input" or "output"."""
+    """An input or output that a node class declares.
+
+    direction: "input" or "output".
+    """
 
     name: str
     direction: str
@@ -202,14 +220,20 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """Method that is called periodically; rate_parameter: node parameter with the rate (Hz)."""
+    """A method that is called periodically.
+
+    rate_parameter: name of the node parameter that contains the rate (Hz).
+    """
 
     method: str
     rate_parameter: str
 
 
 def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Mark a node's method to be called periodically, at the rate (Hz) in the named parameter."""
+    """Make a decorator for a node's method that must be called periodically.
+
+    rate_parameter: name of the node parameter that contains the rate (Hz).
+    """
 
     def mark(method: Callable[..., Any]) -> Callable[..., Any]:
         method.__periodic__ = rate_parameter  # type: ignore[attr-defined]  # a function attribute
@@ -221,8 +245,8 @@ def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[...
 def find_ports(node_class: type[Node]) -> dict[str, Port]:
     """Return the declared ports of a node class by name, in the order of declaration.
 
-    A port has the name of its topic, with "__" for "/" ("twin__finger"). A launch file can connect
-    it to another topic of the same type.
+    A port has the name of its topic, with "__" instead of "/" ("twin__finger"). A launch file can
+    connect the port to another topic of the same type.
     """
     ports = {}
     for name, annotation in get_type_hints(node_class).items():
@@ -234,17 +258,20 @@ def find_ports(node_class: type[Node]) -> dict[str, Port]:
 
 
 def further_port(topic_name: str) -> str:
-    """Return the port name for a topic that `Node.further_inputs` has returned."""
+    """Return the name of the port for a topic that `Node.further_inputs` has returned."""
     return f"in/{topic_name}"
 
 
 def find_parameters_type(node_class: type[Node]) -> type[NodeParameters]:
-    """Return the parameter class that a node class declares as the type of `parameters`."""
+    """Return the parameter class of a node class, which is the declared type of `parameters`."""
     return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
 
 
 def find_role(node_class: type[Node]) -> NodeRole | None:
-    """Return the role that a node class declares; by default ARM_BRIDGE if it writes ArmState."""
+    """Return the role of a node class, or None if it has no role.
+
+    A class that declares no role but writes ArmState has the role ARM_BRIDGE.
+    """
     publishes = {
         port.message for port in find_ports(node_class).values() if port.direction == "output"
     }
@@ -254,7 +281,7 @@ def find_role(node_class: type[Node]) -> NodeRole | None:
 
 
 def find_timers(node_class: type[Node]) -> list[Timer]:
-    """Return the methods of a node class that are marked `@periodic`."""
+    """Return the methods of a node class that have the decorator `@periodic`."""
     return [
         Timer(name, member.__periodic__)
         for name, member in inspect.getmembers(node_class, inspect.isfunction)
@@ -263,7 +290,7 @@ def find_timers(node_class: type[Node]) -> list[Timer]:
 
 
 class Node:
-    """Base class of all nodes; the module's docstring shows how to write one."""
+    """The base class of all nodes. The docstring of the module contains an example."""
 
     parameters: NodeParameters
     status: Output[Status]
@@ -271,43 +298,50 @@ class Node:
     takes_frames: ClassVar[bool] = False
     """Whether `deliver` receives each message as raw frames that are not decoded."""
     measures_clocks: ClassVar[bool] = False
-    """Whether timestamps of other hosts stay unconverted, since the node measures their clocks."""
+    """Whether the node measures the clocks of other hosts, so that their timestamps are not
+    converted."""
     role: ClassVar[NodeRole | None] = None
     optional_inputs: ClassVar[frozenset[str]] = frozenset()
-    """Ports that may stay unconnected if no node of the graph writes their topic."""
+    """The ports that may be unconnected if no node of the graph writes their topic."""
     live_parameters: ClassVar[frozenset[str]] = frozenset()
-    """Parameters that may change while the node runs, because each use reads them from
-    `parameters`.  A class with such parameters declares `parameter: Input[ParameterChange]`."""
+    """The parameters that may change while the node runs. The node must read them from `parameters`
+    at each use, and must declare `parameter: Input[ParameterChange]`."""
     watched_inputs: ClassVar[frozenset[str]] = frozenset()
-    """Input ports at which the node must detect at once that the writer's process has ended."""
+    """The input ports at which the node must detect immediately that the process of the writer has
+    ended."""
     ends_with_inputs: ClassVar[bool] = False
-    """Whether the end of a watched input also disconnects the readers of this node's outputs, so
-    that downstream nodes detect it too."""
+    """Whether the end of a watched input also disconnects the readers of this node's outputs. Then
+    these readers detect the end, too."""
     on_demand: ClassVar[bool] = False
-    """Whether the node is left out of a graph in which no other node reads its topics."""
+    """Whether a graph omits the node if no other node reads its topics."""
     opens_devices: ClassVar[bool] = False
-    """Whether the node opens devices, ports or files, so that a replay must not start it."""
+    """Whether the node opens devices, ports or files. A replay does not start such a node."""
     late_modules: ClassVar[tuple[str, ...]] = ()
-    """Modules that the node imports only after its start, if parameters or messages require it."""
+    """The modules that the node imports only after its start, if parameters or messages require
+    them."""
 
     async def settle(self) -> None:
-        """Wait for the work that handlers have started; a replay awaits it after each step."""
+        """Wait until the work that handlers have started is finished. A replay calls this method
+        after each step.
+        """
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        """Return why `flexsheet bag verify` cannot replay the node; "" if it can."""
+        """Return the reason why `flexsheet bag verify` cannot replay the node, or "" if it can."""
         if cls.opens_devices:
             return "it reads devices, whose data are not in the bag"
         return ""
 
     @classmethod
     def omission_reason(cls, parameters: Any, scene: Scene) -> OmissionReason | None:
-        """Return why a graph with this scene can omit the node; None if it may need the node."""
+        """Return the reason why a graph with this scene can omit the node, or None if it may need
+        the node.
+        """
         return None
 
     @classmethod
     def unused_inputs(cls, parameters: Any, scene: Scene) -> frozenset[str]:
-        """Return the ports that the node does not use with this scene."""
+        """Return the input ports that the node does not use with this scene."""
         return frozenset()
 
     @classmethod
@@ -317,10 +351,10 @@ class Node:
 
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:
-        """Return the topics to subscribe to in addition to the declared ports.
+        """Return the names of the topics that the node reads in addition to its declared ports.
 
-        written: topics that the graph writes. The ports of further topics are named by
-        `further_port`.
+        written: topics that the nodes of the graph write. The function `further_port` names the
+            ports of the returned topics.
         """
         return ()
 
@@ -337,8 +371,11 @@ class Node:
     ) -> None:
         """Connect the ports to topics.
 
-        topics: topic names by port, where they differ from the port's name: {"arm": "arm_left"}.
-        epoch: number that identifies one start of the node; default: the time (ns) of the start.
+        send: function that sends messages.
+        topics: topic names by port, for ports whose name differs from that of the topic, such as
+            {"arm": "arm_left"}.
+        epoch: number that identifies one start of the node; None for the time (ns) of the start.
+
         Raises TypeError if the message type of a topic differs from that of its port.
         """
         self.parameters = parameters
@@ -389,27 +426,35 @@ class Node:
         }
 
     def on_parameter(self, change: ParameterChange, _: Header) -> None:
-        """Change a parameter while the node runs; raises ValueError if it is not live."""
+        """Change a parameter while the node runs.
+
+        Raises ValueError if the parameter is not one of `live_parameters`.
+        """
         if change.node != self.name:
             return
         if change.parameter not in self.live_parameters:
-            raise ValueError(f'parameter "{change.parameter}" cannot change while the node runs')
+            raise ValueError(
+                f'parameter "{change.parameter}" cannot change while the node runs; change it in '
+                "the launch file and start the graph again"
+            )
         value = json.loads(change.value)
         kind = type(self.parameters)
         self.parameters = kind.model_validate({**dict(self.parameters), change.parameter: value})
         self.changed_parameters[change.parameter] = value
 
     async def setup(self) -> None:
-        """Open devices; the runner calls it once before the first message."""
+        """Open devices. The runner calls this method once before the first message."""
 
     async def close(self) -> None:
-        """Release devices; the runner calls it once at the end, also after an error."""
+        """Release devices. The runner calls this method once at the end, also after an error."""
 
     def _handler(self, port: str) -> Handler | None:
         return getattr(self, f"on_{port}", None)
 
     def deliver(self, port: str, message: Message, header: Header) -> None:
-        """Pass a message to its input and handler; a coroutine handler runs in a separate task."""
+        """Store a message in its input, and call its handler. A coroutine handler runs in a
+        separate task.
+        """
         message, header, clock_problem = self._localise(message, header)
         self.inputs[port].has_ended = False
         mailbox = self._mailboxes.get(port)
@@ -425,7 +470,10 @@ class Node:
                 self.report_error(f"on_{port}", error)
 
     async def step(self, port: str, message: Message, header: Header) -> None:
-        """Pass a message to its input, and await its handler; for replay and tests."""
+        """Store a message in its input, call its handler, and wait until it is finished.
+
+        Replays and tests use this method.
+        """
         await self.handle(port, *self._localise(message, header))
 
     def _localise(self, message: Message, header: Header) -> tuple[Message, Header, str]:
@@ -434,14 +482,22 @@ class Node:
         return self.clock_table.localize(message, header, self.clock.now_ns())
 
     async def handle(self, port: str, message: Message, header: Header, clock_problem: str) -> None:
-        """Pass a message with timestamps of this host's clock to its input; await its handler."""
+        """Store a message in its input, call its handler, and wait until it is finished.
+
+        header: header with timestamps of this host's clock. clock_problem: reason why they are not
+        reliable, or "".
+        """
         self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)
         if handler is not None:
             await self.call(f"on_{port}", handler, message, header)
 
     async def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> None:
-        """Call a handler or timer; count, log and report its exception, if any.  what: its name."""
+        """Call a handler or a timer method. If it raises an exception, count, log and report the
+        exception.
+
+        what: name of the handler or timer in the log.
+        """
         try:
             result = function(*arguments)
             if inspect.isawaitable(result):
@@ -450,23 +506,31 @@ class Node:
             self.report_error(what, error)
 
     def drain_execution_log(self) -> NDArray[np.int64]:
-        """Return the handler calls since the last call; see `Status.execution_log`."""
+        """Return the log of handler calls for the next status message. `Status.execution_log`
+        describes the rows.
+        """
         return self._execution_log.drain()
 
     async def call_timer(self, number: int, timer: Timer) -> None:
-        """Call a periodic method, and add the call to the execution log.  number: its index."""
+        """Call a periodic method, and add the call to the execution log.
+
+        number: index of the method in the list of timers.
+        """
         if not self.opens_devices:
             self._execution_log.add_timer(number)
         await self.call(timer.method, getattr(self, timer.method))
 
     def report_error(self, what: str, error: Exception) -> None:
-        """Count an error, report it in the status, and log it with its traceback."""
+        """Count an error, report it in the status message, and log it with its traceback."""
         self.errors += 1
         self.last_error = f"{what}: {type(error).__name__}: {error}"
         self.log.error("handler failed", what=what, error=str(error), exc_info=error)
 
     def is_superseded(self, port: str) -> bool:
-        """Return whether a newer message waits for a port's coroutine handler (thread-safe)."""
+        """Return whether a newer message waits for the coroutine handler of a port.
+
+        Any thread may call this method.
+        """
         return self._mailboxes[port].has_waiting
 
     def mailbox_tasks(self) -> list[asyncio.Task[None]]:
@@ -479,7 +543,9 @@ class Node:
 
 
 class Mailbox:
-    """Queue of messages for a coroutine handler; it keeps the latest, or a bounded number."""
+    """A queue of messages for a coroutine handler. It stores only the latest message, or a limited
+    number of messages.
+    """
 
     def __init__(self, node: Node, port: str) -> None:
         self._node, self._port = node, port
@@ -497,7 +563,10 @@ class Mailbox:
             if self._overflow_is_error:
                 self._node.report_error(
                     f"on_{self._port}",
-                    OverflowError(f"queue of {self._capacity} messages overflowed, one is lost"),
+                    OverflowError(
+                        f"the queue of {self._capacity} messages is full, so its oldest message is "
+                        "lost; reduce the rate of the topic"
+                    ),
                 )
         self._waiting.append((message, header, clock_problem))
         if self.task is None or self.task.done():

@@ -1,4 +1,6 @@
-"""Define annotated types for node parameters, which tell the launcher what a value is used for."""
+"""Define annotated types for node parameters. The annotations inform the launcher about the use of
+a value.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from pydantic import BaseModel, Field
 
 
 class ParameterMark(StrEnum):
-    """Mark of a node parameter that tells the launcher how the value is used."""
+    """A mark of a node parameter, from which the launcher knows how the value is used."""
 
     LISTEN_PORT = "listen_port"
     DEVICE_HOST = "device_host"
@@ -24,32 +26,33 @@ class ParameterMark(StrEnum):
 
 
 ListenPort = Annotated[int, Field(ge=0, le=65535), ParameterMark.LISTEN_PORT]
-"""TCP port on which the node listens; 0 for any free port."""
+"""The TCP port on which the node listens; 0 for any free port."""
 
 DeviceHost = Annotated[str, ParameterMark.DEVICE_HOST]
-"""IP address of the device that the node controls."""
+"""The IP address of the device that the node controls."""
 
 DevicePort = Annotated[int, Field(ge=1, le=65535), ParameterMark.DEVICE_PORT]
-"""TCP port of the device."""
+"""The TCP port of the device that the node controls."""
 
 DeviceFile = Annotated[str, ParameterMark.DEVICE_FILE]
-"""Path of a device file, or URL of a stream; `flexsheet doctor` checks that a path exists."""
+"""The path of a device file, or the URL of a stream. The command `flexsheet doctor` checks that the
+path exists."""
 
 CameraCalibrationFile = Annotated[Path, ParameterMark.CAMERA_CALIBRATION]
-"""File with a stereo calibration; the launcher checks it against the scene."""
+"""The path of a stereo calibration. The launcher checks whether it agrees with the scene."""
 
 SheetCalibrationFile = Annotated[Path, ParameterMark.SHEET_CALIBRATION]
-"""File with a sheet calibration; the launcher checks it against the scene."""
+"""The path of a sheet calibration. The launcher checks whether it agrees with the scene."""
 
 MarkerCalibrationFile = Annotated[Path, ParameterMark.MARKER_CALIBRATION]
-"""File with a marker calibration; the launcher checks it against the scene."""
+"""The path of a marker calibration. The launcher checks whether it agrees with the scene."""
 
 ParameterKey = tuple[str | int, ...]
-"""Path of a value in the parameters, for instance ("source", "left")."""
+"""The path of a value in nested parameters, for instance ("source", "left")."""
 
 
 def find_marked(parameters: BaseModel, mark: ParameterMark) -> dict[ParameterKey, Any]:
-    """Return the values of all parameters with this mark, by key; None values are omitted.
+    """Return the values of all parameters with a mark, by key. Values that are None are omitted.
 
     Parameters in nested models, unions and sequences are included.
     """

@@ -1,8 +1,9 @@
 """Run nodes live: connect their ports, run their timers and publish their status.
 
-The launcher writes a `ProcessConfig` to a file and starts a process with it, which runs one or
-several nodes in one event loop. Nodes of one process exchange messages without serialization. If
-one of them fails, the process ends. A test can call `run_node` in its own event loop.
+The launcher writes a `ProcessConfig` to a file, and starts a process that reads the file. The
+process runs one or several nodes in one event loop. The nodes of a process exchange messages
+without serialization. If a node fails, its process ends. A test can call `run_node` in its own
+event loop.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ KEYS_PERIOD_S = 1.0
 
 
 class PortConfig(BaseModel):
-    """Connection of a node's port to a topic.
+    """The connection of a node's port to a topic.
 
-    endpoints: ZeroMQ endpoints; those of an input can name the expected writer.
+    endpoints: ZeroMQ endpoints. Those of an input can name the expected writer.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -57,11 +58,11 @@ class PortConfig(BaseModel):
 
 
 class NodeConfig(BaseModel):
-    """Configuration of one node.
+    """The configuration of one node.
 
-    keys_file: file with the encryption keys, a `KeyRing`; None: no encryption.
-    estop_resetters: writers that may reset an e-stop or enable the arms; None: all.
-    clocks: connection to the topic with the offsets of other hosts' clocks; None: a single host.
+    keys_file: file with the encryption keys (a `KeyRing`); None for no encryption.
+    estop_resetters: writers that may reset an e-stop or enable the arms; None if all writers may.
+    clocks: connection to the topic with the clock offsets of other hosts; None for a single host.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -79,7 +80,7 @@ class NodeConfig(BaseModel):
 
 
 class ProcessConfig(BaseModel):
-    """Configuration of a process with its nodes.
+    """The configuration of a process and its nodes.
 
     ready_fd: file descriptor of a pipe to the launcher; None if there is no launcher.
     """
@@ -92,9 +93,9 @@ class ProcessConfig(BaseModel):
 
 
 class NodeTransport:
-    """Sockets of one node's inputs and outputs.
+    """The sockets of the inputs and outputs of one node.
 
-    local: bus between the nodes of one process; None if it has only one node.
+    local: bus between the nodes of one process; None if the process has only one node.
     """
 
     def __init__(self, config: NodeConfig, log: Any, local: LocalBus | None = None) -> None:
@@ -122,7 +123,7 @@ class NodeTransport:
                 )
 
     def _make_refusal_handler(self, counts: PortCounts, topic: Topic) -> Callable[[str], None]:
-        """Return a function that counts and logs connections that an output has refused."""
+        """Return a function that counts and logs the connections that an output has refused."""
 
         def on_refused(text: str) -> None:
             counts.rejected += 1
@@ -173,7 +174,7 @@ class NodeTransport:
                 self._open_stop_socket(node, config.port)
 
     def _open_stop_socket(self, node: Node, port: str) -> None:
-        """Open a socket by which a tool can stop the node even if its launcher does not respond."""
+        """Open a socket for e-stops from tools. It works even if the launcher does not respond."""
 
         def stop(reason: str) -> None:
             now_ns = node.clock.now_ns()
@@ -186,7 +187,7 @@ class NodeTransport:
     def _end_input(self, node: Node, port: str) -> None:
         """Record that the writer of a watched input has ended.
 
-        If the node cannot work without it, also disconnect the readers of the node's outputs.
+        If the node has `ends_with_inputs`, disconnect the readers of its outputs, too.
         """
         node.inputs[port].has_ended = True
         if not node.ends_with_inputs or self._has_failed.is_set():
@@ -200,7 +201,7 @@ class NodeTransport:
             self._has_failed.set()
 
     async def watch_failure(self) -> None:
-        """Wait until a socket cannot be opened again, then raise BusError."""
+        """Wait until a socket of the node fails permanently, and raise BusError."""
         await self._has_failed.wait()
         if self._failure is not None:
             raise self._failure
@@ -258,7 +259,9 @@ class NodeTransport:
 
 
 async def run_timer(node: Node, number: int, timer: Timer) -> None:
-    """Call a node's periodic method on a fixed time grid; skip grid times that have passed."""
+    """Call a node's periodic method on a fixed time grid. Times that have already passed are
+    skipped.
+    """
     period_s = 1.0 / float(getattr(node.parameters, timer.rate_parameter))
     loop = asyncio.get_running_loop()
     due_s = loop.time()
@@ -272,14 +275,14 @@ async def run_timer(node: Node, number: int, timer: Timer) -> None:
 
 
 async def run_key_reload(transport: NodeTransport) -> None:
-    """Check once a second whether encryption keys have changed, and reload them."""
+    """Check once a second whether the encryption keys have changed, and reload changed keys."""
     while True:
         await asyncio.sleep(KEYS_PERIOD_S)
         transport.renew_keys()
 
 
 async def run_status(node: Node, process: psutil.Process, beat: Callable[[], None]) -> None:
-    """Publish the node's status and send a heartbeat to the launcher, once a second."""
+    """Publish the node's status, and send a heartbeat to the launcher, once a second."""
     process.cpu_percent()
     while True:
         await asyncio.sleep(STATUS_PERIOD_S)
@@ -290,8 +293,9 @@ async def run_status(node: Node, process: psutil.Process, beat: Callable[[], Non
 def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
     """Make the status message of a node.
 
-    The state is "degraded" if an error, a rejected message or a gap has occurred since the last
-    status.  Gaps on topics with the delivery `latest` are normal.
+    The state is "degraded" if an error, a rejected message or a gap in the sequence numbers has
+    occurred since the last status. Gaps on topics with the delivery `latest` are normal and are
+    ignored.
     """
     problems = node.errors + sum(
         port.counts.rejected + (0 if port.topic.delivery is Delivery.LATEST else port.counts.gaps)
@@ -327,9 +331,10 @@ async def run_node(
     heartbeat: Heartbeat | None = None,
     local: LocalBus | None = None,
 ) -> None:
-    """Build and connect a node, and run it until `stop` is set or one of its tasks fails.
+    """Create and connect a node, and run it until `stop` is set or one of its tasks fails.
 
-    heartbeat: pipe to the launcher; None if there is no launcher.  local: see `NodeTransport`.
+    heartbeat: pipe to the launcher; None if there is no launcher. local: bus between the nodes of
+    one process; None if the process has only one node.
     """
     heartbeat = heartbeat or Heartbeat(None)
     class_ = node_class(config.type)
@@ -380,8 +385,8 @@ async def run_node(
 async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
     """Cancel tasks repeatedly until they have ended.
 
-    Once is not enough, because a handler can suppress a cancellation.  `wait_for` of Python 3.11
-    does so if its result arrives at the same moment.
+    A single cancellation is not sufficient, because a handler can suppress it. The function
+    `wait_for` of Python 3.11 suppresses a cancellation if its result arrives at the same moment.
     """
     pending = {task for task in tasks if not task.done()}
     while pending:
@@ -391,9 +396,10 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
 
 
 class Heartbeat:
-    """Pipe to the launcher.  It reports first that all nodes are ready, then that they run.
+    """A pipe to the launcher. The first heartbeat reports that all nodes are ready, and the
+    following heartbeats report that they run.
 
-    fd: write end of the pipe; None if there is no launcher.  Writing never blocks.
+    fd: write end of the pipe; None if there is no launcher. Writing never blocks.
     nodes: number of nodes in the process.
     """
 
@@ -403,7 +409,9 @@ class Heartbeat:
             os.set_blocking(fd, False)
 
     def report_ready(self) -> None:
-        """Record that one node is set up.  When all are, send the launcher the first heartbeat."""
+        """Record that one node is ready. When all nodes are ready, send the first heartbeat to the
+        launcher.
+        """
         self._starting -= 1
         self.beat()
 
@@ -416,13 +424,15 @@ class Heartbeat:
 
 
 class LoggedNodeError(Exception):
-    """Failure of a node that is already logged with the node's name."""
+    """Raised after the failure of a node. The failure is already logged with the name of the
+    node.
+    """
 
 
 async def run_nodes(config: ProcessConfig, stop: asyncio.Event) -> None:
-    """Run all nodes of a process until `stop` is set; if one fails, stop the others.
+    """Run all nodes of a process until `stop` is set. If a node fails, stop all nodes.
 
-    Raises LoggedNodeError for the first node that failed; its error is logged.
+    Raises LoggedNodeError for the first node that failed, after its error was logged.
     """
     heartbeat = Heartbeat(config.ready_fd, len(config.nodes))
     local = None

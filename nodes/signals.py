@@ -1,4 +1,4 @@
-"""Handle in the event loop those signals that end a process."""
+"""Handle signals that end a process. The handlers run in the event loop."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from contextlib import contextmanager
 def handle_signals(
     handler: Callable[[], object], *numbers: int, ignore_afterwards: bool = False
 ) -> Iterator[None]:
-    """Call `handler` in the running event loop for each of these signals, until the context ends.
+    """Call `handler` in the running event loop for each of the given signals, until the context
+    exits.
 
-    ignore_afterwards: whether to ignore the signals afterwards instead of restoring their actions,
-        for a process that ends after its clean-up.
+    ignore_afterwards: whether to ignore the signals after the context instead of restoring their
+        former actions. Use it in a process that ends after its clean-up.
 
     When the event loop removes its handler of SIGINT, it installs Python's default, which raises an
-    exception. The signals are therefore blocked until the former actions are restored.
+    exception. Therefore the signals are blocked until the former actions are restored.
     """
     loop = asyncio.get_running_loop()
     former = {number: signal.getsignal(number) for number in numbers}
@@ -36,7 +37,7 @@ def handle_signals(
 
 @contextmanager
 def keyboard_interrupts() -> Iterator[None]:
-    """Make SIGINT raise KeyboardInterrupt until the context ends."""
+    """Make the signal SIGINT raise KeyboardInterrupt until the context exits."""
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield

@@ -1,8 +1,8 @@
 """Receive e-stops on a unix socket of a launcher or a node.
 
-Only one command-line tool at a time can use the tools' shared endpoint of the topic `estop`, but
-any number can connect to this socket. Each sends one packet and receives an answer. The module
-imports only light modules, so that these tools start quickly.
+Only one command-line tool at a time can use the endpoint of the topic `estop` that tools share. Any
+number of tools can connect to this socket. Each tool sends one packet and receives an answer. This
+module imports only small modules, so that the tools start quickly.
 """
 
 from __future__ import annotations
@@ -20,15 +20,16 @@ Kind = Literal["launcher", "node"]
 REQUEST, ANSWER = b"stop ", b"stopped"
 MAX_REQUEST_BYTES = 4096
 MAX_CONNECTIONS = 32
-"""Maximum number of open connections; when one more opens, the oldest is closed."""
+"""The maximum number of open connections. When a further connection opens, the oldest connection is
+closed."""
 
 _PEER = struct.Struct("3i")
 
 
 class StopSocket:
-    """Unix socket that calls `on_stop(reason)` for each received e-stop.
+    """A unix socket that receives e-stops and calls `on_stop(reason)` for each e-stop.
 
-    Only this user and root may connect.
+    Only processes of the same user or of root may connect.
     """
 
     def __init__(
@@ -39,7 +40,10 @@ class StopSocket:
         self._connections: list[socket.socket] = []
 
     def open(self) -> None:
-        """Listen in the running event loop. Raises OSError if the path is too long."""
+        """Open the socket, and accept connections in the running event loop.
+
+        Raises OSError if the path of the socket is too long.
+        """
         self._path.unlink(missing_ok=True)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
@@ -54,7 +58,7 @@ class StopSocket:
         self._loop.add_reader(listener.fileno(), self._accept, listener)
 
     def close(self) -> None:
-        """Stop listening, and remove the socket's file; has no effect on a closed socket."""
+        """Close the socket, and remove its file. This has no effect on a closed socket."""
         if self._listener is None:
             return
         self._path.unlink(missing_ok=True)
@@ -98,7 +102,7 @@ class StopSocket:
 
 
 def read_peer(connection: socket.socket) -> tuple[int, int]:
-    """Return process ID and user ID of the process at the other end of a unix socket."""
+    """Return the process ID and the user ID of the process at the other end of a unix socket."""
     packed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
     process, user, _ = _PEER.unpack(packed)
     return process, user
