@@ -28,7 +28,7 @@ class DeadlineFallback:
 
     @property
     def is_fallback(self) -> bool:
-        """Return whether the current method is not the best one."""
+        """Return whether the current method differs from the best method."""
         return self.name != self._names[0]
 
     def record(self, seconds: float) -> bool:

@@ -24,7 +24,7 @@ MAX_ITERATIONS = 20
 
 def distort(normalized: Floats, distortion: Floats) -> Floats:
     """Apply lens distortion to normalized image coordinates (..., 2), and return the distorted
-    ones.
+    coordinates.
 
     distortion: coefficients k1, k2, p1, p2, k3 (Brown 1966, in OpenCV's order).
     """

@@ -678,7 +678,7 @@ def disjoint(windows: list[Window]) -> list[Window]:
     """Return windows that do not overlap and cover the same pixels as the given windows.
 
     Two overlapping windows are joined. If the joined window would be too large (see
-    EMPTY_FRACTION), the overlap is removed from one of both windows.
+    EMPTY_FRACTION), the overlap is removed from one of the two windows.
     """
     apart: list[Window] = []
     pending = list(windows)

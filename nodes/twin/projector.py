@@ -195,8 +195,8 @@ class LitSheet:
         """Return the projector columns and rows that illuminate the sheet at the points that camera
         rays hit.
 
-        rays: x/z and y/z (rows, columns, 2) in the camera frame. The third result is whether each
-        ray hits the sheet.
+        rays: x/z and y/z (rows, columns, 2) in the camera frame. The third result states for each
+            ray whether it hits the sheet.
         """
         directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
         directions = directions @ world_from_eye[:3, :3].T

@@ -227,8 +227,8 @@ class SmoothMeshShape:
         return self.closest(points).height_m
 
     def _continue_from(self, query: Floats, before: Floats) -> Nearest | None:
-        """Find the nearest surface point of a query (3,), starting from the previous one, `before`
-        (3,).
+        """Find the nearest surface point of a query (3,), starting from the previous nearest point
+        `before` (3,).
 
         Return None if the projection does not converge.
         """
