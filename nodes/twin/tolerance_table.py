@@ -55,8 +55,8 @@ class Distribution(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """A normal distribution, truncated at MAX_DEVIATION_SIGMAS and at the limits `low` and
-    `high`.
+    """A normal distribution whose samples are limited to MAX_DEVIATION_SIGMAS and to the range
+    `low` to `high`.
     """
 
     mean: float
@@ -74,7 +74,7 @@ class Normal:
 
 @dataclass(frozen=True, slots=True)
 class LogNormal:
-    """A log-normal distribution, truncated at MAX_DEVIATION_SIGMAS."""
+    """A log-normal distribution whose samples are limited to MAX_DEVIATION_SIGMAS."""
 
     median: float
     sigma_ln: float
@@ -89,7 +89,9 @@ class LogNormal:
 
 @dataclass(frozen=True, slots=True)
 class HalfNormal:
-    """A half-normal distribution (of absolute normal values), truncated at MAX_DEVIATION_SIGMAS."""
+    """A half-normal distribution (of absolute normal values) whose samples are limited to
+    MAX_DEVIATION_SIGMAS.
+    """
 
     sigma: float
 
