@@ -1,10 +1,11 @@
 """Estimate the lag of an arm behind its commands from commanded and measured joint angles.
 
-The measured joint angles are compared with the commanded ones at each lag of a grid. The estimate
-is the lag at which the variance of the difference is smallest. For white noise, this is the
-maximum-likelihood estimate (Knapp and Carter, The generalized correlation method for estimation of
-time delay, 1976). The weight of old samples decays exponentially. A constant difference due to
-gravity or an encoder offset has no influence, so constant velocity gives no information.
+The measured joint angles are compared with the commands that were sent earlier by each lag of a
+grid. The estimate is the lag at which the variance of the difference is smallest. For white noise,
+this is the maximum-likelihood estimate (Knapp and Carter, The generalized correlation method for
+estimation of time delay, 1976). The weight of old samples decays exponentially. The variance
+removes a constant difference due to gravity or an encoder offset. Therefore motion at constant
+velocity gives no information about the lag.
 """
 
 from __future__ import annotations
@@ -17,70 +18,74 @@ import numpy as np
 from flexsheet.nodes.arrays import Floats
 
 GRID_STEP_S = 0.004
-"""The step of the grid of lags. A parabola through three grid points gives the minimum."""
+"""The step of the grid of lags, s. The minimum between grid points is computed with a parabola."""
 
 MEMORY_S = 1.2
-"""The time constant with which the weight of samples decays."""
+"""The time constant, in seconds, with which the weight of samples decays."""
 
 MIN_OBSERVED_S = 1.0
-"""The duration of observed motion that is required for the first estimate."""
+"""The duration of observed motion that is required before the first estimate, s."""
 
 MIN_SPEED_RAD_PER_S = 0.01
-"""The standard deviation of the joints' speed below which there is no estimate."""
+"""The standard deviation of the joints' speed below which no estimate is made."""
 
 MAX_MISFIT_RATIO = 0.05
-"""The unexplained fraction of the motion's variance above which there is no estimate.
+"""The fraction of the motion's variance above which unexplained variance prevents an estimate.
 
-With a larger fraction, the arm does not move as commanded, or its joints have reversed signs.
+If the fraction is larger, the arm does not move as commanded, or a joint has the wrong sign.
 """
 
 CORRELATION_S = 0.1
-"""The time over which errors of the difference are correlated, so they count as one sample."""
+"""The time within which errors of the angles are correlated, s. Samples within this time count as
+one sample."""
 
 MIN_NOISE_RATIO = 0.2
-"""The minimum fraction of the difference's variance that is attributed to noise.
+"""The minimum fraction of the variance of measured minus commanded angles that is attributed to
+noise.
 
-It accounts for the errors of the servo model.
+This minimum accounts for the errors of the servo model.
 """
 
 MAX_UNCERTAINTY_S = 0.004
-"""The standard deviation of an estimate above which the estimate is not used."""
+"""The standard deviation (s) of an estimate above which the estimate is not used."""
 
 MAX_SLEW_S_PER_S = 0.02
-"""The maximum rate at which the used lag changes, so that targets do not jump."""
+"""The maximum rate (s/s) at which the lag in use changes. The limit prevents jumps of the
+targets."""
 
 HISTORY = 256
 MIN_COMMANDS = 4
-"""The minimum number of commands with which a measurement is compared."""
+"""The minimum number of recorded commands for the use of a measurement."""
 
 MIN_STEP_S = 0.02
-"""The minimum time between two used measurements.
+"""The minimum time between two measurements that are used, s.
 
-More measurements would need more computing time, but add no information.
+More measurements would need more computing time, but would add little information.
 """
 
 MAX_JOINT_RAD = 10.0
-"""The maximum angle of a joint. A larger angle is an error."""
+"""The maximum plausible angle of a joint. Larger angles are treated as errors."""
 
 MAX_GAP_S = 0.05
-"""The maximum gap between commands. After a longer gap, the recorded motion is discarded."""
+"""The maximum time between two commands, s. After a longer gap, the recorded motion is
+discarded."""
 
 
 @dataclass(frozen=True, slots=True)
 class LagBounds:
-    """The minimum and maximum of the lag (s) that may be used."""
+    """The minimum and the maximum lag (s) of an arm."""
 
     min_s: float
     max_s: float
 
     def clip(self, lag_s: float) -> float:
-        """Return the lag (s), limited to the bounds."""
+        """Return `lag_s`, limited to the minimum and maximum."""
         return min(max(lag_s, self.min_s), self.max_s)
 
 
 @dataclass(frozen=True, slots=True)
 class LagEstimate:
-    """An identified lag (s) with its standard deviation.
+    """An estimated lag (s) of an arm with its standard deviation (s).
 
     tracking_error_rad: standard deviation of measured minus commanded joint angles at this lag
         (norm over the joints).
@@ -99,15 +104,18 @@ class LagEstimate:
 
 
 class ServoLagEstimator:
-    """An estimator of one arm's lag.
+    """An estimator of the lag of one arm behind its commands.
 
     estimate: newest estimate; None before the first estimate.
-    lag_s: lag to use, always within the bounds. It starts at the initial lag and changes slowly
-        towards the estimate.
+    lag_s: lag to use, in seconds, always within the bounds. It starts at the initial lag and
+        changes slowly towards the estimate.
     """
 
     def __init__(self, initial_s: float, bounds: LagBounds) -> None:
-        """Start with an initial lag (s), which is limited to the bounds."""
+        """Create an estimator without data.
+
+        initial_s: initial lag, which is limited to the bounds, s.
+        """
         self.estimate: LagEstimate | None = None
         self.lag_s = bounds.clip(initial_s)
         self._bounds = bounds
@@ -118,7 +126,7 @@ class ServoLagEstimator:
         self.restart()
 
     def restart(self) -> None:
-        """Discard the recorded motion after a gap. `lag_s` and `estimate` remain."""
+        """Discard the recorded motion, for example after a gap. Keep `lag_s` and `estimate`."""
         self._count = 0
         count = len(self._lags_s)
         self._weight = 0.0
@@ -145,7 +153,10 @@ class ServoLagEstimator:
         self._count += 1
 
     def on_measurement(self, at_s: float, joints_rad: Floats) -> None:
-        """Add angles (6,), rad, that were measured at the time `at_s`, after the newest command."""
+        """Add joint angles (6,), rad, that were measured at the time `at_s`.
+
+        The newest command must be older than the measurement.
+        """
         if not (math.isfinite(at_s) and _are_joints(joints_rad)):
             return
         times = self._times_s[: self._count]
@@ -173,9 +184,9 @@ class ServoLagEstimator:
     def _add(self, measured: Floats, wanted_s: Floats, timing_s: Floats, step_s: float) -> None:
         """Add one measurement to the weighted means and variances of all lags.
 
-        measured (6,): measured joint angles, rad. wanted_s: times of the commands to compare, one
-            per lag. timing_s (2,): answer delay and command interval. step_s: weight of the
-            measurement.
+        measured (6,): measured joint angles, rad. wanted_s: times of the commands with which the
+        angles are compared, one for each lag. timing_s (2,): answer delay and command interval.
+        step_s: weight of the measurement.
         """
         times, joints = self._times_s[: self._count], self._joints[: self._count]
         # For times after the newest command, that command is used.
@@ -206,7 +217,9 @@ class ServoLagEstimator:
             self._timing_s += weight / self._timing_weight * (timing_s - self._timing_s)
 
     def _solve(self) -> LagEstimate | None:
-        """Return the lag with the smallest variance, or None if the motion is insufficient."""
+        """Return the lag with the smallest variance, or None if the motion is insufficient for an
+        estimate.
+        """
         if self._weight < MIN_OBSERVED_S * (1.0 - math.exp(-1.0)):
             return None
         if not self._speed_square >= MIN_SPEED_RAD_PER_S**2:
@@ -242,12 +255,14 @@ class ServoLagEstimator:
 
 
 def _are_joints(joints_rad: Floats) -> bool:
-    """Return whether joint angles (6,), rad, are plausible. NaN is not plausible."""
+    """Return whether joint angles (6,), rad, are finite and not too large."""
     return bool((np.abs(joints_rad) <= MAX_JOINT_RAD).all())
 
 
 def _update(mean: Floats, square: float, value: Floats, gain: float) -> tuple[Floats, float]:
-    """Return the mean (6,) and total variance after adding a value (6,) with the weight `gain`."""
+    """Return the mean (6,) and the total variance after a value (6,) is added with the weight
+    `gain`.
+    """
     deviation = value - mean
     return mean + gain * deviation, square + gain * (
         (1.0 - gain) * float(deviation @ deviation) - square
