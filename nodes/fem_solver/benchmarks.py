@@ -1,10 +1,10 @@
-"""Measure error and time of the soft-body methods for `flexsheet chart soft-body`.
+"""Measure the error and the time of the soft-body methods for `flexsheet chart soft-body`.
 
-The methods are linear, nonlinear table, and Newton's method. They are compared with references:
-full Newton solutions of one push on separate, finer meshes. At each push depth the reference is the
-finest mesh whose solution converged there. The difference from the second finest mesh is taken as
-the uncertainty of the reference. Where no solution converged, the chart shows only the time and the
-maximum displacement of the skin (the surface of the body).
+The methods are the linear method, the nonlinear table, and Newton's method. They are compared with
+references, which are full Newton solutions of one push on separate, finer meshes. At each push
+depth the reference is the finest mesh whose solution converged there. The difference from the
+second finest mesh is taken as the uncertainty of the reference. Where no solution converged, the
+chart shows only the time and the maximum displacement of the skin (the surface of the body).
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ TABLE_SPACINGS_M = {"nonlinear table, medium": 0.0045}
 NEWTON = "neo-Hookean Newton, 0.1 mm further"
 NEWTON_RATIO = 0.64
 FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
-"""The distances between skin nodes of the reference meshes, from the most to the least accurate.
-Focused meshes are fine only near the finger, and their spacing is in finger radii. Even meshes have
-the same spacing everywhere, in metres."""
+"""The distances between skin nodes of two kinds of reference meshes, from the most to the least
+accurate mesh. Focused meshes are fine only near the finger, and their spacing is in finger radii.
+Even meshes have the same spacing everywhere, in metres."""
 SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
 DEPTHS_M = (*SHALLOW_M, 0.020, 0.0225, 0.025, 0.0275, 0.030, 0.040, 0.050)
 NEWTON_DEPTHS_M = (0.003, 0.010, 0.015)
 NEWTON_STEP_M = 1e-4
 SAMPLE_OFFSET_M = np.array([0.004, 0.003, 0.0])
 """The offset of the pushed point from the point nearest to the user. With this offset, the pushed
-point is not a node of any mesh. A push at a node would favour a method."""
+point is not a node of any mesh. A push at a node would favour the methods that use this mesh."""
 LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 RIM_RATIO = 1.5
 """The distance from the push, in finger radii, within which displacement errors are ignored,
@@ -65,7 +65,9 @@ MAX_DISPLACEMENT = "largest_move_mm"
 
 
 class SkinSolution(Protocol):
-    """The result of a method for one push: skin displacement (s, 3), m, and force (3,), N."""
+    """The interface of a method's result for one push: the displacement of the skin nodes (s, 3),
+    m, and the force (3,), N.
+    """
 
     @property
     def displacement(self) -> Floats | Singles: ...
@@ -79,9 +81,9 @@ class SoftBodyBenchmark:
     """A benchmark of the soft-body methods for pushes at one point of the object of a scene.
 
     depths_m: push depths. linear_m, table_m: skin spacing (m) for each name of a linear or table
-    method. newton_m: depths at which full Newton solutions are timed. focused: skin spacings of the
-    reference meshes that are fine only near the finger, in finger radii. even_m: skin spacings of
-    the even reference meshes, m.
+    method. newton_m: depths at which the time of full Newton solutions is measured. focused: skin
+    spacings of the reference meshes that are fine only near the finger, in finger radii. even_m:
+    skin spacings of the even reference meshes, m.
     """
 
     scene: Scene
@@ -94,7 +96,11 @@ class SoftBodyBenchmark:
     even_m: Sequence[float]
 
     def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
-        """Load or compute the body with its linear method, and its precomputed model."""
+        """Return the body with its linear method, and the precomputed model. Compute them if they
+        are not cached.
+
+        spacing_m: distance between skin nodes.
+        """
         spec = make_soft_body_spec(self.scene, spacing_m)
 
         def log_start(done: int, total: int, need: WorkBudget) -> None:
@@ -113,7 +119,9 @@ class SoftBodyBenchmark:
         return body, model
 
     def coarsest(self) -> SceneBody:
-        """Return the linear body with the largest skin spacing."""
+        """Return the body with the linear method that has the largest distance between skin
+        nodes.
+        """
         return self.linear(max([*self.linear_m.values(), *self.table_m.values()]))[0]
 
     def sample(self) -> SamplePoint:
@@ -123,7 +131,9 @@ class SoftBodyBenchmark:
         return SamplePoint(found.point, found.normal)
 
     def reference_jobs(self) -> list[tuple[str, SnapshotJob]]:
-        """Return names and jobs of the reference solutions, in order of decreasing accuracy."""
+        """Return the names and the jobs of the reference solutions, in order of decreasing
+        accuracy.
+        """
         body, sample = self.coarsest(), self.sample()
         jobs = []
         for focused, even in zip(self.focused, self.even_m, strict=True):
@@ -136,7 +146,10 @@ class SoftBodyBenchmark:
         return jobs
 
     def local_tables(self) -> dict[str, LocalTable]:
-        """Return a table for the skin near the push for each method whose table is not cached."""
+        """Return, by method, tables that cover only the skin near the push.
+
+        The result contains the methods whose full table is not cached.
+        """
         found = {}
         for name, spacing in self.table_m.items():
             body, model = self.linear(spacing)
@@ -145,7 +158,9 @@ class SoftBodyBenchmark:
         return found
 
     def prepare(self, on_progress: Progress) -> None:
-        """Solve and cache all references and table snapshots. The first call takes minutes."""
+        """Compute and cache all reference solutions and table snapshots. The first call takes
+        minutes.
+        """
         jobs = [job for _, job in self.reference_jobs()]
         for table in self.local_tables().values():
             jobs += table.jobs
@@ -162,7 +177,7 @@ class SoftBodyBenchmark:
         return ReferenceSet(references, sample, self.scene)
 
     def trials(self) -> Iterator[Trial]:
-        """Yield one trial (a measured case) for each method and push depth.
+        """Yield one trial (measurement of one case) for each method and push depth.
 
         The error of a trial is the maximum displacement error of the skin nodes that the finger
         does not hide, in mm. The force error is an additional metric.
@@ -189,7 +204,7 @@ class SoftBodyBenchmark:
     def _newton_trials(self, references: ReferenceSet) -> Iterator[Trial]:
         """Yield one trial of the full Newton method for each depth in `newton_m`.
 
-        Each trial is one load step of the length `NEWTON_STEP_M` to its depth.
+        Each trial is one load step that increases the depth by `NEWTON_STEP_M` to the given depth.
         """
         if not self.newton_m:
             return
@@ -292,7 +307,7 @@ class ReferenceSet:
 
 
 def _ignore_progress(done: int, total: int) -> None:
-    """Ignore the progress of calls that find all results in the cache."""
+    """Do nothing. This progress callback is used where all results are in the cache."""
 
 
 def make_benchmark(scene: Scene) -> SoftBodyBenchmark:

@@ -27,25 +27,26 @@ from flexsheet.nodes.fem_solver.mesh import FACES, SUBTRIANGLES, nodes_in_planes
 from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, NestedDissection
 
 PENALTY_RATIO = 200.0
-"""The ratio of the penalty stiffness (Pa/m) to Young's modulus per finger radius."""
+"""The penalty stiffness (Pa/m) of the contact, divided by Young's modulus per finger radius."""
 ROUNDING_RATIO = 0.005
 """The penetration up to which the penalty pressure rises quadratically, in finger radii."""
 POINTS_PER_EDGE = 4
 MAX_STEP_RATIO = 0.35
 """The maximum displacement of the finger per load step, in finger radii."""
 MIN_STEP_FRACTION = 1.0 / 16.0
-"""The minimum fraction of a load step to which a step without convergence is halved."""
+"""The minimum size of a load step as a fraction of the full step. Steps that do not converge are
+halved down to this size."""
 MAX_ITERATIONS = 25
 REGULARIZATIONS = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.3), (0.0, 2.0), (0.0, 15.0))
 """The successive attempts to make the tangent stiffness positive definite. Each pair contains the
-weight of the geometric stiffness of the contact, and the added stiffness in units of the shear
-modulus."""
+weight of the contact's geometric stiffness, and the added stiffness in units of the shear modulus.
+"""
 TOLERANCE = 1e-8
 """The maximum residual force at convergence, as a fraction of the largest nodal force."""
 
 
 class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
-    """An error that is raised if a load step does not converge."""
+    """Raised if a load step of Newton's method does not converge."""
 
     code = "newton"
     remedy = "Reduce the push, refine the mesh, or choose the linear method."
@@ -53,12 +54,12 @@ class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
 
 @dataclass(frozen=True, slots=True)
 class EquilibriumState:
-    """The equilibrium of the body with the finger.
+    """An equilibrium of the body in contact with the finger.
 
     displacement (n, 3): displacement of the nodes, m. force_n (3,): force of the body on the
     finger. centre (3,): centre of the sphere, m. min_volume_ratio: minimum ratio of deformed to
-    undeformed volume. reached: whether the solution for
-    the target position converged. If it did not, `centre` is the last position that converged.
+    undeformed volume. reached: whether the solution for the target position converged. If false,
+    `centre` is the last position that converged.
     """
 
     displacement: Floats
@@ -84,9 +85,10 @@ class FingerObstacle:
         """Distribute the contact points over the faces.
 
         faces (f, 6): six-node triangles that the finger can touch. modulus_pa: Young's modulus of
-        the body, to which the contact stiffness is proportional. radius_m: radius of the finger.
-        axis (3,): unit vector from the tip of the finger along its shaft, a cylinder of the same
-        radius; None for a sphere.
+            the body, to which the contact stiffness is proportional. radius_m: radius of the
+            finger.
+        axis (3,): unit vector from the tip of the finger along its shaft, which is a cylinder of
+            the same radius; None for a sphere.
         """
         self.radius_m, self._axis = radius_m, axis
         self._count, self._faces = len(nodes), faces
@@ -191,7 +193,7 @@ class FingerObstacle:
 
 
 class NeoHookeanBody:
-    """A neo-Hookean (hyperelastic) body with fixed nodes that a finger pushes."""
+    """A neo-Hookean (hyperelastic) body with fixed nodes, which a finger pushes."""
 
     def __init__(
         self,
@@ -210,16 +212,17 @@ class NeoHookeanBody:
         mirror_axes: tuple[int, ...] = (),
         finger_axis: Floats | None = None,
     ) -> None:
-        """Prepare the solver.
+        """Prepare the solver for a mesh and a material.
 
         nodes (n, 3), elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
-        six-node triangles that the finger can touch, with outward normals. tolerance: maximum
-        residual force, relative to the largest nodal force. min_step_fraction: minimum fraction of
-        a load step. max_step_ratio: maximum load step, in finger radii. factor_dtype: precision of
-        the factors of the tangent stiffness; it affects only the search direction.
-        mirror_axes: axes of planes of symmetry, on one side of which the mesh is; the forces are
-        those of this part. finger_axis (3,): direction of the finger's shaft; None for a sphere.
-        Raise SolidMeshError for inverted elements and ValueError for an invalid material.
+            six-node triangles that the finger can touch, with outward normals. tolerance: maximum
+            residual force, relative to the largest nodal force. min_step_fraction: minimum fraction
+            of a load step. max_step_ratio: maximum load step, in finger radii. factor_dtype:
+            precision of the factors of the tangent stiffness; it affects only the search direction.
+        mirror_axes: axes of planes of symmetry if the mesh is only one side of them. Then the
+            forces are those of this side. finger_axis (3,): direction of the finger's shaft; None
+            for a sphere. Raise SolidMeshError for inverted elements and ValueError for an invalid
+            material.
         """
         self.solid = NeoHookeanSolid(
             nodes, elements, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
@@ -299,10 +302,9 @@ class NeoHookeanBody:
     ) -> tuple[Floats, Factors | None]:
         """Find the equilibrium with the sphere at `centre` (3,) by Newton's method.
 
-        The iteration starts at `displacement` (n, 3) or at `guess` (n, 3), m, whichever has less
-        energy. Return the displacement (n, 3) at equilibrium and the
-        last factors of the tangent stiffness. Raise NewtonNotConvergedError if the iteration does
-        not converge.
+        The iteration starts at `displacement` or `guess` (n, 3), m. It uses the start with less
+        energy. Return the displacement (n, 3) at equilibrium and the last factors of the tangent
+        stiffness. Raise NewtonNotConvergedError if the iteration does not converge.
         """
         nodes = self.solid.nodes
         if self._energy(guess, centre) < self._energy(displacement, centre):
@@ -359,7 +361,9 @@ class NeoHookeanBody:
         target: Floats,
         factors: Factors | None,
     ) -> Floats:
-        """Predict the displacement (n, 3) to first order for a finger that moves to `target`."""
+        """Predict the displacement (n, 3), m, to first order after a motion of the finger to
+        `target` (3,).
+        """
         if factors is None:
             return displacement
         positions, fraction = self.solid.nodes + displacement, 1e-3 * (target - position)
@@ -398,8 +402,8 @@ def winding_number(triangles: Floats) -> float:
     """Return the winding number of a closed surface about the origin.
 
     The number is 1 if the origin is inside the surface, and 0 if it is outside. triangles (t, 3,
-    3): corners, counter-clockwise seen from outside. Source: van Oosterom & Strackee, IEEE Trans.
-    Biomed. Eng. 30, 1983.
+    3): corners, counter-clockwise as seen from outside. Source: van Oosterom & Strackee, IEEE
+    Trans. Biomed. Eng. 30, 1983.
     """
     a, b, c = triangles.transpose(1, 0, 2)
     x, y, z = np.linalg.norm(triangles, axis=2).T

@@ -31,7 +31,7 @@ T = TypeVar("T")
 
 POLL_S = 0.05
 BLEND_S = 5.0
-"""The duration of the gradual change between the responses of two methods, in seconds."""
+"""The duration of the gradual transition between the responses of two methods, in seconds."""
 
 
 class FemSolver(Node):
@@ -77,10 +77,11 @@ class FemSolver(Node):
         self._anchor: ContactAnchor | None = None
 
     def _set_bodies(self, bodies: list[body.SceneBody]) -> None:
-        """Set the soft bodies that compute responses, and start a gradual change of the responses.
+        """Set the soft bodies that compute responses, and start a gradual transition to their
+        responses.
 
         bodies: one body per method, of which the first is the best; an empty list if there is no
-        scene yet.
+            scene yet.
         """
         if bodies and self._bodies:
             self._replaced.append((self._bodies[self._fallback.name], self.clock.now_ns()))
@@ -142,9 +143,9 @@ class FemSolver(Node):
             self._table_task = asyncio.create_task(self._build_table(scene, bodies[0]))
 
     async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
-        """Compute the nonlinear table in the background and use it when it is finished.
+        """Compute the nonlinear table in the background, and use it when it is finished.
 
-        Until then, the linear method and later a coarse table compute the responses.
+        Until then, the linear method, and later a coarse table, computes the responses.
         """
         loop = asyncio.get_running_loop()
         stop = self._stop
@@ -212,7 +213,7 @@ class FemSolver(Node):
         self.soft_body.publish(message, source_ns=header.source_ns)
 
     def _end_transitions(self) -> None:
-        """Remove the replaced bodies that no longer contribute to the responses."""
+        """Remove the replaced soft bodies that no longer contribute to the responses."""
         if not self._replaced:
             return
         begin_ns = self.clock.now_ns() - round(1e9 * BLEND_S)
@@ -240,12 +241,12 @@ async def run_unless_superseded(
     progress: Callable[..., None],
     is_superseded: Callable[[], bool],
 ) -> T:
-    """Run a function in a thread and return its result, unless a newer request arrives.
+    """Run a function in a thread, and return its result.
 
     compute: function that receives a progress callback. progress: this callback, with a stop event
-    as an additional first argument. is_superseded: function that returns true if a newer request
-    has arrived. Raise Interrupted in this case. The thread then ends later, and its errors are
-    ignored.
+    as an additional first argument. is_superseded: function that returns whether a newer request
+    has arrived. Raise Interrupted if a newer request arrives. The thread then ends later, and its
+    errors are ignored.
     """
     stop = Event()
     task = asyncio.create_task(asyncio.to_thread(compute, partial(progress, stop)))

@@ -1,9 +1,9 @@
 """Compute the nonlinear table of a soft body from snapshots that are solved in parallel.
 
-Snapshots (`snapshots`) are solutions for pushes at single points. They are independent of each
-other and take most of the time. They are solved by an executor of `concurrent.futures`: processes
-of this computer or the workers of a cluster (`dask_executor`). Each snapshot is stored when it is
-solved.
+Snapshots (module `snapshots`) are solutions for pushes at single points. They are independent of
+each other, and need most of the computing time. An executor of `concurrent.futures` computes them
+with processes of this computer, or with the workers of a cluster (module `dask_executor`). Each
+snapshot is stored when it is finished.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ T = TypeVar("T")
 VERSION = 5
 """The version of the computation. Increase it when results for the same specification change."""
 SNAPSHOT_STEPS, NODE_STEPS = 200, 1
-"""The numbers of progress steps for a snapshot and for a node of the table."""
+"""The numbers of progress steps that a snapshot and a node of the table count."""
 POLL_S = 0.2
 """The period of progress reports and stop checks while snapshots are solved, in seconds."""
 SNAPSHOT_BYTES = 600_000_000
@@ -64,13 +64,13 @@ SNAPSHOT_BYTES = 600_000_000
 
 Progress = Callable[[int, int, "TableBudget"], None]
 """A callback that receives the number of finished steps, the total number and the required
-resources. It is first called before the work starts, and may raise `precompute.Interrupted` to stop
-the work."""
+resources. The first call is before the work starts. The callback may raise `precompute.Interrupted`
+to stop the work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableSpec:
-    """The inputs of a nonlinear table."""
+    """The inputs of the computation of a nonlinear table."""
 
     body: SoftBodySpec
     finger_radius_m: float
@@ -85,7 +85,7 @@ class TableBudget:
     """An estimate of the resources that the computation of a table needs.
 
     snapshots, nodes: number of snapshots, and of nodes of the table. bytes: memory. coarse: whether
-    the table is the coarse one, which is computed first.
+    the table is the coarse table, which is computed first.
     """
 
     snapshots: int
@@ -104,7 +104,7 @@ class TableBudget:
 def local_processes(count: int) -> Iterator[Executor]:
     """Yield an executor with `count` processes of this computer.
 
-    If an exception leaves the context, the processes stop without finishing their jobs.
+    If the context exits with an exception, the processes stop without finishing their jobs.
     """
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
@@ -130,10 +130,10 @@ def _init_worker(stop: Event) -> None:
 
 
 def _exit_on(stop: Event) -> None:
-    """Exit the worker process when an event is set.
+    """Exit the worker process as soon as an event is set.
 
-    A job checks for a stop only after each push depth, which may take a minute. The parent process
-    stores finished results.
+    This is necessary because a job checks for a stop only after each push depth, which may take a
+    minute. The parent process stores finished results.
     """
     stop.wait()
     os._exit(0)
@@ -144,14 +144,14 @@ def _solve(job: snapshots.SnapshotJob) -> snapshots.Snapshot:
 
 
 class WorkersError(FlexsheetError, RuntimeError):
-    """An error that is raised if the workers for snapshots cannot be used."""
+    """Raised if the workers that compute snapshots cannot be used."""
 
     code = "workers"
     remedy = "Follow the remedy in the text."
 
 
 class LostWorkersError(WorkersError):
-    """An error that is raised if the workers are lost. Finished snapshots are stored."""
+    """Raised if the workers that compute snapshots are lost. Finished snapshots are stored."""
 
     code = "lost-workers"
     remedy = "Start the workers again and repeat the command. Finished results are stored."
@@ -183,7 +183,7 @@ def compute_table(
 
     model: linear response of the same body. workers: number of workers of the executor on this
     computer. on_quick: function that receives a coarse table, which is ready much earlier than the
-    complete one; None to omit the coarse table. Raise MemoryError if this computer has too little
+    complete table; None to omit the coarse table. Raise MemoryError if this computer has too little
     memory. Raise LostWorkersError if the executor loses its workers.
     """
     entry = make_table_cache(spec)
@@ -333,7 +333,7 @@ def solve_all(
     *,
     names: Sequence[str] = (),
 ) -> list[snapshots.Snapshot]:
-    """Load the snapshots of jobs from a store, or solve and store them.
+    """Load the snapshots of jobs from a store. Compute and store the missing snapshots.
 
     on_progress: function that receives the number of finished snapshots. It may raise an exception
     to cancel the pending jobs. names: names of the stored snapshots; empty for "push-0000" and so

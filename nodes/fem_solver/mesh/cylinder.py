@@ -5,7 +5,7 @@ support. A cross-section consists of concentric rings of points. It is triangula
 extruded along x to prisms. Each prism is split into three tetrahedra according to the order of its
 vertex indices, so that neighbours use the same diagonal (Dompierre et al., "How to subdivide
 pyramids, prisms and hexahedra into tetrahedra", 1999). The midpoints of edges on the curved side
-are on the true cylinder (isoparametric elements); all other edges are straight.
+are on the true cylinder (isoparametric elements). All other edges are straight.
 """
 
 from __future__ import annotations
@@ -31,9 +31,11 @@ DEPTH_GROWTH = 0.35
 """The increase of the element size per depth below the curved side (m/m)."""
 RAMP_RAD = 0.6
 FOCUS_GROWTH = 0.35
-"""The increase of the element size per distance from the focus (m/m)."""
+"""The increase of the element size per distance (m/m) from the focus, which is the point of the
+push."""
 MAX_SIZE_RATIO = 0.35
-"""The maximum element size of a mesh with a focus, as a fraction of the radius of the cylinder."""
+"""The maximum element size of a mesh that is fine only near a focus point, as a fraction of the
+radius of the cylinder."""
 SPIRAL, FLAT_RATIO = 1e-3, 1e-6
 
 
@@ -67,10 +69,10 @@ def cylinder_mesh(
     support_angle_rad: full angle of the fixed strip, which is centred on -z. touch_angle_rad: half
     angle of the touchable skin, which is centred on +z. skin_spacing_m: distance between touchable
     nodes. focus: point around which the mesh is fine; None for a mesh that is fine on all touchable
-    skin. mirror_axes: axes of planes of symmetry through the focus, 0 for x = 0 and 1 for y = 0;
-    the mesh contains only the half with positive coordinates. Elements are larger inside and at
-    the back of the cylinder. Raise ValueError for a spacing that is too large for the cylinder, or
-    for invalid angles.
+    skin. mirror_axes: axes of planes of symmetry through the focus, 0 for x = 0 and 1 for y = 0.
+    The mesh contains only the half with positive coordinates. Elements are larger inside and at the
+    back of the cylinder. Raise ValueError for a spacing that is too large for the cylinder, or for
+    invalid angles.
     """
     half_support = 0.5 * support_angle_rad
     if not 0.0 < half_support < np.pi:
@@ -141,10 +143,11 @@ class _Sizes:
 
 
 def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> Floats:
-    """Return the x coordinates of the cross-sections, including both ends of the cylinder.
+    """Return the x coordinates (s,), m, of the cross-sections, including both ends of the cylinder.
 
-    If the sizes have a focus, one cross-section is at the focus, and the distances are equal within
-    `near_m`. With the plane of symmetry x = 0, only x >= 0 is returned.
+    If the sizes have a focus (a point near which the mesh is fine), one cross-section is at the
+    focus. Within `near_m` of it, the distances are equal. With the plane of symmetry x = 0, only x
+    >= 0 is returned.
     """
     half = 0.5 * length_m
     stops = [-half, half]
@@ -165,8 +168,8 @@ def _stations(length_m: float, sizes: _Sizes, mirror_axes: tuple[int, ...]) -> F
 def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
     """Return the angles (n,), in rad, of points on an arc from `start` to `stop` (excluded).
 
-    The distances of the points are the required sizes. radius: radius of the arc, m. depth: depth
-    (m) of the arc below the curved side.
+    The distances between the points are the required element sizes. radius: radius of the arc, m.
+    depth: depth (m) of the arc below the curved side.
     """
     fine = np.linspace(start, stop, 2001)
     return _sample_by_density(
@@ -177,7 +180,7 @@ def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _
 def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floats:
     """Return increasing values whose spacing is the reciprocal of a density.
 
-    fine: increasing values that cover the range of the result; the result omits the end of the
+    fine: increasing values that cover the range of the result. The result omits the end of the
     range. density: required number of points per unit at each of these values. min_count: minimum
     number of results.
     """
@@ -188,7 +191,9 @@ def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floa
 
 
 def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
-    """Yield the radius and the depth (m) of each ring of points, from outside inwards."""
+    """Yield the radius and the depth (m) of each ring of points, from the outermost ring to the
+    centre.
+    """
     depth, step = 0.0, sizes.element_m
     while True:
         depth += 0.85 * step
@@ -202,7 +207,7 @@ def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
 def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
     """Return the points (n, 2), as (y, z), and the triangles (t, 3) of the cross-section.
 
-    The triangles are counter-clockwise if seen from +x. Two points are at the ends of the support.
+    The triangles are counter-clockwise as seen from +x. Two points are at the ends of the support.
     """
     free = np.pi - half_support
     ends = [-free, free, 2 * np.pi - free]
@@ -269,11 +274,10 @@ def _circle(radius: float | Floats, angles: Floats) -> Floats:
 
 
 def _triangles(points: Floats, where: Floats) -> Ints:
-    """Triangulate points; return counter-clockwise triangles (t, 3) of indices.
+    """Triangulate points, and return counter-clockwise triangles (t, 3) of point indices.
 
-    points (n, 2): true positions. where (n, 2): positions at which the Delaunay triangulation
-    determines which points to connect; they may differ from `points`. Triangles without area are
-    omitted.
+    points (n, 2): true positions. where (n, 2): positions that the Delaunay triangulation uses to
+    select the connected points. They may differ from `points`. Triangles without area are omitted.
     """
     from scipy.spatial import Delaunay  # late: scipy is slow to import
 
@@ -287,11 +291,12 @@ def _triangles(points: Floats, where: Floats) -> Ints:
 
 
 def _extrude(points: Floats, triangles: Ints, x: Floats, swapped: int) -> tuple[Floats, Ints]:
-    """Extrude a cross-section to corner nodes (k, 3) and tetrahedra (e, 4).
+    """Extrude a cross-section, and return corner nodes (k, 3) and tetrahedra (e, 4).
 
     points (n, 2), triangles (t, 3): cross-section. x (s,): positions of the cross-sections, m. The
     diagonals alternate between slices, so that the mesh has no preferred direction. swapped: index
-    of a slice with swapped ends, which determines those of all slices.
+    of a slice whose ends are exchanged before it is divided. Every second slice from this one is
+    exchanged, too.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])
