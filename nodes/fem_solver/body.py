@@ -1,4 +1,4 @@
-"""Build the soft body of a scene and compute its response to the finger in the world frame."""
+"""Build the soft body of a scene, and compute its response to the finger in the world frame."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from flexsheet.nodes.models.interpolation import interpolate_path
 from flexsheet.nodes.models.shapes import Shape, make_shape
 
 QUICK_TABLE = "quick_table"
-"""The name of the method that uses the coarse table, which is computed first from few snapshots."""
+"""The name of the method that uses the coarse nonlinear table. This table is computed first, from
+few snapshots."""
 ERROR_DEPTHS_M = (0.0005, 0.001, 0.0015, 0.002, 0.003, 0.005)
 _LINEAR_ERRORS = (1.13, 0.76, 0.59, 0.46, 0.32, 0.26)
 FORCE_ERROR_RATIOS = {
@@ -37,12 +38,13 @@ FORCE_ERROR_RATIOS = {
 }
 """The stated relative errors of the force by method, at the depths `ERROR_DEPTHS_M`.
 
-The first row applies to cylinders on a strip, on which the forces of a table are corrected. The
-second row applies to other bodies, whose tables change to the linear response at small depths. The
-errors hold for 95 % of the touchable nodes, with the demo's finger and its skin spacing of 4.5 mm.
-The first row is from `python -m benchmarks.soft_body --table`."""
+The first row applies to cylinders on a strip support, for which the forces of a table are
+corrected. The second row applies to other bodies, whose tables use the linear response at small
+depths. The errors are valid for 95 % of the touchable nodes, with the demo's finger and a skin
+spacing of 4.5 mm. The first row was measured by `python -m benchmarks.soft_body --table`.
+"""
 NOTED_DEPTHS_M = (0.001, 0.005)
-"""The depths for which the node's status states the error of the force."""
+"""The push depths (m) for which the node's status reports the error of the force."""
 
 
 def state_force_error_ratio(method: str, mesh: MeshSpec, depth_m: float) -> float:
@@ -72,7 +74,7 @@ def make_soft_body_spec(
 
 
 def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
-    """Return the inputs of the nonlinear table of a body."""
+    """Return the inputs of the computation of a body's nonlinear table."""
     return TableSpec(spec, scene.finger.radius_m)
 
 
@@ -112,8 +114,8 @@ class SceneBody:
     ) -> tuple[Response, ContactAnchor | None]:
         """Return the response to a fingertip at `point_world` (3,), m, and the new contact anchor.
 
-        anchor: contact anchor that the previous call returned, or None. Raise ValueError for a
-        point that is not finite.
+        anchor: contact anchor (pushed surface point) that the previous call returned, or None.
+            Raise ValueError for a point that is not finite.
         """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
         if self.friction_ratio == 0.0:
@@ -135,7 +137,9 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact, and the stiffness nearest to the user."""
+        """Return the response without contact. Its stiffness is that of the surface point nearest
+        to the user.
+        """
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -159,7 +163,7 @@ class SceneBody:
         """Convert a response to a message in the world frame.
 
         horizon_s: time from the camera exposure to the predicted fingertip position. replaced:
-        bodies that this one gradually replaces, and that still contribute to the response.
+        replaced bodies that still contribute to the response during a gradual transition.
         """
         errors = [one.force_error_ratio(response.push_depth_m) for one in (self, *replaced)]
         rotation = self.world_from_mesh[:3, :3]
@@ -192,7 +196,7 @@ def build_scene_body(
 
     linear_depth_m: maximum depth at which the linear method is valid. max_depth_m: depth that
     limits the displacement. friction_ratio: friction coefficient between finger and skin. Raise
-    ValueError unless 0 < linear_depth_m < max_depth_m, and if the axis of a cylinder points to the
+    ValueError unless 0 < linear_depth_m < max_depth_m, or if the axis of a cylinder points to the
     user.
     """
     pose = world_from_mesh(scene)
@@ -233,7 +237,7 @@ def attach_table(
 ) -> SceneBody:
     """Return a copy of the body that uses the nonlinear table as its method.
 
-    quick: whether the table is the coarse one of few snapshots.
+    quick: whether the table is the coarse table, which is computed from few snapshots.
     """
     method = TableSoftBody(
         model.response,
@@ -269,10 +273,10 @@ def blend_responses(old: Response, new: Response, weight: float) -> Response:
 
 
 def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:
-    """Return the response at a time `lost_s` after the finger was last measured.
+    """Return the response at the time `lost_s` after the last measurement of the finger.
 
-    The last response is unchanged for a time `hold_s`, and then decays exponentially with the time
-    constant `relax_s`. response: last response before the finger was lost.
+    response: last response before the finger was lost. It is unchanged for the time `hold_s`, and
+        then decays exponentially with the time constant `relax_s`.
     """
     if lost_s <= hold_s:
         return response
@@ -286,7 +290,9 @@ def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: 
 
 
 def predict_position(fingertip: Fingertip, horizon_s: float) -> Floats:
-    """Return the fingertip position (3,), m, world frame, predicted for a time after exposure."""
+    """Return the fingertip position (3,), m, world frame, predicted for the time `horizon_s` after
+    the exposure.
+    """
     return interpolate_path(
         fingertip.predicted_path_world_m, fingertip.prediction_step_s, horizon_s
     )[0]

@@ -1,13 +1,14 @@
 """Solve the contact of a finger with a neo-Hookean body by Newton's method.
 
-This is the reference method, against which the faster ones are measured. The finger is a rigid
-sphere or a rigid capsule, a sphere with a straight shaft. In deep pushes the skin closes over the
-sphere and touches the shaft. A penalty pressure acts on contact points of the skin (the surface of
-the body). It first grows with the square of the penetration, so forces have a continuous slope, and
-then linearly. Under a pressure equal to Young's modulus the penetration is about a hundredth of the
-radius. Newton's method with a line search minimises the sum of elastic and contact energy. An
-inverted element has infinite energy, so it is never accepted. The contact has no friction, so the
-solution depends only on the position of the finger.
+This method is the reference for the errors of the faster methods. The finger is a rigid sphere, or
+a rigid capsule (a sphere with a straight shaft). In deep pushes, the skin closes over the sphere
+and touches the shaft. A penalty pressure acts on contact points of the skin (the surface of the
+body). For small penetrations, the pressure increases with the square of the penetration, so that
+forces have a continuous slope. For larger penetrations, it increases linearly. At a pressure equal
+to Young's modulus, the penetration is about a hundredth of the radius. Newton's method with a line
+search minimises the sum of elastic and contact energy. An inverted element has infinite energy, so
+it is never accepted. Because the contact has no friction, the solution depends only on the position
+of the finger.
 """
 
 from __future__ import annotations
@@ -136,7 +137,8 @@ class FingerObstacle:
         return float(self._penalty[inner] @ density)
 
     def forces(self, positions: Floats, centre: Floats) -> Floats:
-        """Return the force (n, 3), N, of each node on the finger, the gradient of the energy.
+        """Return the force (n, 3), N, of each node on the finger, which is the gradient of the
+        energy.
 
         positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
         """
@@ -253,13 +255,13 @@ class NeoHookeanBody:
     def solve_load_steps(
         self, centres: Iterable[Floats], *, start: tuple[Floats, Floats] | None = None
     ) -> Iterator[EquilibriumState]:
-        """Move the finger to each centre (3,) in a straight line and yield the equilibria.
+        """Move the finger to each centre (3,) in a straight line, and yield the equilibria.
 
-        start: displacement and sphere centre of a known equilibrium. Without it, the sphere at the
-        first centre must not touch the body. If a step does not converge, the last equilibrium is
-        yielded with `reached` false for all remaining centres. A step with inverted elements or
-        with the sphere inside the body has not converged. Raise ValueError for a centre that is not
-        finite.
+        start: displacement (n, 3) and sphere centre (3,) of a known equilibrium. If it is None, the
+        sphere at the first centre must not touch the body. If a step does not converge, the last
+        equilibrium is yielded with `reached` false for all remaining centres. A step with inverted
+        elements or with the sphere inside the body has not converged. Raise ValueError for a centre
+        that is not finite.
         """
         displacement, position = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
@@ -373,7 +375,7 @@ class NeoHookeanBody:
         return displacement - factors.solve(500.0 * change.ravel()).reshape(-1, 3)
 
     def _factorize(self, displacement: Floats, centre: Floats) -> Factors:
-        """Factor the tangent stiffness, regularized if it is not positive definite.
+        """Factor the tangent stiffness. If it is not positive definite, regularize it first.
 
         Raise NewtonNotConvergedError if no regularization makes it positive definite.
         """

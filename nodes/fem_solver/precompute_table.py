@@ -279,10 +279,11 @@ def _compute_table(
 def _interpolate_by(
     executor: Executor, on_progress: Callable[[int, int], None], jobs: Sequence[FillJob]
 ) -> list[FilledNodes]:
-    """Interpolate the snapshots at the nodes of all jobs in an executor.
+    """Interpolate the snapshots at the nodes of all jobs with an executor, and return the results
+    in order.
 
     on_progress: function that receives the number of finished nodes and of nodes of all jobs. Nodes
-    that are mirror images of others have no job.
+        that are mirror images of others have no job.
     """
     filled: dict[int, FilledNodes] = {}
     total = sum(len(job.samples) for job in jobs)
