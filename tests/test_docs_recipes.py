@@ -27,9 +27,15 @@ async def main():
     graph = flexsheet.RunningGraph(flexsheet.load_graph(Path("guard.yaml")))
     async with graph:
         await graph.wait_ready()
+        note, checks = "", ()
         async for status, header in flexsheet.read_topic(graph, "status"):
-            if header.writer == "guard" and status.note:
-                print(status.note)
+            if header.writer == "guard":
+                note = status.note
+            elif header.writer == "triangulator":
+                checks = status.self_checks
+            if note and checks:
+                print(note)
+                print(max(check.value / check.threshold for check in checks))
                 return
 
 asyncio.run(main())
@@ -127,6 +133,8 @@ def test_the_launch_files_of_the_node_tutorial_run(tmp_path: Path) -> None:
         python_block("write-your-own-node.md", "class SpeedGuard(")
     )
     (tmp_path / "launch").symlink_to(ROOT / "launch")
-    assert run_script(GUARD_SCRIPT, tmp_path).startswith("finger at ")
+    note, residual = run_script(GUARD_SCRIPT, tmp_path).splitlines()
+    assert note.startswith("finger at ")
+    assert float(residual) < 0.5, "the triangulator suspects a wrong calibration"
     printed = run_script(GUARD_DEMO_SCRIPT, tmp_path)
     assert printed.split() == ["fingertip", "status", "estop", "True"]
