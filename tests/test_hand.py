@@ -54,6 +54,7 @@ from flexsheet.messages.types import (
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, transform
 from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.planner import hand_bounds
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.trajectory import SheetTrajectoryPlanner
@@ -570,3 +571,14 @@ def test_the_running_graph_and_the_simulation_agree(hand: HandImpedance, tmp_pat
     assert graph.depths_m[steady].mean() == pytest.approx(expected.steady_m, rel=0.1)
     assert graph.forces_n[steady].mean() == pytest.approx(expected.steady_n, rel=0.1)
     assert graph.forces_n.max() == pytest.approx(expected.peak_n, rel=0.1)
+
+
+def test_the_bounds_report_their_computation_only_if_it_is_needed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bounds = make_bounds_60_hz()
+    monkeypatch.setattr(hand_bounds, "compute_offset_bounds", lambda *_, **__: bounds)
+    reports: list[str] = []
+    for _ in range(2):
+        hand_bounds.load_or_compute_bounds(60.0, tmp_path, reports.append)
+    assert len(reports) == 1

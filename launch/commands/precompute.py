@@ -71,8 +71,7 @@ def precompute(
     scene = load_scene(scene_file)
     with progress_words() as progress:
         files = {"deflection_shapes": precompute_deflection_shapes(scene, cache, progress)}
-        progress("computing the stability bounds of the control loop with the user's hand")
-        load_or_compute_bounds(scene.camera.rate_hz, cache)
+        load_or_compute_bounds(scene.camera.rate_hz, cache, progress)
         if scene.methods.sheet_force == "table":
             files["force_table"] = precompute_force_table(scene, cache, progress)
         if skin_spacing_m is not None:

@@ -37,8 +37,7 @@ def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
         return
     for node in plan.nodes.values():
         if issubclass(node_class(node.type), node_class("planner")):
-            progress("computing the stability bounds of the control loop with the user's hand")
-            load_or_compute_bounds(scene.camera.rate_hz, node.parameters["cache_dir"])
+            load_or_compute_bounds(scene.camera.rate_hz, node.parameters["cache_dir"], progress)
         if node.role is NodeRole.RENDERER and _uses_deflection_shapes(
             scene, node.parameters["sheet_shape"]
         ):

@@ -5,6 +5,7 @@ Within these bounds, the closed control loop of sheet and hand is stable.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -35,13 +36,19 @@ def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
     )
 
 
-def load_or_compute_bounds(rate_hz: float, cache_dir: Path | None) -> OffsetBoundsTable:
+def load_or_compute_bounds(
+    rate_hz: float, cache_dir: Path | None, progress: Callable[[str], None] = lambda text: None
+) -> OffsetBoundsTable:
     """Return the bounds for a camera's frame rate from the cache.
 
-    If the cache does not contain the bounds, compute and store them.
+    If the cache does not contain the bounds, compute and store them. progress: receives a text
+    before the computation.
     """
-    return cached(
-        bounds_cache(rate_hz),
-        cache_dir,
-        lambda: compute_offset_bounds(1.0 / rate_hz, advance_limit=MAX_ADVANCE_PER_DEPTH),
-    )
+
+    def compute() -> OffsetBoundsTable:
+        progress(
+            "computing the stability bounds of the control loop with the user's hand (only once)"
+        )
+        return compute_offset_bounds(1.0 / rate_hz, advance_limit=MAX_ADVANCE_PER_DEPTH)
+
+    return cached(bounds_cache(rate_hz), cache_dir, compute)
