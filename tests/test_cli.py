@@ -21,13 +21,16 @@ import numpy as np
 import pytest
 
 from flexsheet.launch import cli
-from flexsheet.launch.commands.session import describe_output
+from flexsheet.launch.commands.session import describe_node, describe_output
+from flexsheet.launch.experiments.run import DEMO_FILE
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import runs
 from flexsheet.messages.bag import BagReader, BagWriter
 from flexsheet.messages.base import Header
 from flexsheet.messages.topics import TOPICS
-from flexsheet.messages.types import Display, EStop, Status
+from flexsheet.messages.types import Display, EStop, PortStatus, Status
 from flexsheet.nodes import NODES
+from tests.test_doctor_hosts import make_status
 from tests.waiting import DEADLINE_S, wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -356,15 +359,29 @@ def test_nodes_of_the_running_graph_are_listed(flexsheet: Command, running: Path
 
 
 def test_status_shows_rates_of_all_nodes(flexsheet: Command, running: Path) -> None:
+    def topics_of_beacon() -> set[str]:
+        rows = flexsheet("status", "--json").json()["nodes"]
+        (beacon,) = (row for row in rows if row["node"] == "beacon")
+        return {port["topic"] for port in beacon["outputs"]}
+
+    # The first status is sent before it is counted.
+    wait_until(lambda: topics_of_beacon() >= {"twin/finger", "status"}, "a counted status")
     printed = flexsheet("status", "--json")
-    rows = {row["node"]: row for row in printed.json()["nodes"]}
     assert printed.code == 0, printed.out
-    assert set(rows) >= {"beacon", "listener", "recorder"}
-    assert {port["topic"] for port in rows["beacon"]["outputs"]} >= {"twin/finger", "status"}
+    assert {row["node"] for row in printed.json()["nodes"]} >= {"beacon", "listener", "recorder"}
     assert printed.json()["self_checks"] == []
     shown = " ".join(flexsheet("status").out.split())
     assert re.search(r"twin/finger \d+ Hz", shown)
     assert "status " not in shown
+
+
+def test_status_distinguishes_skipped_from_lost_messages() -> None:
+    port = PortStatus(
+        topic="frame", rate_hz=25.0, age_s=None, messages=9, dropped=4, gaps=2, rejected=1
+    )
+    node = load_graph(DEMO_FILE).nodes["renderer"]
+    row = describe_node(node, make_status("renderer", inputs=(port,)))
+    assert (row["skipped"], row["lost"]) == (4, 3)
 
 
 def test_status_shows_no_rate_that_has_no_meaning() -> None:

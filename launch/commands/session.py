@@ -66,6 +66,9 @@ NodeArgument = Annotated[
 def status(run: RunOption = None, as_json: JsonOption = False) -> None:
     """Show the nodes of the running graph with their message rates, lost messages and notes.
 
+    A node that reads more slowly than another one writes skips older messages of most topics. These
+    messages are counted as skipped. Lost messages were lost in transit or refused.
+
     The command also prints the problems that the self-checks of the nodes suspect. The exit code is
     1 if there is such a problem, or if a node does not report its status.
     """
@@ -73,7 +76,7 @@ def status(run: RunOption = None, as_json: JsonOption = False) -> None:
     statuses: dict[str, Status] = {}
     hosts: dict[str, HostStatus] = {}
     run_interruptible(_collect_statuses(plan, found, statuses, hosts))
-    rows = [_describe_node(node, statuses.get(node.name)) for node in plan.nodes.values()]
+    rows = [describe_node(node, statuses.get(node.name)) for node in plan.nodes.values()]
     suspicions = _list_suspicions(statuses)
     estops = {name: one.estop for name, one in hosts.items() if one.estop is not None}
     if as_json:
@@ -126,7 +129,7 @@ async def _collect_statuses(
     return 0
 
 
-def _describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
+def describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
     """Return a table row with the status of a node; its values are None if the node does not
     report."""
     row: dict[str, Any] = {"node": node.name, "host": node.host, "state": "silent"}
@@ -134,17 +137,18 @@ def _describe_node(node: ResolvedNode, status: Status | None) -> dict[str, Any]:
         none: dict[str, Any] = {
             "cpu": None,
             "memory_mb": None,
+            "skipped": None,
             "lost": None,
             "inputs": [],
             "outputs": [],
         }
         return row | none | {"errors": None, "note": ""}
-    lost = sum(port.dropped + port.gaps + port.rejected for port in status.inputs)
     return row | {
         "state": status.state,
         "cpu": round(status.cpu_ratio, 3),
         "memory_mb": round(status.resident_bytes / 1e6),
-        "lost": lost,
+        "skipped": sum(port.dropped for port in status.inputs),
+        "lost": sum(port.gaps + port.rejected for port in status.inputs),
         "inputs": [port.model_dump() for port in status.inputs],
         "outputs": [port.model_dump() for port in status.outputs if port.messages],
         "errors": status.errors,
