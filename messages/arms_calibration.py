@@ -67,7 +67,7 @@ class ArmsCalibration(Part):
     """
 
     version: Literal[1] = 1
-    date: str = Field(description="ISO 8601, UTC")
+    date: str = Field(description="time of the calibration, ISO 8601, UTC")
     code_version: str
     scene: str = Field(description="scene whose camera pose in the world is the reference")
     device: str = Field(description="device of the stereo camera")

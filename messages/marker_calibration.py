@@ -21,9 +21,11 @@ class MarkerCalibration(Part):
     """The calibrated position of the marker on a finger, with its uncertainty."""
 
     version: Literal[1] = 1
-    date: str = Field(description="ISO 8601, UTC")
+    date: str = Field(description="time of the calibration, ISO 8601, UTC")
     code_version: str
-    source: str = Field(description="file of the touches, or scene of the simulator")
+    source: str = Field(
+        description="file with the recorded touches, or name of the scene for simulated touches"
+    )
     scene: str = Field(description="name of the scene in which the finger was calibrated")
     marker_from_pad_m: FingerLengths = Field(
         description="marker's centre relative to the pad's contact point, finger's frame"

@@ -199,7 +199,8 @@ class KeyRing:
         if public.get(host) != own:
             raise SecurityError(
                 f'{secret_file}: does not match the key of host "{host}" in the launch file: '
-                f"expected {public.get(host)}, found {own}; enter it there: flexsheet keys install"
+                f"expected {public.get(host)}, found {own}; write the found key into the launch "
+                "file with flexsheet keys install"
             )
         before = self.public
         change = KeyChange(

@@ -772,8 +772,8 @@ class TwinFinger(Message):
     velocity_world_m_per_s: Vector3
     force_world_n: Vector3 = Field(
         default_factory=lambda: np.zeros(3),
-        description="force of the sheet on the finger of a simulated hand that feels the sheet "
-        "(coupled); 0 if the finger follows its path regardless of forces",
+        description="force of the sheet on the simulated finger, N, if forces move the hand; 0 if "
+        "the finger follows its path regardless of forces",
     )
 
 

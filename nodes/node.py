@@ -310,8 +310,8 @@ class Node:
     """The input ports at which the node must detect immediately that the process of the writer has
     ended."""
     ends_with_inputs: ClassVar[bool] = False
-    """Whether the end of a watched input also disconnects the readers of this node's outputs. Then
-    these readers detect the end, too."""
+    """Whether the node disconnects the readers of its outputs if the writer of a port in
+    `watched_inputs` ends. The readers then also detect that the data have stopped."""
     on_demand: ClassVar[bool] = False
     """Whether a graph omits the node if no other node reads its topics."""
     opens_devices: ClassVar[bool] = False

@@ -173,7 +173,7 @@ def test_a_bag_without_a_soft_body_is_rejected(tmp_path: Path) -> None:
     bag = tmp_path / "bare.mcap"
     with BagWriter(bag):
         pass
-    with pytest.raises(ExperimentError, match="does not contain a scene and a force curve"):
+    with pytest.raises(ExperimentError, match="the bag lacks a scene or a force curve"):
         read_bag(bag)
 
 

@@ -360,8 +360,9 @@ class SimulatedArm:
     """A simulated arm without a sheet, whose base pose and joint angles have errors.
 
     Without an apparatus (true hardware parameters), the base deviates at random from the scene, and
-    each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, the arm has its base
-    pose and joint offsets, and each joint rests at a random angle within its backlash.
+    each joint has random errors of SIMULATED_JOINT_RAD. With an apparatus, the arm has the base
+    pose and the joint offsets of the apparatus, and each joint rests at a random angle within its
+    backlash.
     """
 
     def __init__(self, scene: Scene, side: Side, apparatus: Apparatus | None, *, seed: int) -> None:

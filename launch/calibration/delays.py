@@ -260,9 +260,10 @@ def measure_lags_in_simulation(scene: Scene, apparatus: Apparatus) -> dict[Side,
 def measure_in_simulation(
     scene: Scene, apparatus: Apparatus, *, calibration: StereoCalibration | None, seed: int
 ) -> MeasuredDelays:
-    """Measure the servo lags and the stamp offset of simulated arms and a simulated camera.
+    """Measure the servo lags of simulated arms and the timestamp offset of a simulated camera.
 
-    calibration: stereo calibration with which marks are triangulated; None: the scene's camera.
+    calibration: stereo calibration that is used to triangulate the marks. If it is None, the
+    scene's camera model is used.
     """
     servo = measure_lags_in_simulation(scene, apparatus)
     stamp = simulate_stamp_offset(scene, apparatus, calibration=calibration, seed=seed)

@@ -149,8 +149,8 @@ def fit_marker(touches: Sequence[Touch]) -> MarkerFit:
     values = np.concatenate([one @ (touch.marker_m - touch.point_m) for one, touch in pairs])
     if np.linalg.cond(matrix) > MAX_CONDITION:
         raise MarkerFitError(
-            "the touches do not determine the offset, because all are along one direction; touch "
-            "in other orientations"
+            "the touches do not determine the offset, because the finger had similar orientations "
+            "in all of them; repeat with different orientations"
         )
     fixed = COMMON_ERROR_M**2 * parallel
     expected_m = np.array([TOUCH_NOISE_M, ORIENTATION_ERROR_M, POINT_ERROR_M])

@@ -101,7 +101,7 @@ def select_pushes(
     left: SampledMotion,
     right: SampledMotion,
 ) -> list[MeasuredPush]:
-    """Return a push for each force that was measured while the finger rested in the sheet.
+    """Return a push for each force that was measured while the resting finger pushed the sheet.
 
     forces: (time in ns, force in N) of each measurement.
     tips: positions (3,) of the fingertip.

@@ -33,7 +33,7 @@ def view(
     ] = 8765,
     rate: Annotated[
         float,
-        typer.Option(metavar="HZ", help="Maximum rate of numbers per channel, Hz.", min=0.1),
+        typer.Option(metavar="HZ", help="Maximum rate of numeric values per channel, Hz.", min=0.1),
     ] = 30.0,
     image_rate: Annotated[
         float,

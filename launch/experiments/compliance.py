@@ -238,8 +238,7 @@ def read_bag(bag: Path) -> ComplianceRecording:
                 pass
     if scene is None or not curves:
         raise ExperimentError(
-            f"{bag}: does not contain a scene and a force curve; record the topics scene and "
-            "soft_body"
+            f"{bag}: the bag lacks a scene or a force curve; record the topics scene and soft_body"
         )
     curves.sort(key=lambda entry: entry[0])
     return ComplianceRecording(

@@ -47,7 +47,8 @@ from flexsheet.nodes.twin.paths import inside, limit_path_speed, map_to_surface,
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 
 DEPTH_FRACTION = 0.3
-"""The voluntary push depth of the gestures, as a fraction of the scene's maximum push depth."""
+"""The push depth that the simulated hand intends, as a fraction of the scene's maximum push depth.
+"""
 
 TAPS, TAP_M, TAP_LIFT_M = 6, 0.004, 0.012
 STROKE_M_PER_S, MODULATION_HZ = 0.035, 1.0
@@ -293,7 +294,7 @@ def run_gestures(
 ) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
     """Start a graph, perform the gestures in it, and return the results and the felt forces.
 
-    Both have the same format as in `hand_gestures_result`. The force is sampled only at the
+    The results have the format of `hand_gestures_result`. The force is sampled only at the camera's
     exposures, so shorter peaks are missed. curve: (m, 2), depths (m) and forces (N) of the object.
     apparatus: file with the true parameters of the simulated hardware, which include the hand's
     impedance.

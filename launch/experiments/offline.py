@@ -508,9 +508,9 @@ class OfflineEvaluator:
     def compare_crosses(self, apparatus: Apparatus) -> CrossErrors:
         """Compare crosses drawn at expected contact points with the actual contact points.
 
-        The crosses are on the object, and are drawn for each eye of the scene on the sheet in front
-        of the object. The sheet then moves to the finger. The finger touches the sheet where the
-        tracker measures the position of the cross. Raises ExperimentError if there is no solution.
+        Each cross marks a point of the object, and is drawn on the sheet for each eye. The sheet
+        then moves to a finger that touches it at the measured position of the cross. Raise
+        ExperimentError if the touched point cannot be computed.
         """
         scene = apply_apparatus(self._scene, apparatus)
         arms = ArmPair(self._scene, apparatus)

@@ -1,6 +1,6 @@
-"""Method families whose errors are measured against the simulator.
+"""Define the groups of interchangeable methods whose errors are measured against the simulator.
 
-They are in the layer `launch`, because only this layer may import both the methods and the
+The groups are in the layer `launch`, because only this layer may import both the methods and the
 simulator.
 """
 

@@ -31,7 +31,7 @@ ROW_HEIGHT = 4.2
 def draw_system_chart(result: Mapping[str, Any], path: Path) -> None:
     """Draw one row of two diagrams per scene, and save the figure as SVG.
 
-    The left diagram shows the worst error against the latency, the right diagram shows all errors
+    The left diagram shows the worst error against the latency. The right diagram shows all errors
     of each configuration. Filled points meet all tolerances; crosses exceed a tolerance. Bars are
     95 % confidence intervals.
     """

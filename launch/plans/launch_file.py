@@ -100,7 +100,8 @@ class NodeSpec(StrictModel):
         default=0,
         ge=-20,
         le=19,
-        description="niceness of the process; values below 0 (higher priority) need a permission",
+        description="niceness of the process; values below 0 (higher priority) need root or "
+        "CAP_SYS_NICE",
     )
 
 
@@ -114,8 +115,8 @@ class ClocksSpec(StrictModel):
         default=0.005,
         gt=0,
         allow_inf_nan=False,
-        description="maximum uncertainty of a clock offset, s; with a larger one, the arms do not "
-        "move",
+        description="maximum uncertainty of a clock offset, s; the arms do not move while it is "
+        "exceeded",
     )
     max_drift_ratio: float = Field(
         default=5e-4,

@@ -102,9 +102,9 @@ class CpuWatch:
         return int(fields[1]) * 1e-9
 
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
-        """Return the programs that have used most processor time since the last call.
+        """Return the programs that have used the most processor time since the last call.
 
-        Returns no programs if the last call is more than WINDOW_S ago. named: process ids by node
+        Return no programs if the last call was more than WINDOW_S ago. named: process ids by node
         name.
         """
         names = {pid: name for name, pid in named.items()}

@@ -28,12 +28,13 @@ SHOULDER_SINGULAR_M = 1e-7
 """The distance of the wrist centre from the axis of J1 below which J1 stays constant."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
-"""The values of |J5| that delimit the wrist singularity. Up to the first value, J4 may stay
-constant. From the second value on, the exact J4 is used."""
+"""The values of |J5| that bound the region of the wrist singularity. Below the first value, J4 may
+stay constant. Below the second value, J4 may differ from its exact value. Beyond, J4 is exact."""
 
 SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
-"""The distances between wrist centre and J1 axis that delimit the shoulder singularity. Up to the
-first distance, J1 may stay constant. From the second distance on, the exact J1 is used."""
+"""The distances between wrist centre and J1 axis that bound the region of the shoulder singularity.
+Below the first distance, J1 may stay constant. Below the second distance, J1 may differ from its
+exact value. Beyond, J1 is exact."""
 
 MAX_FIXED_ERROR_RATIO = 1.4
 """The maximum pose error near a singularity, divided by WRIST_FIXED_RAD or SHOULDER_FIXED_M. The

@@ -386,7 +386,9 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Return a description if a flange violates the workspace or the flange distance, or None.
+    """Return a description of the violated limit of a flange, or None.
+
+    The limits are the workspace and the distance between the flanges.
 
     flange_world, other_flange: world poses (4, 4). slack_m: tolerance on both limits.
     Values that are not finite violate both limits.

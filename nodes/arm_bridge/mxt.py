@@ -183,7 +183,8 @@ class MxtLink:
         self._unanswered = 0
 
     def due(self, now_ns: int) -> bool:
-        """Return True, because UDP needs no connection."""
+        """Return whether an exchange may be attempted now: always, because UDP has no
+        connection."""
         return True
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> MxtStatus:

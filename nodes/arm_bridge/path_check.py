@@ -56,8 +56,8 @@ CORNER_EVERY = 4
 the corners deviate from the simulated motion by less than 1 mm."""
 
 NEAR_M, NEAR_RAD, NEAR_STRETCH = 0.03, 0.2, 0.02
-"""The position (m), rotation (rad) and stretch differences up to which a check is valid for a newer
-target."""
+"""The maximum differences in position (m), rotation (rad) and stretch between a checked target and
+a newer target for which the check remains valid."""
 
 MAX_START_MOTION_RAD = 0.002
 """The maximum joint motion after a check. If a joint has moved farther, the check is invalid."""

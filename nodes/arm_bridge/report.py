@@ -1,4 +1,4 @@
-"""Compute the state message of an arm and its mean latency."""
+"""Compute the state message and the mean latency of an arm."""
 
 from __future__ import annotations
 

@@ -75,7 +75,8 @@ class Sliders:
 
 
 class SceneController:
-    """A controller of the graph's scene, which viewers select and change by sliders."""
+    """A controller of the graph's scene. Viewers of the page select a scene, or change it by
+    sliders."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Read the constant properties of the graph that the console needs from the run's plan."""
+"""Read from the plan of a run the constant properties of the graph that the console needs."""
 
 from __future__ import annotations
 

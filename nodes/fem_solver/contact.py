@@ -393,9 +393,8 @@ def _search_step(
 class LinearSoftBody:
     """The linear soft-body method, which superposes precomputed responses to unit forces.
 
-    The method is valid up to the depth `linear_depth_m`. Deeper pushes are reported as out of
-    range. Their displacement is limited to that at `max_depth_m`, and their force grows in
-    proportion to the depth.
+    Pushes deeper than `linear_depth_m` are reported as out of range. Their force grows in
+    proportion to the depth. Their displacement grows up to the depth `max_depth_m` only.
     """
 
     name = "linear"

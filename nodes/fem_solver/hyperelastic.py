@@ -46,8 +46,8 @@ class NeoHookeanSolid:
     ) -> None:
         """Compute the shape function gradients and the volumes of the elements.
 
-        nodes (n, 3), m, elements (e, 10): mesh. Raise SolidMeshError for inverted elements, and
-        ValueError for an invalid material.
+        nodes (n, 3): positions of the nodes, m. elements (e, 10): node indices. Raise
+        SolidMeshError for inverted elements, and ValueError for an invalid material.
         """
         self.nodes, self.elements = nodes, elements
         self._lame, self._mu = lame_constants(young_modulus_pa, poisson_ratio)

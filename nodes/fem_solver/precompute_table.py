@@ -102,7 +102,7 @@ class TableBudget:
 
 @contextmanager
 def local_processes(count: int) -> Iterator[Executor]:
-    """Yield an executor with `count` processes of this computer.
+    """Yield an executor with `count` processes on this computer.
 
     If the context exits with an exception, the processes stop without finishing their jobs.
     """

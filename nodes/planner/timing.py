@@ -12,12 +12,12 @@ MIN_STEP_NS = 1_000_000
 """The minimum plausible interval between two exposures. No camera is faster."""
 
 AGE_WEIGHT = 0.05
-"""The weight of the newest value in the exponential mean of the fingertip's age. At 60 Hz, it
-corresponds to a time constant of 0.33 s."""
+"""The weight of the newest value in the exponential moving average of the age of fingertips. At
+60 Hz, it corresponds to a time constant of 0.33 s."""
 
 DELAY_WEIGHT = 0.11
-"""The weight of the newest value in the exponential mean of an arm's reported latency. At 5 Hz, it
-corresponds to a time constant of 1.8 s."""
+"""The weight of the newest value in the exponential moving average of an arm's reported latency.
+At 5 Hz, it corresponds to a time constant of 1.7 s."""
 
 
 class MonotonicTimestampFilter:
@@ -50,9 +50,10 @@ class MonotonicTimestampFilter:
 
 
 class ActuationDelayEstimator:
-    """An estimator of the delay from the publication of a fingertip until the arms have moved.
+    """An estimator of the time from the publication of a fingertip position to the arms' motion.
 
-    The delay is the latency that the arms report, minus the mean age of published fingertips.
+    This delay is the latency that the arms report, minus the mean age of the fingertip positions at
+    their publication.
     delay_s: mean delay over both arms, or the initial value before any report.
     """
 
@@ -63,7 +64,7 @@ class ActuationDelayEstimator:
         self._delays_s: dict[Side, float] = {}
 
     def on_fingertip(self, age_s: float) -> None:
-        """Add the age (s) that a usable fingertip had when it was published."""
+        """Include in the mean the age (s) of a valid fingertip position when it was published."""
         before_s = age_s if self._age_s is None else self._age_s
         self._age_s = before_s + AGE_WEIGHT * (age_s - before_s)
 

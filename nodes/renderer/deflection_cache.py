@@ -51,7 +51,8 @@ Progress = Callable[[int, int], None]
 
 
 def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
-    """Return the rubber sheet of a scene, and the range of pushes for which shapes are computed."""
+    """Return the rubber of a scene's sheet, and the range of pushes with precomputed sheet
+    shapes."""
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     within = IndentationRange(

@@ -46,9 +46,9 @@ peak and the drift of its frequency. Slow oscillators, which model voluntary mot
 point, have a damping ratio of one half."""
 
 SCORED_HORIZONS_S = (0.0, 0.05, 0.1)
-"""The horizons for which prediction errors are measured and weights are computed. Horizons are
-rounded up to whole frames, and the first horizon is one frame. Weights for other horizons are
-interpolated."""
+"""The prediction horizons (s) at which the errors of the predictors are measured, to compute the
+weights of the predictors. Horizons are rounded up to whole frames, and the first horizon is one
+frame. Weights for other horizons are interpolated."""
 
 MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
 """The maximum age of the earlier filter states that are stored to measure prediction errors."""

@@ -23,7 +23,7 @@ RAYS = 5
 BLUR_PX = 0.7
 GROUND_LEVEL, MARKER_LEVEL = 70.0, 215.0
 GROUND_REACH_PX = 10.0
-"""The distance from the marker's centre up to which the background has a brightness gradient."""
+"""The radius around the marker's centre in which the background has a brightness gradient."""
 
 MARKER_CASES = (
     *((radius_px, noise, 0.0, 0.0) for radius_px in (1.6, 3.2, 6.0) for noise in (1.0, 2.0, 4.0)),

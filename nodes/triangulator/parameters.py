@@ -27,8 +27,8 @@ class TriangulatorParameters(NodeParameters):
     )
     marker: MarkerMethod | Literal["auto"] = Field(
         default="auto",
-        description="method that refines the marker's centre; auto: the scene's method, else "
-        "subpixel_fit",
+        description="method that refines the marker's centre; auto: the method in the scene, or "
+        "subpixel_fit if the scene names none",
     )
     marker_noise_px: Positive | None = Field(
         default=None,
@@ -41,7 +41,8 @@ class TriangulatorParameters(NodeParameters):
         default=1.5, description="maximum reprojection error of a triangulated marker, px"
     )
     marker_min_contrast: Positive = Field(
-        default=60.0, description="minimum contrast of a marker, grey levels above its surroundings"
+        default=60.0,
+        description="minimum contrast of a marker: its grey level minus that of its surroundings",
     )
     marker_min_area_px: Annotated[int, Field(ge=1)] = Field(
         default=4, description="minimum area of a marker in an image, pixels"
@@ -54,12 +55,12 @@ class TriangulatorParameters(NodeParameters):
     )
     tracking: TrackingMethod | Literal["auto"] = Field(
         default="auto",
-        description="tracking method that filters and predicts the fingertip; auto: the scene's "
-        "method, else adaptive",
+        description="tracking method that filters and predicts the fingertip; auto: the method "
+        "in the scene, or adaptive if the scene names none",
     )
     max_acceleration_m_per_s2: Positive = Field(
         default=60.0,
-        description="maximum acceleration of a finger, m/s^2; points beyond it are rejected",
+        description="maximum acceleration of a finger, m/s^2; points that imply more are rejected",
     )
     track_timeout_s: Positive = Field(
         default=0.1,

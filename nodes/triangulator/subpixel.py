@@ -37,8 +37,8 @@ X, Y, RADIUS, BLUR, MARKER, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range
 STILL_PARAMETERS = 8
 ELONGATION = slice(8, 10)
 ELLIPSE = [X, Y, RADIUS, BLUR, 8, 9]
-"""The indices of an ellipse's shape parameters. The elongation has the same indices as the motion
-of a disc."""
+"""The indices of an ellipse's shape parameters in the parameter vector of a fit. Entries 8 and 9
+are the elongation of an ellipse, or the motion blur of a disc."""
 
 ODD = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 """The symmetry of each parameter: 1 if the derivative of the image is odd about the disc's centre,

@@ -74,8 +74,8 @@ def check_loopback(address: str) -> str:
     """
     if not ipaddress.ip_address(address).is_loopback:
         raise ValueError(
-            f"{address} is not a loopback address, but any client can move a simulated arm; "
-            "use 127.0.0.1"
+            f"{address} is not a loopback address; use 127.0.0.1, because a simulated arm obeys "
+            "any client that can reach it"
         )
     return address
 

@@ -1,5 +1,4 @@
-"""Compute the simulated sheet as a finite-element membrane between two clamps, which a finger
-pushes.
+"""Compute the simulated sheet: a finite-element membrane that two clamps hold and a finger pushes.
 
 The material is incompressible neo-Hookean rubber in plane stress. Its energy per volume is W = mu/2
 (I1 - 3), where I1 is the first strain invariant and mu = E/3 is the shear modulus. A membrane has

@@ -38,9 +38,7 @@ def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> TrueRubber:
 
 
 def true_friction(apparatus: Apparatus | None) -> float | None:
-    """Return the friction coefficient between finger and sheet, or None if touched rubber
-    sticks.
-    """
+    """Return the friction coefficient of the finger on the sheet, or None if nothing slips."""
     return None if apparatus is None else apparatus.sheet.friction_coefficient
 
 

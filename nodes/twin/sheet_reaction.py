@@ -1,7 +1,7 @@
-"""Tabulate the force of the simulated sheet on a finger, because the force is needed every
-millisecond.
+"""Tabulate the force of the simulated sheet on a finger.
 
-The membrane model takes a tenth of a second per push. The table contains the normal force of pushes
+The force is needed every millisecond, but the membrane model takes a tenth of a second per push.
+The table contains the normal force of pushes
 along the sheet's normal. The force is the product of two factors. The first factor is the force at
 the sheet's centre for several stretch ratios. The second factor is the ratio of the force at other
 positions to the force at the centre, for the mean stretch ratio.

@@ -183,10 +183,10 @@ def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[fl
 def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
     """Express the true hardware parameters in the world frame that the stereo camera defines.
 
-    Calibrations define the world frame by the left camera. Therefore the pose of this camera in the
-    scene is exact, and its pose errors become opposite pose errors of arms, projector and eyes. The
-    finger's path, the direction of gravity and the finger's tilt have the same coordinates in the
-    new world frame.
+    Calibrations define the world frame by the left camera. In this frame, the camera's pose in the
+    scene is exact by definition. The original pose error of the camera appears as the inverse pose
+    error of arms, projector and eyes. The finger's path, the direction of gravity and the finger's
+    tilt have the same coordinates in the new world frame.
     """
     nominal = apparatus.nominal or devices_of(scene)
     true_scene = apply_apparatus(scene, apparatus)

@@ -265,10 +265,11 @@ class SmoothMeshShape:
         """Return the globally nearest surface points of queries (n, 3), and whether they are
         ambiguous (n,).
 
-        Each query is projected from its nearest jet (local quadratic fit), which gives a point at a
-        distance D. Any nearer point has a jet within the radius `_cover` = c. Because curvature is
-        bounded, that jet is at most sqrt(D^2 + c^2 (1 + 4 D / rho)) from the query. Among the jets
-        in this radius, `_select_starts` chooses the starting points of further projections.
+        A jet is a local quadratic fit of the surface. Each query is first projected from its
+        nearest jet, which gives a point at a distance D. Each point of the surface has a jet within
+        the distance c (`_cover`). The radius of curvature is at least rho (`smoothing_m`).
+        Therefore the jet of a nearer point is at most sqrt(D^2 + c^2 (1 + 4 D / rho)) from the
+        query. Further projections start from selected jets within this distance.
         """
         nearest, rho = self._tree.query(queries)[1], self.smoothing_m
         start = self._centre[nearest]
