@@ -20,6 +20,7 @@ from flexsheet.launch.calibration.commission import (
     NodeValue,
     StepName,
     StepResult,
+    VerificationError,
     list_doubts,
 )
 from flexsheet.launch.calibration.delays import DelaysError, MeasuredLag, read_measured_lags
@@ -37,6 +38,7 @@ from flexsheet.launch.commands.commission_steps import (
     describe_sheet,
     open_laboratory,
 )
+from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
 from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
 from flexsheet.launch.experiments.robustness import summarize_commissioning
 from flexsheet.launch.experiments.stroke import SampledMotion, apply_compliance
@@ -74,6 +76,10 @@ DEMO = ROOT / "launch" / "demo.yaml"
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 OPTICS = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 SCENE = load_scene(SCENE_FILE)
+OVERLOADED = (
+    "the computer was overloaded during the verification; run flexsheet commission --check on an "
+    "idle computer"
+)
 PREDICTED = {"typical": 0.3, "limit_95": 0.45, "tolerance": 0.5, "within": True}
 
 
@@ -450,21 +456,149 @@ def test_an_unknown_apparatus_leaves_no_folder(tmp_path: Path) -> None:
 def test_a_laboratory_is_doubted_for_each_reason(tmp_path: Path) -> None:
     lab = open_lab(tmp_path)
     lab.run(StepName.CAMERA, lambda _: result())
-    figures = {"predicted": {"image_mm": PREDICTED}, "flagged": []}
+    figures = {"predicted": {"image_mm": PREDICTED}, "flagged": [], "overloaded": False}
     assert list_doubts(lab.state.steps, figures, (0.2, 0.5)) == []
     lab.run(StepName.ARMS, lambda _: result(0.7))
     lab.skip(StepName.EDGES, "no marks")
     figures = {
         "predicted": {"image_mm": {**PREDICTED, "within": False, "limit_95": 0.9}},
         "flagged": ["marker_offset"],
+        "overloaded": True,
     }
     doubts = list_doubts(lab.state.steps, figures, (0.6, 0.5))
     for doubt, words in zip(
         doubts,
-        ("step arms: residual 0.7", "edges was skipped", "image_mm: 95 %", "marker", "0.6 mm"),
+        (
+            OVERLOADED,
+            "step arms: residual 0.7",
+            "edges was skipped",
+            "image_mm: 95 %",
+            "marker",
+            "0.6 mm",
+        ),
         strict=True,
     ):
         assert words in doubt
+
+
+# Verification
+
+VERIFIED: dict[str, Any] = {
+    "stroke": {
+        "true_delta_d_mm": {"mean": 0.3, "std": 0.1, "max": 0.9},
+        "delta_d_mm": {"mean": 0.2, "std": 0.1, "max": 0.8},
+        "delta_theta_deg": {"mean": 0.4, "std": 0.1, "max": 1.1},
+        "fingertip_mm": {"mean": 0.06, "std": 0.01, "max": 0.1},
+        "latency_ms": {
+            "exposure_to_frame": {"p50": 21.0, "p99": 35.0},
+            "exposure_to_light": {"p50": None, "p99": None},
+        },
+        "drops": 90,
+        "bag": None,
+    },
+    "at_rest": {
+        "before": {"image_mm": 7.77},
+        "after": {"sheet_mm": 0.04, "image_mm": 0.1, "force_percent": 4.0, "fingertip_mm": 0.05},
+    },
+    "co_location": {"mean_mm": 0.052, "max_mm": 0.11, "disparity_mm": 0.0123},
+    "predicted": {
+        "sheet_mm": PREDICTED,
+        "image_mm": PREDICTED,
+        "force_percent": {**PREDICTED, "limit_95": 6.0, "tolerance": 10.0},
+        "fingertip_mm": PREDICTED,
+    },
+    "flagged": [],
+    "overloaded": False,
+    "doubts": [],
+    "repeat": [],
+}
+
+
+def verify(folder: Path, figures: dict[str, Any]) -> list[str]:
+    """Record a verification, and return the lines of the report."""
+    lab = open_lab(folder)
+    lab.run(StepName.MARKER, lambda _: result(uncertainty={"x_mm": 0.08}))
+    lab.run(StepName.VERIFICATION, lambda _: result(figures=figures))
+    return (folder / "report.md").read_text().splitlines()
+
+
+def test_the_report_shows_only_the_main_figures_of_the_verification(tmp_path: Path) -> None:
+    lines = verify(tmp_path, VERIFIED)
+    shown = lines[lines.index("## Verification") : lines.index("## What limits the accuracy")]
+    assert shown[2] == "The laboratory is good: all errors are expected within tolerance."
+    assert [line for line in shown if line.startswith("| ")] == [
+        "| metric | measured | predicted root mean square | predicted 95 % | tolerance |",
+        "| sheet | 0.3 mm | 0.3 mm | 0.45 mm | 0.5 mm |",
+        "| image | 0.1 mm | 0.3 mm | 0.45 mm | 0.5 mm |",
+        "| force | 4 % | 0.3 % | 6 % | 10 % |",
+        "| fingertip | 0.06 mm | 0.3 mm | 0.45 mm | 0.5 mm |",
+        "| figure | value |",
+        "| position error Δd of the sheet, mean / maximum | 0.3 / 0.9 mm |",
+        "| angular error Δθ of the sheet, mean / maximum | 0.4 / 1.1 ° |",
+        "| latency exposure to frame, p50 / p99 | 21 / 35 ms |",
+        "| lost or refused messages (drops) | 90 |",
+        "| co-location of image and touch, mean / maximum | 0.052 / 0.11 mm |",
+    ]
+    assert "All figures: commission.json, steps.verification.result.figures." in shown
+
+
+@pytest.mark.parametrize(
+    ("at_rest", "tolerances", "first"),
+    [
+        (
+            {"sheet_mm": 0.04},
+            {"sheet_mm": 0.5, "fingertip_mm": 0.3},
+            "sheet: measured 0.3 mm, tolerance 0.5 mm; this metric is nearest to its tolerance. "
+            "The error at rest is 0.04 mm, which is small: motion and delays cause most of the "
+            "error.",
+        ),
+        (
+            {"sheet_mm": 0.04, "fingertip_mm": 0.05},
+            {"sheet_mm": 0.5, "fingertip_mm": 0.08},
+            "fingertip: measured 0.06 mm, tolerance 0.08 mm; this metric is nearest to its "
+            "tolerance. The error at rest is 0.05 mm, which is a large part of the error.",
+        ),
+        (
+            {"force_percent": 9.0, "image_mm": None},
+            {"sheet_mm": 0.5, "force_percent": 10.0, "image_mm": 0.5},
+            "force: measured 9 %, tolerance 10 %; this metric is nearest to its tolerance. It is "
+            "measured at rest, so motion and delays do not cause it.",
+        ),
+        (
+            {},
+            {"sheet_mm": 0.5},
+            "sheet: measured 0.3 mm, tolerance 0.5 mm; this metric is nearest to its tolerance.",
+        ),
+    ],
+)
+def test_the_metric_nearest_to_its_tolerance_limits_the_accuracy(
+    tmp_path: Path, at_rest: dict[str, Any], tolerances: dict[str, float], first: str
+) -> None:
+    predicted = {key: {**PREDICTED, "tolerance": value} for key, value in tolerances.items()}
+    figures = {**VERIFIED, "at_rest": {"after": at_rest}, "predicted": predicted}
+    lines = verify(tmp_path, figures)
+    start = lines.index("## What limits the accuracy") + 2
+    assert lines[start : start + 2] == [f"- {first}", "- marker: x 0.08 mm"]
+
+
+def test_a_failed_stroke_says_that_finished_steps_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab, devices = open_laboratory(tmp_path / "lab", DEMO, None, "seed:3")
+    errors = [
+        ExperimentError("the bag contains 0 valid fingertips"),
+        ExperimentInterruptedError("interrupted; all nodes are stopped"),
+    ]
+
+    def fail(*_: object) -> None:
+        raise errors.pop(0)
+
+    monkeypatch.setattr("flexsheet.launch.experiments.trial.run_stroke", fail)
+    words = "step verification: .* 0 valid .* other graphs, and run the same .* steps are kept"
+    with pytest.raises(VerificationError, match=words):
+        devices.verify(lab)
+    with pytest.raises(ExperimentInterruptedError):
+        devices.verify(lab)
 
 
 # Predicted errors
@@ -495,6 +629,45 @@ def test_predicted_errors_match_errors_drawn_from_the_same_uncertainties() -> No
 
 
 # The command
+
+
+@pytest.mark.parametrize(
+    ("changes", "verdict"),
+    [
+        ({}, ["The laboratory is good: all errors are expected within tolerance."]),
+        (
+            {"doubts": [OVERLOADED], "repeat": ["marker"]},
+            ["The laboratory is not good:", f"- {OVERLOADED}", "Repeat these steps: marker."],
+        ),
+    ],
+)
+def test_the_command_ends_with_the_verdict(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    changes: dict[str, Any],
+    verdict: list[str],
+) -> None:
+    step = result(figures={**VERIFIED, **changes})
+    monkeypatch.setattr(
+        Laboratory, "steps", property(lambda _: {name: lambda _: step for name in StepName})
+    )
+    line = ["commission", "--apparatus", "seed:3", "--output", str(tmp_path / "lab")]
+    done = CliRunner().invoke(cli.app, line)
+    assert done.exit_code == 0
+    lines = done.stderr.splitlines()
+    limit = "What limits the accuracy: sheet: measured 0.3 mm, tolerance 0.5 mm; "
+    assert lines[-1].startswith(limit)
+    assert lines[-1 - len(verdict) : -1] == verdict
+    assert lines[-2 - len(verdict)].startswith("report: ")
+
+
+def test_a_skipped_verification_gives_no_verdict(
+    tmp_path: Path, quick_steps: list[StepName]
+) -> None:
+    line = ["commission", "--apparatus", "seed:3", "--output", str(tmp_path / "lab")]
+    done = CliRunner().invoke(cli.app, [*line, "--skip", "verification=no finger"])
+    assert StepName.VERIFICATION not in quick_steps
+    assert done.stderr.splitlines()[-1] == "The laboratory was not verified: no finger."
 
 
 def invoke(*arguments: str) -> tuple[int, Any, str]:
@@ -585,6 +758,13 @@ def test_real_devices_stop_at_the_first_step_without_data(
     assert found["verification"]["repeat"] == ["marker"]
     assert found["verification"]["predicted"] == {"image_mm": PREDICTED}
     assert "a self-check suspects: marker_offset" in found["verification"]["doubts"]
+    assert not found["verification"]["overloaded"]
+    for busy_fraction, overloaded in ((0.04, False), (0.1, True)):
+        measured = {"delta_d_mm": {"mean": 0.07}, "flagged": [], "busy_fraction": busy_fraction}
+        stroke.write_text(json.dumps(measured))
+        _, found, _ = invoke(*folder, "--check", "--data", f"verification={stroke}")
+        assert found["verification"]["overloaded"] is overloaded
+        assert (OVERLOADED in found["verification"]["doubts"]) is overloaded
 
 
 @pytest.mark.parametrize(

@@ -27,6 +27,8 @@ from flexsheet.launch.methods.charts import (
 )
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.methods.svg import INK
+from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.base import Header
 from flexsheet.messages.methods import (
     Correction,
     MarkerMethod,
@@ -36,6 +38,8 @@ from flexsheet.messages.methods import (
     TrackingMethod,
 )
 from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import CpuPressure, HostStatus
 from flexsheet.nodes.methods import (
     Family,
     Point,
@@ -138,6 +142,45 @@ def test_a_missing_stroke_is_named_with_what_there_is() -> None:
         ExperimentError, match=r"not contain the finger path .*it contains: wandering"
     ):
         stroke.stroke_errors(recording, 10.0)
+
+
+@pytest.mark.parametrize(
+    ("reports", "fraction"),
+    [
+        # The first and the last report are outside of the stroke.
+        ([(0.0, True), (4.0, True), (6.0, False), (8.0, False), (13.0, True)], 1 / 3),
+        ([(0.0, True), (13.0, True)], None),
+    ],
+)
+def test_the_load_of_computers_is_counted_during_the_stroke(
+    tmp_path: Path, reports: list[tuple[float, bool]], fraction: float | None
+) -> None:
+    bag = tmp_path / "stroke.mcap"
+    with BagWriter(bag) as writer:
+        for number, (seconds, busy) in enumerate(reports, start=1):
+            status = HostStatus(
+                host="main", run="1", plan_hash="", code="", python="3.11", uptime_s=1.0,
+                load_ratio=8.0, disk_free_bytes=0, memory_free_bytes=0, nodes=(),
+                missing_devices=(), cpu=CpuPressure(busy=busy, wait_ratio=0.5, node="planner"),
+            )  # fmt: skip
+            at_ns = round(seconds * 1e9)
+            header = Header(number, at_ns, at_ns, "test", "launch", 1)
+            writer.write(TOPICS["host"], status, header, at_ns)
+    empty = stroke.SampledMotion(TIMES[:2], np.zeros((2, 3)))
+    recording = stroke.StrokeRecording(
+        scene=SCENE,
+        fingertip=empty,
+        measured=empty,
+        finger=empty,
+        windows_ns={stroke.stroke_label(10.0): (0, round(12.5e9))},
+        measured_edges=(empty, empty),
+        true_edges=(empty, empty),
+        delays_s={},
+        drops=0,
+        loads=stroke.read_loads(bag),
+    )
+    found = stroke.compute_busy_fraction(recording, 10.0)
+    assert found == (None if fraction is None else pytest.approx(fraction))
 
 
 def test_size_errors_are_absolute_differences_in_mm() -> None:

@@ -157,6 +157,13 @@ class MissingDataError(CommissionError):
         self.step, self.instruction = step, instruction
 
 
+class VerificationError(CommissionError):
+    """Raised if the stroke of the verification fails in a running graph."""
+
+    code = "commission-verification"
+    remedy = "Close other graphs, and run the same command again; finished steps are kept."
+
+
 Step = Callable[["Commissioning"], StepResult]
 
 
@@ -366,36 +373,115 @@ def format_report(state: State) -> str:
             if not result.within_limit:
                 advice.append(f"- {name}: above the limit. {result.advice}")
             advice += [f"- {name}: {one.describe()}" for one in result.missing]
-    verification = state.steps.get(StepName.VERIFICATION)
-    if verification is not None and verification.result is not None:
-        lines += _format_verdict(verification.result.figures)
-        lines += ["", "## Verification", "", "| figure | value |", "|---|---|"]
-        lines += [f"| {key} | {value} |" for key, value in _flatten(verification.result.figures)]
-        if "co_location" in verification.result.figures:
-            lines += ["", f"![Seen crosses relative to touched points]({CROSSES_FILE})"]
-    limits = _rank_uncertainties(state)
+    if StepName.VERIFICATION in state.steps:
+        lines += ["", "## Verification", ""]
+        lines += [line for text in format_verdict(state) for line in (text, "")]
+        if figures := _verification_figures(state):
+            lines += _format_figures(figures)
     lines += ["", "## What limits the accuracy", ""]
-    lines += [f"- {text}" for text in limits] + advice + [f"- {MEASURED_IN_OPERATION}", ""]
+    lines += [f"- {text}" for text in list_limits(state)]
+    lines += [*advice, f"- {MEASURED_IN_OPERATION}", ""]
     return "\n".join(lines)
 
 
-def _format_verdict(figures: Mapping[str, Any]) -> list[str]:
-    """Return a Markdown table of predicted errors, and whether the laboratory meets all tolerances.
+def _verification_figures(state: State) -> Mapping[str, Any]:
+    record = state.steps.get(StepName.VERIFICATION)
+    return {} if record is None or record.result is None else record.result.figures
 
-    If it does not, the reasons are included.
 
-    figures: results of the step "verification".
+def format_verdict(state: State) -> list[str]:
+    """Return whether the laboratory meets all tolerances, in one line, and one line per doubt.
+
+    The result is empty before the verification.
     """
-    lines = ["", "## Predicted errors", ""]
-    lines += ["| metric | root mean square | 95 % | tolerance |", "|---|---|---|---|"]
-    lines += [
-        f"| {metric} | {one['typical']:.3g} | {one['limit_95']:.3g} | {one['tolerance']:.3g} |"
-        for metric, one in figures.get("predicted", {}).items()
-    ]
+    record = state.steps.get(StepName.VERIFICATION)
+    if record is None:
+        return []
+    if record.result is None:
+        return [f"The laboratory was not verified: {record.skipped_because}."]
+    figures = record.result.figures
     doubts = figures.get("doubts", [])
     if not doubts:
-        return [*lines, "", "The laboratory is good: all errors are expected within tolerance."]
-    return [*lines, "", "The laboratory is not good:", "", *(f"- {one}" for one in doubts)]
+        return ["The laboratory is good: all errors are expected within tolerance."]
+    lines = ["The laboratory is not good:", *(f"- {one}" for one in doubts)]
+    if repeat := figures.get("repeat"):
+        lines.append(f"Repeat these steps: {', '.join(repeat)}.")
+    return lines
+
+
+def _format_figures(figures: Mapping[str, Any]) -> list[str]:
+    """Return Markdown tables with the main figures of the verification.
+
+    The first table contains the metrics that have a tolerance.
+    """
+    measured = _find_measured_errors(figures)
+    lines = [
+        "| metric | measured | predicted root mean square | predicted 95 % | tolerance |",
+        "|---|---|---|---|---|",
+    ]
+    for metric, one in figures.get("predicted", {}).items():
+        name, unit = _split_metric(metric)
+        value = f"{measured[metric]:.3g} {unit}" if metric in measured else "not measured"
+        predicted = " | ".join(
+            f"{one[key]:.3g} {unit}" for key in ("typical", "limit_95", "tolerance")
+        )
+        lines.append(f"| {name} | {value} | {predicted} |")
+    lines += ["", "Sheet and fingertip are measured during the stroke, image and force at rest."]
+    lines += ["", "| figure | value |", "|---|---|"]
+    stroke = figures.get("stroke", {})
+    for name, key, unit in (
+        ("position error Δd of the sheet", "delta_d_mm", "mm"),
+        ("angular error Δθ of the sheet", "delta_theta_deg", "°"),
+    ):
+        found = stroke.get(f"true_{key}", stroke.get(key, {}))
+        if "max" in found:
+            lines.append(
+                f"| {name}, mean / maximum | {found['mean']:.3g} / {found['max']:.3g} {unit} |"
+            )
+    for key, found in stroke.get("latency_ms", {}).items():
+        if found["p50"] is not None:
+            name = key.replace("_", " ")
+            lines.append(
+                f"| latency {name}, p50 / p99 | {found['p50']:.3g} / {found['p99']:.3g} ms |"
+            )
+    if "drops" in stroke:
+        lines.append(f"| lost or refused messages (drops) | {stroke['drops']} |")
+    if crosses := figures.get("co_location"):
+        lines += [
+            "| co-location of image and touch, mean / maximum | "
+            f"{crosses['mean_mm']:.3g} / {crosses['max_mm']:.3g} mm |",
+            "",
+            f"![Seen crosses relative to touched points]({CROSSES_FILE})",
+        ]
+    return [*lines, "", f"All figures: {STATE_FILE}, steps.verification.result.figures."]
+
+
+def _split_metric(metric: str) -> tuple[str, str]:
+    """Return the name and the unit of a metric such as "sheet_mm"."""
+    name, _, unit = metric.rpartition("_")
+    return name, "%" if unit == "percent" else unit
+
+
+MOVING = {"sheet_mm": ("delta_d_mm", "true_delta_d_mm"), "fingertip_mm": ("fingertip_mm",)}
+"""The metrics that are measured during the stroke, with their keys in the stroke's result.
+
+The last key that exists is used.
+"""
+
+
+def _find_measured_errors(figures: Mapping[str, Any]) -> dict[str, float]:
+    """Return the measured errors by metric.
+
+    Errors of sheet and fingertip are means over the stroke, the others are measured at rest. Real
+    devices have no true errors, so only the error of the sheet that they report is known.
+    """
+    stroke = figures.get("stroke", {})
+    found = dict(figures.get("at_rest", {}).get("after", {}))
+    for metric, keys in MOVING.items():
+        for key in keys:
+            if key in stroke:
+                found[metric] = stroke[key]["mean"]
+    return {metric: value for metric, value in found.items() if value is not None}
 
 
 def list_doubts(
@@ -408,6 +494,11 @@ def list_doubts(
         (mm).
     """
     doubts = []
+    if figures["overloaded"]:
+        doubts.append(
+            "the computer was overloaded during the verification; run flexsheet commission --check "
+            "on an idle computer"
+        )
     for name, record in steps.items():
         if name is StepName.VERIFICATION:
             continue
@@ -435,12 +526,50 @@ def list_doubts(
     return doubts
 
 
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flatten(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", f"{value:.4g}" if isinstance(value, float) else str(value)
+def list_limits(state: State) -> list[str]:
+    """Return texts that state what limits the accuracy, with the most important one first.
+
+    The first text names the metric that is nearest to its tolerance, if the laboratory is verified.
+    The others name the uncertainties of the steps.
+    """
+    nearest = _describe_nearest_metric(_verification_figures(state))
+    return ([] if nearest is None else [nearest]) + _rank_uncertainties(state)
+
+
+SMALL_ERROR_RATIO = 0.5
+"""The maximum ratio of the error at rest to the error in motion at which the first one is small.
+
+Independent errors add in quadrature, so the error at rest then causes at most a quarter of the mean
+square.
+"""
+
+
+def _describe_nearest_metric(figures: Mapping[str, Any]) -> str | None:
+    """Describe the metric that is nearest to its tolerance; return None if none was measured."""
+    measured = _find_measured_errors(figures)
+    ratios = {
+        metric: measured[metric] / one["tolerance"]
+        for metric, one in figures.get("predicted", {}).items()
+        if metric in measured
+    }
+    if not ratios:
+        return None
+    metric = max(ratios, key=lambda name: ratios[name])
+    name, unit = _split_metric(metric)
+    value, tolerance = measured[metric], figures["predicted"][metric]["tolerance"]
+    text = (
+        f"{name}: measured {value:.3g} {unit}, tolerance {tolerance:.3g} {unit}; this metric is "
+        "nearest to its tolerance."
+    )
+    at_rest = figures.get("at_rest", {}).get("after", {}).get(metric)
+    if at_rest is None:
+        return text
+    if metric not in MOVING:
+        return f"{text} It is measured at rest, so motion and delays do not cause it."
+    text += f" The error at rest is {at_rest:.3g} {unit}"
+    if at_rest <= SMALL_ERROR_RATIO * value:
+        return f"{text}, which is small: motion and delays cause most of the error."
+    return f"{text}, which is a large part of the error."
 
 
 def _rank_uncertainties(state: State) -> list[str]:

@@ -260,6 +260,8 @@ def summarize(lab: Commissioning) -> dict[str, Any]:
 
 
 def _print_result(lab: Commissioning, missing: Any, as_json: bool) -> None:
+    from flexsheet.launch.calibration.commission import format_verdict, list_limits
+
     result = summarize(lab)
     if as_json:
         print_json({**result, "next": None if missing is None else str(missing)})
@@ -283,3 +285,6 @@ def _print_result(lab: Commissioning, missing: Any, as_json: bool) -> None:
     words.print(f"launch file: {result['launch_file']}\nreport: {result['report']}", markup=False)
     if missing is not None:
         words.print(str(missing), markup=False)
+    if verdict := format_verdict(lab.state):
+        limits = [f"What limits the accuracy: {one}" for one in list_limits(lab.state)[:1]]
+        words.print("\n".join([*verdict, *limits]), markup=False)

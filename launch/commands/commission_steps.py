@@ -29,6 +29,7 @@ from flexsheet.launch.calibration.commission import (
     Step,
     StepName,
     StepResult,
+    VerificationError,
     list_doubts,
 )
 from flexsheet.launch.commands import (
@@ -572,6 +573,7 @@ class Laboratory:
 
         For simulated devices, the errors at rest are also measured.
         """
+        from flexsheet.launch.bags.report.findings import BRIEFLY_BUSY_FRACTION
         from flexsheet.launch.calibration.prediction import predict_errors
 
         scene = load_scene(lab.scene_copy)
@@ -586,6 +588,9 @@ class Laboratory:
         limit_mm = 1e3 * scene.tolerances.sheet_position_m
         predicted = predict_errors(collect_knowledge(lab), 1e-3 * tracking_mm)
         figures["predicted"] = {name: one.model_dump() for name, one in predicted.items()}
+        # A stroke in simulated time has no load, because no graph runs.
+        busy_fraction = figures["stroke"].get("busy_fraction")
+        figures["overloaded"] = busy_fraction is not None and busy_fraction > BRIEFLY_BUSY_FRACTION
         figures["doubts"] = list_doubts(lab.state.steps, figures, (tracking_mm, limit_mm))
         figures["repeat"] = [REPEAT[one] for one in figures["flagged"] if one in REPEAT]
         return StepResult(
@@ -635,8 +640,10 @@ def run_verification(
 
     The result contains errors of the stroke, errors at rest, and errors of fingertip and sheet at
     the working speed. seconds: duration of the stroke. simulated_time: run the stroke without a
-    graph, and omit the self-checks and the errors before calibration.
+    graph, and omit the self-checks and the errors before calibration. Raises VerificationError if
+    the stroke fails.
     """
+    from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError
     from flexsheet.launch.experiments.maps import draw_cross_errors
     from flexsheet.launch.experiments.node_calibrations import NodeCalibrations
     from flexsheet.launch.experiments.offline import (
@@ -661,7 +668,14 @@ def run_verification(
         folders = {"after": (lab.launch_copy, lab.scene_copy)}
     else:
         trial = {"launch_file": str(lab.launch_copy), "seconds": seconds}
-        stroke = run_stroke(trial, file)
+        try:
+            stroke = run_stroke(trial, file)
+        except ExperimentInterruptedError:
+            raise
+        except ExperimentError as error:
+            raise VerificationError(
+                f"step {StepName.VERIFICATION}: {error}. {VerificationError.remedy}"
+            ) from error
         folders = {
             "before": (lab.launch_file, lab.scene_file),
             "after": (lab.launch_copy, lab.scene_copy),

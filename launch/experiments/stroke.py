@@ -22,12 +22,14 @@ from flexsheet.launch.experiments.lag import estimate_lag_s
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Header, Message
+from flexsheet.messages.busy import is_busy
 from flexsheet.messages.scene import ArmSpec, Cylinder, Scene, require_cylinder
 from flexsheet.messages.types import (
     ArmState,
     FingerPath,
     Fingertip,
     Frame,
+    HostStatus,
     SheetTarget,
     Side,
     SoftBody,
@@ -218,7 +220,8 @@ class StrokeRecording:
     to the events that it caused, by event. drops: number of lost or refused messages, without
     messages that a `latest` reader skipped. apparatus: origin of the true parameters of the
     simulated hardware. surface, true_surface: shape of the unloaded sheet, by the scene and by the
-    apparatus.
+    apparatus. loads: times (ns) at which the computers reported their load, and whether they were
+    overloaded.
     """
 
     scene: Scene
@@ -234,6 +237,7 @@ class StrokeRecording:
     frames: DrawnFrames = field(default_factory=lambda: DrawnFrames([], [], []))
     surface: SheetSurface | None = None
     true_surface: SheetSurface | None = None
+    loads: tuple[tuple[int, bool], ...] = ()
 
     def arm_delays_s(self) -> Floats:
         """Return the delays (n,), in s, from exposures to the commands sent to both arms."""
@@ -388,6 +392,17 @@ def read_recording(bag: Path) -> StrokeRecording:
         frames=frames,
         surface=SheetSurface.of(scene),
         true_surface=SheetSurface.of(scene, apparatus),
+        loads=read_loads(bag),
+    )
+
+
+def read_loads(bag: Path) -> tuple[tuple[int, bool], ...]:
+    """Return the times (ns) at which computers reported their load, and whether they were
+    overloaded."""
+    return tuple(
+        (header.source_ns, is_busy(message))
+        for _, message, header, _ in BagReader(bag, topics=["host"])
+        if isinstance(message, HostStatus)
     )
 
 
@@ -730,6 +745,16 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
     }
 
 
+def compute_busy_fraction(recording: StrokeRecording, seconds: float) -> float | None:
+    """Return the fraction of time during a stroke in which a computer was overloaded.
+
+    The result is None if no computer reported its load during the stroke.
+    """
+    begin_ns, finish_ns = stroke_span_ns(recording, seconds)
+    busy = [one for at_ns, one in recording.loads if begin_ns <= at_ns <= finish_ns]
+    return sum(busy) / len(busy) if busy else None
+
+
 def stroke_result(
     recording: StrokeRecording, errors: StrokeErrors, seconds: float, bag: Path
 ) -> dict[str, Any]:
@@ -764,5 +789,6 @@ def stroke_result(
             ),
         },
         "drops": recording.drops,
+        "busy_fraction": compute_busy_fraction(recording, seconds),
         "bag": str(bag),
     }
