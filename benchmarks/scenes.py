@@ -41,6 +41,8 @@ LAUNCH_FILES = {SMALLEST: DEMO_FILE.with_name("rigid.yaml")}
 GESTURE = "circle"
 APPROACH_S = 3.0
 POLL_S = 0.01
+SOFT_BODY_S = 600.0
+"""The maximum time to wait for the first soft body, whose precomputation may not be cached."""
 
 
 def write_launch_file(folder: Path, scene: str) -> Path:
@@ -92,6 +94,10 @@ async def measure(plan: ResolvedGraph, seconds: float) -> dict[str, Any]:
         start_s = time.monotonic() - begun_s
         pids = {name: graph.pids[nodes[0]] for name, nodes in processes.items()}
         async with Driver(plan, graph.run) as driver:
+            if plan.writers.get("soft_body"):
+                await driver.wait_for(
+                    lambda: driver.newest("soft_body") is not None, "a soft body", SOFT_BODY_S
+                )
             await driver.wait_ready()
             driver.move_finger(gesture_path(GESTURE, scene))
             await asyncio.sleep(APPROACH_S)
