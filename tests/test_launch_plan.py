@@ -124,7 +124,8 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             GRAPH.replace("rate_hz: 20", "rate_hz: fast"),
-            "graph.yaml:6: nodes.beacon.parameters.rate_hz: 'fast' is invalid",
+            "graph.yaml:6: nodes.beacon.parameters.rate_hz: 'fast' is invalid; "
+            "write a number in Hz, without the unit",
         ),
         (
             GRAPH + "  triangulator: {type: triangulator, parameters: {ahead_s: 0.1}}\n",

@@ -347,10 +347,48 @@ def test_less_tilt_helps_where_a_base_cannot() -> None:
         "tilt_rad",
         "push_depth_m",
     }
-    for remedy in found.remedies:
-        if "tilt_rad" in remedy.values:
-            kept = np.abs(found.samples.tilt_rad) <= remedy.values["tilt_rad"]
-            assert found.reachable[kept].all()
+
+
+def make_ball(tilt_rad: float) -> Scene:
+    """Return the scene with the ball of the tutorial and another tilt."""
+    content = SCENE.model_dump()
+    content["object"]["geometry"] = {"shape": "sphere", "radius_m": 0.04}
+    content["working_range"] = {
+        "push_depth_m": 0.05,
+        "tilt_rad": tilt_rad,
+        "speed_m_per_s": 0.035,
+    }
+    return Scene.model_validate(content)
+
+
+def test_the_largest_reachable_tilt_is_proposed() -> None:
+    found = check_layout(make_ball(0.9))
+    (remedy,) = (one for one in found.remedies if "tilt_rad" in one.values)
+    largest = remedy.values["tilt_rad"]
+    assert 0.6 <= largest < 0.9
+    degrees = np.degrees(largest)
+    assert remedy.what == f"working_range.tilt_rad: at most {largest:g} rad ({degrees:.1f} degrees)"
+    assert check_layout(make_ball(largest)).reachable
+    assert not check_layout(make_ball(largest + 0.01)).reachable
+
+
+def test_a_speed_that_is_too_high_gives_a_warning_and_the_largest_speed(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ball = make_ball(0.6)
+    found = check_layout(ball)
+    assert found.reachable
+    (remedy,) = found.remedies
+    slower = ball.working_range.model_copy(update=remedy.values)
+    assert slower.speed_m_per_s < ball.working_range.speed_m_per_s
+    calm = check_layout(ball.model_copy(update={"working_range": slower}))
+    assert calm.followed.all()
+    assert calm.remedies == ()
+    monkeypatch.setattr(layout, "check_layout", lambda scene, **_: found)
+    code, out, _ = run(capsys, monkeypatch, "doctor", "scene", SCENE_FILE)
+    assert code == 0
+    assert re.search(r"^warning: the arms follow \d+ mm/s at only [\d.]+ % of", out, re.M)
+    assert f"remedy: {remedy.what}" in out
 
 
 @pytest.mark.parametrize(

@@ -93,7 +93,8 @@ def check_scene(
 
     The command checks samples of all tilts and push depths in the range, at the minimum and the
     maximum stretch of the sheet. It prints the maximum finger speed that the arms can follow. The
-    exit code is 1 if the arms cannot reach a sample.
+    exit code is 1 if the arms cannot reach a sample. If they reach all samples but are too slow, a
+    warning is printed.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, make_layout_result
     from flexsheet.launch.plans.plan import load_scene
@@ -181,6 +182,11 @@ def _print_layout(result: dict[str, Any], required_m_per_s: float) -> None:
     )
     for path in result["blocked_paths"]:
         words.print(f"the arms cannot move along the path {path}")
+    if result["fraction_at_working_speed"] < 1.0:
+        print(
+            f"warning: the arms follow {1e3 * required_m_per_s:.0f} mm/s at only "
+            f"{100 * result['fraction_at_working_speed']:.1f} % of the samples"
+        )
     for remedy in result["remedies"]:
         print(f"remedy: {remedy['what']}")
     if not result["reachable"] and not result["remedies"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from rich.status import Status
 
 FAILED, BAD_INPUT, OTHER_THAN_LIVE = 1, 2, 3
+
+PROGRESS_LINE_S = 2.0
+"""The minimum time (s) between two lines with the progress, if stderr is not a terminal."""
 
 
 class CommandError(FlexsheetError):
@@ -183,10 +187,20 @@ def progress_words() -> Iterator[Callable[[str], None]]:
 def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
     """Show a progress bar on stderr, and yield its update function (done, total).
 
-    If stderr is not a terminal, nothing is shown.
+    If stderr is not a terminal, lines with the progress are printed: one for every 5 %, and at
+    most one in PROGRESS_LINE_S seconds.
     """
     if not words.is_terminal:
-        yield lambda done, total: None
+        printed_s, printed = time.monotonic(), 0.0
+
+        def print_line(done: float, total: float) -> None:
+            nonlocal printed_s, printed
+            due = time.monotonic() - printed_s >= PROGRESS_LINE_S
+            if due and total > 0.0 and done / total - printed >= 0.05:
+                printed_s, printed = time.monotonic(), done / total
+                words.print(f"{label}: {100.0 * done / total:.0f} %")
+
+        yield print_line
         return
     from rich.progress import (
         BarColumn,

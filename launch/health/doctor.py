@@ -203,7 +203,9 @@ def check_sockets() -> Finding:
             f"{directory} belongs to another user",
             "set FLEXSHEET_RUNS to another folder",
         )
-    return Finding("sockets", "ok", f"{directory}, {len(list_live_runs())} graphs are running")
+    count = len(list_live_runs())
+    running = "1 graph is running" if count == 1 else f"{count} graphs are running"
+    return Finding("sockets", "ok", f"{directory}, {running}")
 
 
 def check_leftovers() -> Finding:

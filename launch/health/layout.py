@@ -9,6 +9,7 @@ so that the contact also moves on the sheet. The sheet poses follow the rules of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
@@ -61,6 +62,9 @@ CLAMP_MARGIN_M = 0.03
 
 OFFSETS_M = (-0.15, -0.1, -0.05, -0.025, 0.0, 0.025, 0.05, 0.1, 0.15)
 """The offsets (m) of an arm's base along each world axis that are tried as a remedy."""
+
+TILT_STEP_RAD, DEPTH_STEP_M, SPEED_STEP_M_PER_S = 0.01, 0.001, 1e-4
+"""The steps between the values that are tried as remedies."""
 
 REACHED_COLOR = "#dcefdc"
 
@@ -290,7 +294,13 @@ def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Lay
     progress: function that is called with a description of each step.
     """
     progress("finding the contacts on the object")
-    samples = make_samples(scene, sample_contacts(scene))
+    found = _check_reach(scene, sample_contacts(scene), progress)
+    return replace(found, remedies=tuple(_find_remedies(found, progress)))
+
+
+def _check_reach(scene: Scene, contacts: Sequence[ContactSample], progress: Progress) -> Layout:
+    """Return the layout without remedies."""
+    samples = make_samples(scene, contacts)
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
     progress(f"{len(samples.poses)} poses of the sheet, left arm")
     left_reach = find_best_reach(left, right, samples.poses)
@@ -298,10 +308,7 @@ def check_layout(scene: Scene, *, progress: Progress = lambda text: None) -> Lay
     right_reach = find_best_reach(right, left, samples.poses)
     found = Layout(scene, samples, left_reach, right_reach, (), ())
     progress("checking paths from the front to the limits of the range")
-    found = replace(found, blocked_paths=tuple(_find_blocked_paths(found, left, right)))
-    if found.reached.all():
-        return found
-    return replace(found, remedies=tuple(_find_remedies(found, progress)))
+    return replace(found, blocked_paths=tuple(_find_blocked_paths(found, left, right)))
 
 
 def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -> Iterator[str]:
@@ -339,8 +346,16 @@ def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -
 def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]:
     """Yield changes of the scene after which the arms reach all samples.
 
-    The changes are other base positions, a smaller tilt range, or a smaller push depth.
+    The changes are other base positions, a smaller tilt range, or a smaller push depth. If the arms
+    reach all samples but are too slow, the change is a smaller speed.
     """
+    if layout.reachable:
+        if not layout.followed.all():
+            speed = SPEED_STEP_M_PER_S * np.floor(layout.speed_m_per_s(1.0) / SPEED_STEP_M_PER_S)
+            yield LayoutRemedy(
+                f"working_range.speed_m_per_s: at most {speed:.4f} m/s", {"speed_m_per_s": speed}
+            )
+        return
     moved: dict[Side, Floats] = {}
     for side, reach in layout.arms():
         if not reach.reachable.all():
@@ -359,19 +374,48 @@ def _find_remedies(layout: Layout, progress: Progress) -> Iterator[LayoutRemedy]
             f"move the {moves} along the world's x, y, z",
             {f"{side}_base_offset_m": offset.tolist() for side, offset in moved.items()},
         )
-    reached = layout.reached
-    for name, values, unit, factor in (
-        ("tilt", np.abs(layout.samples.tilt_rad), "degrees", 180.0 / np.pi),
-        ("push_depth", layout.samples.depth_m, "mm", 1e3),
+    for key, step, unit, factor, shown in (
+        ("tilt_rad", TILT_STEP_RAD, "rad", 180.0 / np.pi, "degrees"),
+        ("push_depth_m", DEPTH_STEP_M, "m", 1e3, "mm"),
     ):
-        bad = values[~reached]
-        possible = values[values < bad.min() - 1e-9] if len(bad) else values
-        if len(possible) and possible.max() > 0.0:
-            largest = float(possible.max())
-            key = "tilt_rad" if name == "tilt" else "push_depth_m"
+        progress(f"searching the largest {key}")
+        largest = _find_largest(layout.scene, key, step)
+        if largest is not None:
             yield LayoutRemedy(
-                f"working_range.{key}: at most {factor * largest:.1f} {unit}", {key: largest}
+                f"working_range.{key}: at most {largest:g} {unit} ({factor * largest:.1f} {shown})",
+                {key: largest},
             )
+
+
+def _find_largest(scene: Scene, key: str, step: float) -> float | None:
+    """Return the largest value of a key of the working range with which the range is reachable.
+
+    The search is a bisection over the multiples of `step` below the value in the scene. Return None
+    if no tested value is reachable.
+    """
+    low, high = 0, math.ceil(round(getattr(scene.working_range, key) / step, 6))
+    while high - low > 1:
+        middle = (low + high) // 2
+        value = round(middle * step, 6)
+        changed = scene.working_range.model_copy(update={key: value})
+        if _is_reachable(scene.model_copy(update={"working_range": changed})):
+            low = middle
+        else:
+            high = middle
+    return round(low * step, 6) if low else None
+
+
+def _is_reachable(scene: Scene) -> bool:
+    contacts = sample_contacts(scene)
+    if not contacts:
+        return False
+    # Paths are only checked if all samples are reachable, because their check takes long.
+    poses = make_samples(scene, contacts).poses.without_twists()
+    left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
+    for arm, other in ((left, right), (right, left)):
+        if not find_best_reach(arm, other, poses).reachable.all():
+            return False
+    return _check_reach(scene, contacts, lambda text: None).reachable
 
 
 def move_base(scene: Scene, side: Side, offset_m: Floats) -> Scene:

@@ -180,7 +180,8 @@ class ArmBridge(Node):
         if self._link.due(now_ns):
             await self._exchange(geometry, other, step_s)
         control = self._control
-        self.note = f"{control.mode} {control.reason}; {self._failures} failed exchanges"
+        doing = f"{control.mode} {control.reason}".rstrip()
+        self.note = f"{doing}; {self._failures} failed exchanges"
         if control.last_measured_rad is not None:
             now_ns, last = self.clock.now_ns(), self._last
             state = make_arm_state(control, geometry, other, last, lag=self._lag, now_ns=now_ns)

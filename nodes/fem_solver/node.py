@@ -30,6 +30,7 @@ from flexsheet.nodes.node import Input, Node, Output
 T = TypeVar("T")
 
 POLL_S = 0.05
+TABLE_NOTE = "; the nonlinear table is being computed"
 BLEND_S = 5.0
 """The duration of the gradual transition between the responses of two methods, in seconds."""
 
@@ -90,7 +91,7 @@ class FemSolver(Node):
         self._bodies = {one.method.name: one for one in bodies}
         if bodies:
             self._fallback = DeadlineFallback(list(self._bodies), self.parameters.step_budget_s)
-            self.note = f"soft body ready, {self._describe(bodies[0])}"
+            self.note = f"soft body by {self._describe(bodies[0])}"
 
     def _describe(self, current: body.SceneBody) -> str:
         """Return the method in use, its force error and its number of skin nodes as a text."""
@@ -101,7 +102,7 @@ class FemSolver(Node):
             f"{1e3 * depth_m:g} mm"
             for depth_m in body.NOTED_DEPTHS_M
         )
-        return f"{current.method.name}, force within {errors}, {nodes} skin nodes"
+        return f"{current.method.name}, force error up to {errors} depth, {nodes} skin nodes"
 
     async def close(self) -> None:
         self._stop.set()
@@ -140,6 +141,7 @@ class FemSolver(Node):
         self.note += factory.pending_note(scene, method, bodies)
         self.skin.publish(bodies[0].skin, source_ns=header.source_ns)
         if method == "nonlinear_table" and not p.friction_ratio and len(bodies) == 1:
+            self.note += TABLE_NOTE
             self._table_task = asyncio.create_task(self._build_table(scene, bodies[0]))
 
     async def _build_table(self, scene: Scene, linear: body.SceneBody) -> None:
@@ -153,6 +155,7 @@ class FemSolver(Node):
         async def adopt(quick: body.SceneBody) -> None:
             if not stop.is_set():
                 self._set_bodies([quick, linear])
+                self.note += TABLE_NOTE
 
         def on_quick(quick: body.SceneBody) -> None:
             asyncio.run_coroutine_threadsafe(adopt(quick), loop).result()
@@ -220,7 +223,7 @@ class FemSolver(Node):
         self._replaced = [one for one in self._replaced if one[1] > begin_ns]
         builds_table = self._table_task is not None and not self._table_task.done()
         if not (self._replaced or builds_table or self._fallback.is_fallback):
-            self.note = f"soft body ready, {self._describe(self._bodies[self._fallback.name])}"
+            self.note = f"soft body by {self._describe(self._bodies[self._fallback.name])}"
 
     def _blend_in(
         self, response: Response, respond: Callable[[body.SceneBody], Response]

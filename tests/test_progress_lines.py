@@ -1,0 +1,33 @@
+"""Test the progress lines and notes that commands print."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from flexsheet.launch.commands import output
+from flexsheet.launch.health import doctor
+
+
+def test_progress_is_printed_in_lines_where_stderr_is_no_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = iter((0.0, 1.0, 3.0, 3.0, 6.0, 7.0, 7.0))
+    monkeypatch.setattr(output, "time", SimpleNamespace(monotonic=lambda: next(now)))
+    with output.progress_bar("replaying") as progress:
+        for done in (10, 30, 32, 60):
+            progress(done, 100)
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.splitlines() == ["replaying: 30 %", "replaying: 60 %"]
+
+
+@pytest.mark.parametrize(("count", "words"), [(1, "1 graph is running"), (2, "2 graphs are")])
+def test_the_number_of_graphs_agrees_with_the_verb(
+    count: int, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "root", lambda: tmp_path)
+    monkeypatch.setattr(doctor, "list_live_runs", lambda: [None] * count)
+    assert words in doctor.check_sockets().what
