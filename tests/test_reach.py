@@ -369,7 +369,13 @@ def test_the_largest_reachable_tilt_is_proposed() -> None:
     degrees = np.degrees(largest)
     assert remedy.what == f"working_range.tilt_rad: at most {largest:g} rad ({degrees:.1f} degrees)"
     assert check_layout(make_ball(largest)).reachable
-    assert not check_layout(make_ball(largest + 0.01)).reachable
+    beyond = make_ball(largest + 0.01)
+    poses = make_samples(beyond, sample_contacts(beyond)).poses
+    left, right = ArmGeometry(beyond, "left"), ArmGeometry(beyond, "right")
+    reached = [
+        find_best_reach(*arms, poses).reachable.all() for arms in ((left, right), (right, left))
+    ]
+    assert not all(reached)
 
 
 def test_a_speed_that_is_too_high_gives_a_warning_and_the_largest_speed(
