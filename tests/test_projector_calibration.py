@@ -198,7 +198,7 @@ def test_corners_in_no_order_are_rejected() -> None:
     with pytest.raises(ProjectorError, match="not a convex quadrangle"):
         fit_keystone(crossed, 0.1, 0.1, guess)
     mirrored = np.array([[199.0, 499], [599, 499], [599, 99], [199, 99]])
-    with pytest.raises(ProjectorError, match="no projector pose near"):
+    with pytest.raises(ProjectorError, match="no projector near the pose in the scene"):
         fit_keystone(mirrored, 0.1, 0.1, guess)
 
 

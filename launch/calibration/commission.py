@@ -494,7 +494,7 @@ def list_doubts(
         (mm).
     """
     doubts = []
-    if figures["overloaded"]:
+    if figures.get("overloaded"):
         doubts.append(
             "the computer was overloaded during the verification; run flexsheet commission --check "
             "on an idle computer"

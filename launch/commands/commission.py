@@ -137,11 +137,12 @@ def commission(
     seed: SeedOption = 1,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate camera, arms, sheet, projector, marker and eyes in sequence, and verify the result.
+    """Calibrate all devices of a laboratory in sequence, and verify the result.
 
-    The command does not repeat finished steps. With --apparatus, all devices are simulated.
-    Otherwise, if the data of a step are missing, the command states how to capture them and stops
-    with exit code 1.
+    The steps are camera, arms, edges, sheet, projector, marker, eyes, delays and verification.
+    Finished steps are not repeated. With --apparatus, all devices are simulated, and the steps take
+    a few minutes. Otherwise, if the data of a step are missing, the command states how to capture
+    them and stops with exit code 1.
     """
     from flexsheet.launch.calibration.commission import MissingDataError, StepName
     from flexsheet.launch.commands.calibrate import FOUR_BITS, _parse_board
