@@ -16,6 +16,8 @@ from annotated_types import Gt
 from pydantic import BaseModel, ValidationInfo, field_validator
 from pydantic.fields import FieldInfo
 
+from flexsheet.messages.units import find_unit
+
 MAX_LENGTH_M = 10.0
 """The maximum length or coordinate (m), which is about the size of a room."""
 
@@ -173,8 +175,8 @@ def find_min_positive(name: str) -> float:
 
 
 def _unit_text(name: str) -> str:
-    unit = next((unit for unit in MAX_BY_UNIT if name.endswith(unit)), "")
-    return f" {unit[1:]}" if unit and unit != "_ratio" else ""
+    unit = find_unit(name)
+    return "" if unit in ("", "1") else f" {unit}"
 
 
 @cache

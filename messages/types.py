@@ -790,7 +790,7 @@ Viewpoint = Literal["centre", "left", "right"]
 
 
 class TwinEye(Message):
-    """A rendering of what an eye sees in the simulation, and the image that it should see."""
+    """An image that an eye sees in the simulation, and the image that the eye should see."""
 
     label: str
     correction: Correction

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -125,19 +125,27 @@ def test_a_track_needs_samples() -> None:
         stroke.make_motion([(0, np.zeros(3))], "fingertip")
 
 
-def test_a_missing_stroke_is_named_with_what_there_is() -> None:
-    empty = stroke.SampledMotion(TIMES[:2], np.zeros((2, 3)))
-    recording = stroke.StrokeRecording(
+def make_recording(
+    windows_ns: dict[str, tuple[int, int]], **changes: Any
+) -> stroke.StrokeRecording:
+    """Return a recording with motions of two samples at the origin."""
+    rest = stroke.SampledMotion(TIMES[:2], np.zeros((2, 3)))
+    return stroke.StrokeRecording(
         scene=SCENE,
-        fingertip=empty,
-        measured=empty,
-        finger=empty,
-        windows_ns={"wandering": (0, 1)},
-        measured_edges=(empty, empty),
-        true_edges=(empty, empty),
+        fingertip=rest,
+        measured=rest,
+        finger=rest,
+        windows_ns=windows_ns,
+        measured_edges=(rest, rest),
+        true_edges=(rest, rest),
         delays_s={},
         drops=0,
+        **changes,
     )
+
+
+def test_a_missing_stroke_is_named_with_what_there_is() -> None:
+    recording = make_recording({"wandering": (0, 1)})
     with pytest.raises(
         ExperimentError, match=r"not contain the finger path .*it contains: wandering"
     ):
@@ -166,18 +174,8 @@ def test_the_load_of_computers_is_counted_during_the_stroke(
             at_ns = round(seconds * 1e9)
             header = Header(number, at_ns, at_ns, "test", "launch", 1)
             writer.write(TOPICS["host"], status, header, at_ns)
-    empty = stroke.SampledMotion(TIMES[:2], np.zeros((2, 3)))
-    recording = stroke.StrokeRecording(
-        scene=SCENE,
-        fingertip=empty,
-        measured=empty,
-        finger=empty,
-        windows_ns={stroke.stroke_label(10.0): (0, round(12.5e9))},
-        measured_edges=(empty, empty),
-        true_edges=(empty, empty),
-        delays_s={},
-        drops=0,
-        loads=stroke.read_loads(bag),
+    recording = make_recording(
+        {stroke.stroke_label(10.0): (0, round(12.5e9))}, loads=stroke.read_loads(bag)
     )
     found = stroke.compute_busy_fraction(recording, 10.0)
     assert found == (None if fraction is None else pytest.approx(fraction))

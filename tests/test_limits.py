@@ -153,7 +153,7 @@ def test_an_absurd_rate_in_a_launch_file_is_rejected(tmp_path: Path) -> None:
     file = tmp_path / "graph.yaml"
     file.write_text("nodes:\n  arms:\n    type: twin_arms\n    parameters: {rate_hz: 1.0e+308}\n")
     printed = (
-        r"graph.yaml:4: nodes.arms.parameters.rate_hz: 1e\+308 is invalid; give at most 10000 hz"
+        r"graph.yaml:4: nodes.arms.parameters.rate_hz: 1e\+308 is invalid; give at most 10000 Hz"
     )
     with pytest.raises(BadInputError, match=printed):
         load_graph(file)

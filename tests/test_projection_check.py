@@ -214,18 +214,23 @@ def test_another_bright_point_and_a_mark_beside_the_sheet_are_ignored() -> None:
     points[0] = points[0] + [0.008, 0.0, 0.0]
     for number in range(60):
         light_ns = 1 + round(1e9 * FRAME_S * number)
-        check.on_frame(
-            Frame.model_construct(
-                light_ns=light_ns,
-                world_from_sheet=np.eye(4),
-                marks_world_m=world,
-                marks_finger_ratio=np.zeros(len(world)),
-            )
-        )
+        show_marks(check, light_ns, world, np.zeros(len(world)))
         check.on_points(points, np.zeros(3), light_ns + 1)
     results = check.results(camera_checked=True)
     assert set(results) == {"projector_moved", "arm_base_moved"}
     assert results["projector_moved"].value == pytest.approx(0.0, abs=1e-9)
+
+
+def show_marks(check: ProjectionCheck, light_ns: int, world: Any, ratios: Any) -> None:
+    """Pass a frame of a sheet in the plane z = 0 to the check."""
+    check.on_frame(
+        Frame.model_construct(
+            light_ns=light_ns,
+            world_from_sheet=np.eye(4),
+            marks_world_m=world,
+            marks_finger_ratio=np.asarray(ratios),
+        )
+    )
 
 
 def check_heights(
@@ -243,14 +248,7 @@ def check_heights(
         expected = flat + np.array([0.0, 0.0, 1.0]) * (
             turning_rad_per_s * FRAME_S * number * flat[:, :1]
         )
-        check.on_frame(
-            Frame.model_construct(
-                light_ns=light_ns,
-                world_from_sheet=np.eye(4),
-                marks_world_m=expected,
-                marks_finger_ratio=np.asarray(ratios),
-            )
-        )
+        show_marks(check, light_ns, expected, np.asarray(ratios))
         seen = expected + np.outer(heights_m, [0.0, 0.0, 1.0])
         check.on_points(list(seen), np.zeros(3), light_ns + 100_000_000)
     return check
@@ -283,14 +281,7 @@ def test_a_point_belongs_to_one_mark_only() -> None:
     world = np.array([(0.0, 0.0, 0.0), (0.0, 0.003, 0.0), (0.05, 0.0, 0.0)])
     for number in range(60):
         light_ns = 1 + round(1e9 * FRAME_S * number)
-        check.on_frame(
-            Frame.model_construct(
-                light_ns=light_ns,
-                world_from_sheet=np.eye(4),
-                marks_world_m=world,
-                marks_finger_ratio=np.zeros(3),
-            )
-        )
+        show_marks(check, light_ns, world, np.zeros(3))
         hidden = world[[0, 2]]
         check.on_points(list(hidden), np.zeros(3), light_ns + 1)
     assert check.results(camera_checked=True)["projector_moved"].value == pytest.approx(0.0)

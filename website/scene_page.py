@@ -12,8 +12,8 @@ from pydantic.fields import FieldInfo
 from flexsheet.launch.objects.meshes import MeshFile
 from flexsheet.messages.field_types import describe_field_type
 from flexsheet.messages.scene import Lens, Mesh, Pose, Scene
+from flexsheet.messages.units import find_unit
 from website.messages_page import describe_bounds, format_table
-from website.parameters_page import unit
 
 LEAVES: tuple[type[BaseModel], ...] = (Pose, Lens)
 """The types that the page describes only once."""
@@ -140,7 +140,7 @@ def _rows(
             )  # fmt: skip
         else:
             effect = EFFECTS.get(prefix + name) or field.description or _tag_effect(field)
-            yield f"`{prefix}{name}`", _type(field), unit(name), _default(field), effect
+            yield f"`{prefix}{name}`", _type(field), find_unit(name), _default(field), effect
 
 
 def _tag_effect(field: FieldInfo) -> str:

@@ -48,6 +48,7 @@ from flexsheet.launch.plans.renamed_keys import (
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
+from flexsheet.messages.units import find_unit
 from flexsheet.nodes import NODES
 
 M = TypeVar("M", bound=BaseModel)
@@ -81,25 +82,6 @@ MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapp
 
 NUMBER_ERROR_TYPES = ("float_parsing", "float_type", "int_parsing", "int_type")
 """The types of pydantic errors for values that should be numbers."""
-
-KEY_UNITS = {
-    "_rad_per_s": "rad/s",
-    "_m_per_s2": "m/s²",
-    "_m_per_s": "m/s",
-    "_n_per_m": "N/m",
-    "_pa": "Pa",
-    "_rad": "rad",
-    "_deg": "degrees",
-    "_kg": "kg",
-    "_hz": "Hz",
-    "_px": "pixels",
-    "_ms": "ms",
-    "_mm": "mm",
-    "_m": "m",
-    "_s": "s",
-    "_n": "N",
-}
-"""The units by the ends of key names; the first end that fits counts."""
 
 Key = tuple[str | int, ...]
 """A path of a value in a document, such as ("nodes", "planner", "parameters", "max_age_s")."""
@@ -471,8 +453,9 @@ def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Ke
         return document.problem(key, what, f'it was renamed to "{renamed}"')
     if error["type"] in NUMBER_ERROR_TYPES:
         name = next((part for part in reversed(key) if isinstance(part, str)), "")
-        unit = next((unit for end, unit in KEY_UNITS.items() if name.endswith(end)), None)
-        remedy = "write a number" if unit is None else f"write a number in {unit}, without the unit"
+        unit = find_unit(name)
+        is_plain = unit in ("", "1")
+        remedy = "write a number" if is_plain else f"write a number in {unit}, without the unit"
         return document.problem(key, f"{_shorten(error['input'])} is invalid", remedy)
     raised = error.get("ctx", {}).get("error")
     message = str(raised) if isinstance(raised, Exception) else error["msg"]

@@ -42,6 +42,7 @@ The first row applies to cylinders on a strip support, for which the forces of a
 corrected. The second row applies to other bodies, whose tables use the linear response at small
 depths. The errors are valid for 95 % of the touchable nodes, with the demo's finger and a skin
 spacing of 4.5 mm. The first row was measured by `python -m benchmarks.soft_body --table`.
+The second row is derived from the first row and was not measured.
 """
 NOTED_DEPTHS_M = (0.001, 0.005)
 """The push depths (m) for which the node's status reports the error of the force."""
