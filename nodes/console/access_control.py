@@ -66,7 +66,7 @@ class ConsoleError(FlexsheetError, RuntimeError):
 def read_token(path: Path) -> str:
     """Read the access token from a file.
 
-    Raise ConsoleError if the file cannot be read, or if other users can read it. Also raise it if
+    Raises ConsoleError if the file cannot be read, or if other users can read it. Also raise it if
     the token is too short or contains characters other than letters and digits.
     """
     try:
@@ -93,7 +93,7 @@ class AccessControl:
 
     address: IP address of the page. token: required token; None permits every user of this
         computer.
-    Raise ConsoleError if the address is not a loopback address and there is no token.
+    Raises ConsoleError if the address is not a loopback address and there is no token.
     """
 
     def __init__(self, address: str, token: str | None) -> None:
@@ -243,7 +243,7 @@ def start_server(address: str, port: int, access: AccessControl, label: str) -> 
     """Start a viser server with access control at the requested address and port.
 
     label: heading of the control panel.
-    Raise ConsoleError if the port is in use, or if the installed version of viser does not support
+    Raises ConsoleError if the port is in use, or if the installed version of viser does not support
     the access control.
     """
     # viser uses the next free port if the requested port is in use, so test the port first.

@@ -116,7 +116,7 @@ class SceneController:
     def apply_sliders(self, now_s: float) -> bool:
         """Publish the changed scene and return True, if the sliders have stopped moving.
 
-        Raise SceneChoiceError for invalid slider positions.
+        Raises SceneChoiceError for invalid slider positions.
         """
         if self._due_s is None or now_s < self._due_s:
             return False
@@ -300,7 +300,7 @@ class Replay:
     def open(self, name: str) -> None:
         """Open a bag of the folder by its name, and play it from its start.
 
-        Raise BagError for a file that is not a readable bag.
+        Raises BagError for a file that is not a readable bag.
         """
         self.timeline = Timeline(self._folder / name)
         self.playing = True

@@ -22,7 +22,7 @@ class Ray:
     """A ray in the world frame that selects its first intersection with the object.
 
     direction: vector of any length except 0.
-    Raise ValueError for values that are not finite, and for a direction of length 0.
+    Raises ValueError for values that are not finite, and for a direction of length 0.
     """
 
     origin_m: tuple[float, float, float]
@@ -54,7 +54,7 @@ class FingerIntent:
     position: ray that selects a point on any object.
     depth_m: depth below the surface if the finger is not lifted.
     lifted: whether the finger hovers above the point.
-    Raise ValueError for a depth that is negative or not finite.
+    Raises ValueError for a depth that is negative or not finite.
     """
 
     position: Ray = field(default_factory=lambda: Ray.from_front(0.0, 0.0))

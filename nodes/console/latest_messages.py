@@ -18,7 +18,7 @@ class MessageSource(Protocol):
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
         """Return the latest message of a topic with its header, or None before the first message.
 
-        Raise TypeError if the message does not have the type `kind`.
+        Raises TypeError if the message does not have the type `kind`.
         """
         ...
 
@@ -46,7 +46,7 @@ class LatestMessages:
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
         """Return the latest message of a topic with its header, or None before the first message.
 
-        Raise TypeError if the message does not have the type `kind`.
+        Raises TypeError if the message does not have the type `kind`.
         """
         frames = self._frames.pop(name, None)
         if frames is not None:

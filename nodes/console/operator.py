@@ -293,7 +293,7 @@ class Operator:
     def _command_finger(self, command: Callable[..., None], *values: Any) -> None:
         """Pass a command to the finger's controller.
 
-        Raise ValueError if the command is refused. The page then shows the unchanged state.
+        Raises ValueError if the command is refused. The page then shows the unchanged state.
         """
         finger = self.controller.finger
         self._finger_shown_s = self._now_s + SETTLE_S

@@ -23,7 +23,7 @@ class Timeline:
     """A reader of the state that a recording had at a selected time.
 
     seconds: selected time since the start of the bag.
-    Raise BagError if the file is not a bag, or contains no topic that the page shows.
+    Raises BagError if the file is not a bag, or contains no topic that the page shows.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,7 +49,7 @@ class Timeline:
 
         kind: type of the message.
         Return None if there is no such message.
-        Raise TypeError if the message has another type.
+        Raises TypeError if the message has another type.
         """
         times, _ = self._positions.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1

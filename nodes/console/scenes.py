@@ -54,7 +54,7 @@ def edit_scene(
 
     size_ratio: size relative to the size in `scene`.
     The front of the object stays in place, and the object grows away from the user. A rigid object
-    stays rigid. Raise SceneChoiceError for invalid values.
+    stays rigid. Raises SceneChoiceError for invalid values.
     """
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
@@ -107,7 +107,7 @@ def _with(part: Any, **changes: Any) -> Any:
 def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
     """Scale a shape about its origin; return a plane unchanged.
 
-    Raise SceneChoiceError for a ratio that is not a positive number.
+    Raises SceneChoiceError for a ratio that is not a positive number.
     """
     if not (np.isfinite(ratio) and ratio > 0.0):
         raise SceneChoiceError(

@@ -31,7 +31,7 @@ class ConsoleState(BaseModel):
 def load_state(path: Path) -> ConsoleState | None:
     """Read the saved state of a console; return None if there is no file.
 
-    Raise SceneChoiceError for an invalid file.
+    Raises SceneChoiceError for an invalid file.
     """
     try:
         return ConsoleState.model_validate_json(path.read_bytes())

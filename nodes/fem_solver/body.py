@@ -61,7 +61,7 @@ def make_soft_body_spec(
     """Return the inputs of the precomputation for the object of a scene.
 
     skin_spacing_m: distance between skin nodes. sticking: whether the finger sticks to the skin.
-    Raise ValueError if the skin spacing exceeds the radius of the fingertip, or if the axis of a
+    Raises ValueError if the skin spacing exceeds the radius of the fingertip, or if the axis of a
     cylinder points to the user.
     """
     if skin_spacing_m > scene.finger.radius_m:
@@ -116,7 +116,7 @@ class SceneBody:
         """Return the response to a fingertip at `point_world` (3,), m, and the new contact anchor.
 
         anchor: contact anchor (pushed surface point) that the previous call returned, or None.
-            Raise ValueError for a point that is not finite.
+            Raises ValueError for a point that is not finite.
         """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
         if self.friction_ratio == 0.0:

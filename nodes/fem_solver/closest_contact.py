@@ -52,7 +52,7 @@ def locate(
     anchor: anchor that the previous call returned, or None. The contact point is usually the
     nearest surface point. It is the anchor if the fingertip is near the centre of curvature. It is
     also the anchor if the nearest point is on the far side of the body. Therefore a finger that is
-    pushed through a body remains in contact with the side that it entered. Raise ValueError for a
+    pushed through a body remains in contact with the side that it entered. Raises ValueError for a
     point that is not finite.
     """
     if not np.isfinite(point).all():
@@ -77,7 +77,7 @@ def locate_sticking(
     """Return the contact of a sticking fingertip at `point` (3,), m, and the next anchor.
 
     anchor: first contact point, to which the fingertip sticks, or None before contact. Pass the
-    returned anchor to the next call. Raise ValueError for a point that is not finite.
+    returned anchor to the next call. Raises ValueError for a point that is not finite.
     """
     query, new_anchor = locate(shape, point, anchor)
     if new_anchor is None or anchor is None:

@@ -342,7 +342,7 @@ def solve_penalty_contact(
     The energy of the forces f is 1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2. weights W (q,
     k): shape functions. compliance C (k, k): m/N. penalty d (q,): N/m. depths t (q,): m. Newton's
     method starts from Hertz's estimate that points deeper than half of the maximum depth are in
-    contact. After `FULL_STEPS` steps, a line search damps the method. Raise ArithmeticError if the
+    contact. After `FULL_STEPS` steps, a line search damps the method. Raises ArithmeticError if the
     method does not converge.
     """
     compliance_at_points = weights @ compliance

@@ -71,7 +71,7 @@ def connect_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[E
     """Connect to a dask scheduler, and yield an executor on its workers.
 
     Running jobs are stopped when the context exits. address: address of the scheduler, such as
-    tcp://host:8786. connect_s: timeout. Raise SchedulerError if the scheduler does not answer or
+    tcp://host:8786. connect_s: timeout. Raises SchedulerError if the scheduler does not answer or
     has no worker, or if a worker has another version of this project.
     """
     try:

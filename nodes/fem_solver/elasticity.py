@@ -31,7 +31,7 @@ class SolidMeshError(FlexsheetError, ValueError):
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
     """Return Lame's constants lambda and mu, in Pa.
 
-    Raise ValueError unless Young's modulus is positive and Poisson's ratio is above
+    Raises ValueError unless Young's modulus is positive and Poisson's ratio is above
     -1 and at most 0.4999.
     """
     if not (np.isfinite(young_modulus_pa) and young_modulus_pa > 0.0):
@@ -111,8 +111,8 @@ def element_stiffness(
 ) -> Floats:
     """Return the element stiffness matrices (e, 30, 30), N/m.
 
-    nodes (n, 3), m, elements (e, 10): mesh. Raise SolidMeshError for inverted or flat elements, and
-    ValueError for an invalid material.
+    nodes (n, 3), m, elements (e, 10): mesh. Raises SolidMeshError for inverted or flat elements,
+    and ValueError for an invalid material.
     """
     lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
     points, weights = quadrature()

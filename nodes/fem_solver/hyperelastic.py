@@ -95,7 +95,7 @@ class NeoHookeanSolid:
     def forces(self, displacement: Floats) -> Floats:
         """Return the elastic nodal forces (n, 3), N, which are the gradient of the energy.
 
-        displacement (n, 3): displacement of the nodes, m. Raise InvertedElementError if an element
+        displacement (n, 3): displacement of the nodes, m. Raises InvertedElementError if an element
         is inverted.
         """
         gradient, inverse, log = self._state(displacement)

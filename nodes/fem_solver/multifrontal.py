@@ -136,7 +136,7 @@ class NestedDissection:
         """Factor the stiffness matrix that is the sum of symmetric element matrices (e, 3k, 3k).
 
         float32 matrices need half of the time and memory of float64 matrices, but their
-        solutions have only about four digits. Raise IndefiniteError if the sum is not positive
+        solutions have only about four digits. Raises IndefiniteError if the sum is not positive
         definite.
         """
         dtype = matrices.dtype

@@ -223,7 +223,7 @@ class NeoHookeanBody:
             precision of the factors of the tangent stiffness; it affects only the search direction.
         mirror_axes: axes of planes of symmetry if the mesh is only one side of them. Then the
             forces are those of this side. finger_axis (3,): direction of the finger's shaft; None
-            for a sphere. Raise SolidMeshError for inverted elements and ValueError for an invalid
+            for a sphere. Raises SolidMeshError for inverted elements and ValueError for an invalid
             material.
         """
         self.solid = NeoHookeanSolid(
@@ -260,8 +260,8 @@ class NeoHookeanBody:
         start: displacement (n, 3) and sphere centre (3,) of a known equilibrium. If it is None, the
         sphere at the first centre must not touch the body. If a step does not converge, the last
         equilibrium is yielded with `reached` false for all remaining centres. A step with inverted
-        elements or with the sphere inside the body has not converged. Raise ValueError for a centre
-        that is not finite.
+        elements or with the sphere inside the body has not converged. Raises ValueError for a
+        centre that is not finite.
         """
         displacement, position = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
@@ -306,7 +306,7 @@ class NeoHookeanBody:
 
         The iteration starts at `displacement` or `guess` (n, 3), m. It uses the start with less
         energy. Return the displacement (n, 3) at equilibrium and the last factors of the tangent
-        stiffness. Raise NewtonNotConvergedError if the iteration does not converge.
+        stiffness. Raises NewtonNotConvergedError if the iteration does not converge.
         """
         nodes = self.solid.nodes
         if self._energy(guess, centre) < self._energy(displacement, centre):
@@ -377,7 +377,7 @@ class NeoHookeanBody:
     def _factorize(self, displacement: Floats, centre: Floats) -> Factors:
         """Factor the tangent stiffness. If it is not positive definite, regularize it first.
 
-        Raise NewtonNotConvergedError if no regularization makes it positive definite.
+        Raises NewtonNotConvergedError if no regularization makes it positive definite.
         """
         positions = self.solid.nodes + displacement
         elastic = self.solid.tangents(displacement)

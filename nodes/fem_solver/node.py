@@ -248,7 +248,7 @@ async def run_unless_superseded(
 
     compute: function that receives a progress callback. progress: this callback, with a stop event
     as an additional first argument. is_superseded: function that returns whether a newer request
-    has arrived. Raise Interrupted if a newer request arrives. The thread then ends later, and its
+    has arrived. Raises Interrupted if a newer request arrives. The thread then ends later, and its
     errors are ignored.
     """
     stop = Event()

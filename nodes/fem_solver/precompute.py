@@ -139,7 +139,7 @@ def compute_budget(
 def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
     """Estimate the resources of a precomputation within a factor of two, without building the mesh.
 
-    Raise UnfitMeshError if the skin spacing does not fit the object or requires too many nodes.
+    Raises UnfitMeshError if the skin spacing does not fit the object or requires too many nodes.
     """
     nodes = mesh_budget(spec.mesh)
     # Empirical numbers of skin nodes, and of touchable nodes among them.
@@ -324,7 +324,7 @@ def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
 def load_or_compute(spec: SoftBodySpec, cache_dir: Path, progress: Progress) -> SoftBodyModel:
     """Load the cached model, or compute and store it.
 
-    Raise SolidMeshError for a body without sufficient support, ValueError for an invalid material
+    Raises SolidMeshError for a body without sufficient support, ValueError for an invalid material
     or size, and MemoryError if the free memory is insufficient.
     """
     entry = response_cache(spec)

@@ -183,8 +183,8 @@ def compute_table(
 
     model: linear response of the same body. workers: number of workers of the executor on this
     computer. on_quick: function that receives a coarse table, which is ready much earlier than the
-    complete table; None to omit the coarse table. Raise MemoryError if this computer has too little
-    memory. Raise LostWorkersError if the executor loses its workers.
+    complete table; None to omit the coarse table. Raises MemoryError if this computer has too
+    little memory. Raises LostWorkersError if the executor loses its workers.
     """
     entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
@@ -303,7 +303,7 @@ def _collect(
     """Wait for all futures, and cancel the pending futures after an exception.
 
     waiting: indices by future. on_result: function that receives the index and the result of each
-    future. on_progress: function that is called periodically. Raise LostWorkersError if the
+    future. on_progress: function that is called periodically. Raises LostWorkersError if the
     executor loses its workers, and the errors of the futures.
     """
     try:
@@ -338,7 +338,7 @@ def solve_all(
 
     on_progress: function that receives the number of finished snapshots. It may raise an exception
     to cancel the pending jobs. names: names of the stored snapshots; empty for "push-0000" and so
-    on. Raise LostWorkersError if the executor loses its workers, and the errors of the jobs.
+    on. Raises LostWorkersError if the executor loses its workers, and the errors of the jobs.
     """
     names = names or [f"push-{number:04d}" for number in range(len(jobs))]
     solved: dict[int, snapshots.Snapshot] = {}

@@ -114,7 +114,7 @@ class Snapshot:
 def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False) -> Snapshot:
     """Compute the snapshot that a job describes.
 
-    stopped: function that returns true to cancel the solution. Raise SnapshotCancelledError if the
+    stopped: function that returns true to cancel the solution. Raises SnapshotCancelledError if the
     solution is cancelled, SolidMeshError for inverted elements, and ValueError for an invalid
     material.
     """

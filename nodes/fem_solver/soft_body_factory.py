@@ -72,7 +72,7 @@ class SoftBodyFactory:
     ) -> list[body.SceneBody]:
         """Build the soft body of a scene for each available method, starting with the best method.
 
-        Raise SolidMeshError for a body without sufficient support, ValueError for an invalid
+        Raises SolidMeshError for a body without sufficient support, ValueError for an invalid
         material, size or depth, and MemoryError if the free memory is insufficient.
         """
         spec = body.make_soft_body_spec(
@@ -144,7 +144,7 @@ class SoftBodyFactory:
         """Compute and cache the nonlinear table, and return the body that uses it.
 
         linear: body with the linear method. on_quick: function that receives a body with a coarse
-        table of few snapshots; None to omit the coarse table. Raise WorkersError if the workers
+        table of few snapshots; None to omit the coarse table. Raises WorkersError if the workers
         cannot be used or are lost, and MemoryError if the free memory is insufficient.
         """
         model = self._load_model(linear.spec, progress)

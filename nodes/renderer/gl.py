@@ -217,7 +217,7 @@ class Canvas:
     def set_shape(self, positions: Floats, normals: Floats) -> None:
         """Set the current positions (n, 3), m, and unit normals (n, 3) of the object's vertices.
 
-        Raise RuntimeError if `set_mesh` has not been called.
+        Raises RuntimeError if `set_mesh` has not been called.
         """
         if self._object is None:
             raise RuntimeError("the canvas has no mesh; call set_mesh before set_shape")
@@ -226,7 +226,7 @@ class Canvas:
     def set_moved(self, moved: NDArray[np.float32]) -> None:
         """Set positions (m) and normals of the object's vertices, given as one array (n, 6).
 
-        The normals may have any length. Raise RuntimeError if `set_mesh` has not been called.
+        The normals may have any length. Raises RuntimeError if `set_mesh` has not been called.
         """
         if self._object is None:
             raise RuntimeError("the canvas has no mesh; call set_mesh before set_moved")
@@ -301,7 +301,7 @@ class Canvas:
         """Return the vertex positions after the image correction, as the shader computes them.
 
         The result (n, 4) contains positions (m) and validity (0 or 1). Tests compare the result
-        with a reference. Raise RuntimeError if `set_mesh` has not been called.
+        with a reference. Raises RuntimeError if `set_mesh` has not been called.
         """
         if self._object is None:
             raise RuntimeError("the canvas has no mesh; call set_mesh before shifted_points")
@@ -411,7 +411,7 @@ class _MeshBuffers:
     def move(self, moved: NDArray[np.float32]) -> None:
         """Set the current positions (m) and normals of the vertices, given as one array (n, 6).
 
-        Raise ValueError if the array has another shape.
+        Raises ValueError if the array has another shape.
         """
         if moved.shape != (self.count, 6):
             raise ValueError(
@@ -489,7 +489,7 @@ def is_software(context: moderngl.Context) -> bool:
 
 
 def headless_context() -> moderngl.Context:
-    """Return an OpenGL 3.3 context without a window. Raise NoOpenGLError if the library EGL
+    """Return an OpenGL 3.3 context without a window. Raises NoOpenGLError if the library EGL
     provides none.
     """
     limit_driver_threads()

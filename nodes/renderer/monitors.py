@@ -50,7 +50,7 @@ def glfw_errors() -> Iterator[None]:
 
 
 def start_glfw() -> None:
-    """Initialize the window library GLFW. Raise WindowError if there is no display."""
+    """Initialize the window library GLFW. Raises WindowError if there is no display."""
     glfw.ERROR_REPORTING = "raise"
     try:
         with glfw_errors():
@@ -76,7 +76,7 @@ def monitor_names() -> list[str]:
 def find_monitor(monitor: str | int) -> Any:
     """Return the GLFW monitor with a number or name.
 
-    Raise WindowError if there is no such monitor, or if several monitors have this name.
+    Raises WindowError if there is no such monitor, or if several monitors have this name.
     """
     monitors, names = glfw.get_monitors(), monitor_names()
     key = monitor
@@ -118,7 +118,7 @@ def refresh_period_s(monitor: Any) -> float:
 def hidden_window() -> Any:
     """Return an invisible window, whose OpenGL context is used for drawing.
 
-    Raise WindowError if the window cannot be opened.
+    Raises WindowError if the window cannot be opened.
     """
     return _create((1, 1), {glfw.VISIBLE: False})
 
@@ -130,7 +130,7 @@ def open_window(
 
     size: width and height, px. monitor: monitor of a full-screen window; None for an ordinary
     window. stereo: whether to request quad buffering (separate buffers for each eye). Return the
-    window, and whether it is quad-buffered. Raise WindowError if the monitor has no mode of this
+    window, and whether it is quad-buffered. Raises WindowError if the monitor has no mode of this
     size.
     """
     width, height = size

@@ -72,7 +72,7 @@ def make_surface(
 
     shape: shape of the geometry, which provides true points and normals. world_from_object (4, 4):
     pose. A plane is drawn as a rectangle, and a mesh as the smooth surface that its shape defines.
-    Raise ValueError for a spacing that needs too many triangles.
+    Raises ValueError for a spacing that needs too many triangles.
     """
     match geometry:
         case Cylinder(radius_m=radius, length_m=length):
@@ -225,8 +225,8 @@ class DeformationTransfer:
         """Compute the interpolation weights between a drawn surface and the skin.
 
         skin_vertices (s, 3): vertices at rest, world frame, m. skin_triangles (t, 3):
-        counter-clockwise as seen from outside. Raise ValueError if all triangles have zero area, or
-        if a coordinate is not finite.
+        counter-clockwise as seen from outside. Raises ValueError if all triangles have zero area,
+        or if a coordinate is not finite.
         """
         self.vertices = len(skin_vertices)
         self._weights = transfer_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
@@ -242,7 +242,7 @@ class DeformationTransfer:
         """Return positions (m) and normals, (n, 6), of the deformed drawn surface.
 
         displacement (s, 3): displacement of the skin's vertices, m; None for the surface at rest.
-        The length of the normals is arbitrary. Raise ValueError for a wrong shape of the array, or
+        The length of the normals is arbitrary. Raises ValueError for a wrong shape of the array, or
         for values that are not finite.
         """
         if displacement is None:
@@ -271,7 +271,7 @@ def transfer_matrix(
     """Return the matrix (n, s), float32, that interpolates skin values at points (n, 3).
 
     Each row contains the barycentric weights of the nearest point of the skin. skin_vertices (s,
-    3), skin_triangles (t, 3): skin. Triangles without area are ignored. Raise ValueError if all
+    3), skin_triangles (t, 3): skin. Triangles without area are ignored. Raises ValueError if all
     triangles have zero area, or if a vertex is not finite.
     """
     if not np.isfinite(skin_vertices).all():

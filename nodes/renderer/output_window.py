@@ -79,7 +79,7 @@ def open_output(
     """Open the output that the parameters select: offscreen, or a window.
 
     now_ns: function that returns the current time. shown: function that receives the tag and the
-    swap time, ns, of each shown image. Raise WindowError if the window cannot be opened, and
+    swap time, ns, of each shown image. Raises WindowError if the window cannot be opened, and
     NoOpenGLError without OpenGL 3.3.
     """
     if parameters.output == "headless":
@@ -111,7 +111,7 @@ class ProjectorWindow:
         monitor: name or number; None for an ordinary window, for tests. swap_interval: number of
         monitor refreshes per shown image. With 0, swaps do not wait for the refresh, and images may
         tear. now_ns: function that returns the current time. shown: function that receives the tag
-        and the swap time, ns, of each shown image. Raise WindowError if there is no display or no
+        and the swap time, ns, of each shown image. Raises WindowError if there is no display or no
         such monitor.
         """
         limit_driver_threads()
@@ -132,7 +132,7 @@ class ProjectorWindow:
     def open(self, size: tuple[int, int]) -> None:
         """Open the window for images of a size (width, height), px, unless it is already open.
 
-        Raise WindowError if the monitor has no mode of this size.
+        Raises WindowError if the monitor has no mode of this size.
         """
         if self._presenter is not None and self._slots[0].textures[0].size == size:
             return

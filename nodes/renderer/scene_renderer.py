@@ -106,7 +106,7 @@ class SceneRenderer:
         spacing_m: distance between the vertices of the object. samples: samples per pixel; None for
         `SAMPLES`, without multisampling in the first pass of two_pass with a software driver.
         basis: deflection shapes of the sheet; None to draw a pushed sheet as four triangles.
-        sheet_shape: method that computes the shape of the sheet. Raise ValueError if the
+        sheet_shape: method that computes the shape of the sheet. Raises ValueError if the
         projector's lens maps several rays to one pixel.
         """
         projector, geometry = require_projector(scene), scene.object.geometry
@@ -176,7 +176,7 @@ class SceneRenderer:
     def deform(self, body: SoftBody | None) -> None:
         """Deform the drawn surface by the displacements from the soft-body solver.
 
-        body: message of the solver; None to draw the surface at rest. Raise ValueError, without a
+        body: message of the solver; None to draw the surface at rest. Raises ValueError, without a
         change of the surface, if the displacement does not fit the current skin or is not finite.
         """
         if body is self._drawn_body:
@@ -259,7 +259,7 @@ class SceneRenderer:
         eyes (1 or 2, 3): positions, world frame, m; None for the eyes of the scene. Two eyes share
         the image, except in the mode frame_sequential. This mode has two images, of which the image
         of the left eye is returned. drawn: function that receives the index of each image when the
-        image is in `canvas.resolved`. Raise ValueError if the sheet's pose is not finite.
+        image is in `canvas.resolved`. Raises ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite; check the poses of the arms")

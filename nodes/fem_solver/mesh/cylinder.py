@@ -71,7 +71,7 @@ def cylinder_mesh(
     nodes. focus: point around which the mesh is fine; None for a mesh that is fine on all touchable
     skin. mirror_axes: axes of planes of symmetry through the focus, 0 for x = 0 and 1 for y = 0.
     The mesh contains only the half with positive coordinates. Elements are larger inside and at the
-    back of the cylinder. Raise ValueError for a spacing that is too large for the cylinder, or for
+    back of the cylinder. Raises ValueError for a spacing that is too large for the cylinder, or for
     invalid angles.
     """
     half_support = 0.5 * support_angle_rad

@@ -92,7 +92,7 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
     """Return nodes (n, 3) and elements (e, 10) of the solid inside the surface of a shape.
 
     low_m, high_m (3,): corners of the bounding box of the shape. grading: required element sizes.
-    Raise UnfitMeshError for a shape that is too thin for elements of these sizes.
+    Raises UnfitMeshError for a shape that is too thin for elements of these sizes.
     """
     cell = INITIAL_CELL_RATIO * grading.element_m
     field = _SurfaceCache(shape, 0.5 * (low_m + high_m), cell)
@@ -194,7 +194,7 @@ def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
     pinches.
 
     Vertices where the boundary touches itself are removed from `core` (n,), in place. distance
-    (n,): signed distance (m) of the vertices from the surface. Raise UnfitMeshError if the object
+    (n,): signed distance (m) of the vertices from the surface. Raises UnfitMeshError if the object
     is too thin.
     """
     before = int(core.sum())

@@ -113,7 +113,7 @@ class MeshBudget:
 def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
     """Return the specification of the mesh of a scene.
 
-    skin_spacing_m: distance between skin nodes. Raise ValueError if the axis of a cylinder points
+    skin_spacing_m: distance between skin nodes. Raises ValueError if the axis of a cylinder points
     to the user.
     """
     body = scene.object
@@ -142,7 +142,7 @@ def world_from_mesh(scene: Scene) -> Floats:
     """Return the pose (4, 4) of the mesh frame in the world.
 
     The pose is that of the object. For a cylinder, it is also rotated about the axis so that z
-    points to the user. Raise ValueError if the axis of a cylinder points to the user, because its
+    points to the user. Raises ValueError if the axis of a cylinder points to the user, because its
     side cannot be touched.
     """
     world_from_object = _world_from_object(scene)
@@ -178,7 +178,7 @@ def _rounded(vector: Floats) -> Vector:
 def mesh_budget(spec: MeshSpec) -> MeshBudget:
     """Estimate the resources that are needed to build a mesh. The estimate takes at most a second.
 
-    Raise UnfitMeshError for a skin spacing that does not fit the object or requires more than
+    Raises UnfitMeshError for a skin spacing that does not fit the object or requires more than
     `MAX_NODES` nodes.
     """
     return _budget(spec, make_shape(dict(spec.geometry)))
@@ -190,7 +190,7 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     Nodes are half an element size apart. Therefore the number of inner nodes is about the integral
     of (2 / element size)^3 over the volume. The number of skin nodes is about the integral of (2 /
     element size)^2 over the surface. Measured factors such as `INNER_FACTOR` correct both numbers.
-    Raise UnfitMeshError for a skin spacing that does not fit the object or requires more than
+    Raises UnfitMeshError for a skin spacing that does not fit the object or requires more than
     `MAX_NODES` nodes.
     """
     low, high = _box(spec)
@@ -242,8 +242,8 @@ def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
 def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
     """Mesh the object of a scene in the mesh frame.
 
-    skin_spacing_m: distance between skin nodes. Raise UnfitMeshError for an object, a spacing or a
-    support that cannot be meshed. Raise ValueError if the axis of a cylinder points to the user.
+    skin_spacing_m: distance between skin nodes. Raises UnfitMeshError for an object, a spacing or a
+    support that cannot be meshed. Raises ValueError if the axis of a cylinder points to the user.
     """
     return build_mesh(mesh_spec(scene, skin_spacing_m))
 
@@ -251,7 +251,7 @@ def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
 def build_mesh(spec: MeshSpec) -> SolidMesh:
     """Build the mesh that a specification describes.
 
-    Raise UnfitMeshError for a skin spacing that does not fit the object or requires more than
+    Raises UnfitMeshError for a skin spacing that does not fit the object or requires more than
     `MAX_NODES` nodes. Also raise this error if the object is too thin for the elements, or if the
     support fixes too few nodes or all touchable skin.
     """

@@ -63,7 +63,7 @@ def map_lattice(template: CuboidMap, vertices: Ints, half_cells: Ints) -> tuple[
 def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Floats, Ints]:
     """Return nodes (n, 3), m, object frame, and elements (e, 10) of the solid inside a shape.
 
-    template: map from the cube to the shape. grading: required element sizes. Raise UnfitMeshError
+    template: map from the cube to the shape. grading: required element sizes. Raises UnfitMeshError
     if the elements of all tried meshes are too distorted.
     """
 

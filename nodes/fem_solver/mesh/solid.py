@@ -134,7 +134,7 @@ def number_slabs(nodes: Floats, elements: Ints) -> Ints:
     """Divide the mesh into slabs along its longest axis, and return the slab index (n,) of each
     node.
 
-    The nodes of one element are in at most two successive slabs. Raise UnfitMeshError if the mesh
+    The nodes of one element are in at most two successive slabs. Raises UnfitMeshError if the mesh
     consists of several separate components.
     """
     axis = int(np.ptp(nodes, axis=0).argmax())
@@ -162,7 +162,7 @@ def make_solid_mesh(
 
     touchable, fixed (n,): whether each node can be touched, and whether each node is fixed. normals
     (n, 3): outward normals at touchable nodes. A face is touchable if all its nodes are touchable
-    and none is fixed. Raise UnfitMeshError if no face is touchable, or if the mesh consists of
+    and none is fixed. Raises UnfitMeshError if no face is touchable, or if the mesh consists of
     several components.
     """
     level = number_slabs(nodes, elements)

@@ -24,7 +24,7 @@ def select_fixed(
 
     All vectors are in the object frame. points (n, 3): skin points, m. normals (n, 3): outward unit
     normals at the points. towards_user (3,): unit vector to the user. down (3,): downward vector of
-    any length, for a base support. Raise UnfitMeshError if all fixed points are collinear.
+    any length, for a base support. Raises UnfitMeshError if all fixed points are collinear.
     """
     chosen: Bools
     match support:

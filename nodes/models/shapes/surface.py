@@ -157,7 +157,7 @@ def check_points(points: ArrayLike, name: str = "points") -> Floats:
 def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
     """Convert the nearest points of the previous query to a float array; return None for None.
 
-    Raise ValueError if their shape differs from that of `points`.
+    Raises ValueError if their shape differs from that of `points`.
     """
     if previous is None:
         return None
