@@ -322,14 +322,7 @@ def identify_scene(scene: Scene) -> str:
 
 def devices_of(scene: Scene) -> Devices:
     """Return the parameters of the camera, arms, sheet, projector, eyes and finger of a scene."""
-    return Devices(
-        camera=scene.camera,
-        arms=scene.arms,
-        sheet=scene.sheet,
-        projector=scene.projector,
-        eyes=scene.eyes,
-        finger=scene.finger,
-    )
+    return Devices(**{name: getattr(scene, name) for name in Devices.model_fields})
 
 
 def nominal_apparatus(scene: Scene) -> Apparatus:

@@ -311,6 +311,17 @@ class ChannelDecoder:
     fingerprint: bytes
     migrate: Migration
 
+    def decode(self, frames: list[memoryview]) -> tuple[Message, Header]:
+        """Decode a message and convert it to the current message type.
+
+        Raises WireError if the message is invalid.
+        """
+        envelope = read_envelope(
+            frames, self.topic, fingerprint=self.fingerprint, type_name=self.recorded_type
+        )
+        envelope.fields = self.migrate(envelope.fields)
+        return envelope.open(), envelope.header
+
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
@@ -412,7 +423,7 @@ class BagReader:
         }
         for number, (name, frames, log_time_ns) in enumerate(self.frames()):
             try:
-                message, header = _decode(frames, decoders[name])
+                message, header = decoders[name].decode(frames)
             except WireError as error:
                 raise BagError(
                     f'{self.path}: topic "{name}", message {number} at {log_time_ns} ns: {error}'
@@ -427,7 +438,7 @@ class BagReader:
         Raises BagError if the record is invalid.
         """
         try:
-            return _decode(split_frames(record.data), self._make_decoder(channel))
+            return self._make_decoder(channel).decode(split_frames(record.data))
         except WireError as error:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" at {record.log_time} ns: {error}'
@@ -539,17 +550,11 @@ class BagReader:
         first = True
         while True:
             head = _read_at(file, offset, _RECORD_HEAD.size)
-            if len(head) < _RECORD_HEAD.size:
+            opcode, length = _RECORD_HEAD.unpack(head.ljust(_RECORD_HEAD.size, b"\0"))
+            if offset + _RECORD_HEAD.size + length > size or opcode == 0:
                 self.problem = f"truncated after {offset} of {size} bytes: it was not closed"
                 break
-            opcode, length = _RECORD_HEAD.unpack(head)
             offset += _RECORD_HEAD.size
-            if offset + length > size or opcode == 0:
-                self.problem = (
-                    f"truncated after {offset - _RECORD_HEAD.size} of {size} bytes: "
-                    "it was not closed"
-                )
-                break
             if first and opcode != Opcode.HEADER:
                 raise BagError(
                     f"{self.path}: this is not a bag; its first record is not an MCAP header"
@@ -715,18 +720,6 @@ def _find_type_name(channel: mcap_records.Channel) -> str:
     """Return the name of a channel's message type, or the current name if the type was renamed."""
     recorded = channel.metadata.get("type", "")
     return RENAMED_TYPES.get(recorded, recorded)
-
-
-def _decode(frames: list[memoryview], decoder: ChannelDecoder) -> tuple[Message, Header]:
-    """Decode a message and convert it to the current message type.
-
-    Raises WireError if the message is invalid.
-    """
-    envelope = read_envelope(
-        frames, decoder.topic, fingerprint=decoder.fingerprint, type_name=decoder.recorded_type
-    )
-    envelope.fields = decoder.migrate(envelope.fields)
-    return envelope.open(), envelope.header
 
 
 def info(path: Path | str) -> BagInfo:

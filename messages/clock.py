@@ -20,11 +20,6 @@ class Clock(Protocol):
     def now_ns(self) -> int: ...
 
 
-def read_boot_id() -> str:
-    """Return the random identifier that the kernel assigned to the current boot of this host."""
-    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-
-
 def read_namespace_offset() -> str:
     """Return the offset (s) of CLOCK_MONOTONIC in the time namespace of this process.
 
@@ -44,11 +39,9 @@ class SystemClock:
     """The system clock CLOCK_MONOTONIC, which all processes of this host share."""
 
     def __init__(self) -> None:
-        self._id = f"{host_name()}-{read_boot_id()[:8]}{read_namespace_offset()}"
-
-    @property
-    def id(self) -> str:
-        return self._id
+        # The kernel assigns a random identifier to each boot.
+        boot_id = Path("/proc/sys/kernel/random/boot_id").read_text()
+        self.id = f"{host_name()}-{boot_id[:8]}{read_namespace_offset()}"
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
@@ -59,11 +52,7 @@ class VirtualClock:
 
     def __init__(self, start_ns: int = 0, *, clock_id: str = "virtual") -> None:
         self._now_ns = start_ns
-        self._id = clock_id
-
-    @property
-    def id(self) -> str:
-        return self._id
+        self.id = clock_id
 
     def now_ns(self) -> int:
         return self._now_ns

@@ -15,27 +15,19 @@ from flexsheet.messages.arrays import ArraySpec
 
 def describe_field_type(field: FieldInfo) -> str:
     """Return the type of a field as Markdown, with a link for each nested model."""
-    for extra in field.metadata:
-        if isinstance(extra, ArraySpec):
-            return _array(extra)
-    return _type(field.annotation)
+    return _type(get_annotation(field))
 
 
 def describe_field(field: FieldInfo) -> dict[str, str]:
     """Return the type (as plain text), the default value and the description of a field."""
+    default = "empty" if field.default_factory is not None else str(field.default)
     # Replace Markdown links by their text.
     kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", describe_field_type(field))
     return {
         "type": re.sub(r"[`\\]", "", kind),
-        "default": "required" if field.is_required() else _default(field),
+        "default": "required" if field.is_required() else default,
         "description": field.description or "",
     }
-
-
-def _default(field: FieldInfo) -> str:
-    if field.default_factory is not None:
-        return "empty"
-    return str(field.default)
 
 
 def get_annotation(field: FieldInfo) -> Any:
@@ -67,10 +59,10 @@ def is_image(spec: ArraySpec) -> bool:
 
 
 def _type(annotation: Any) -> str:
+    annotation, spec = split_annotation(annotation)
+    if spec is not None:
+        return f"{np.dtype(spec.dtype).name} {spec.describe_shape()}"
     origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        spec = next((extra for extra in arguments[1:] if isinstance(extra, ArraySpec)), None)
-        return _array(spec) if spec else _type(arguments[0])
     if origin is Literal:
         return " \\| ".join(f"`{value}`" for value in arguments)
     if origin in (Union, UnionType):
@@ -84,7 +76,3 @@ def _type(annotation: Any) -> str:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
     return getattr(annotation, "__name__", str(annotation))
-
-
-def _array(spec: ArraySpec) -> str:
-    return f"{np.dtype(spec.dtype).name} {spec.describe_shape()}"

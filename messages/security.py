@@ -165,15 +165,6 @@ class KeyRing:
         self._host_by_key: dict[str, str] = {}
         self.reload()
 
-    def get_public_key(self, host: str) -> str:
-        """Return the public key of a host. Raises SecurityError if the host has no key."""
-        key = self.public.get(host)
-        if key is None:
-            raise SecurityError(
-                f'host "{host}" has no key in the launch file; add its key to `hosts`'
-            )
-        return key
-
     def find_host(self, key: str) -> str | None:
         """Return the name of the host with a public key, or None if no host has this key."""
         return self._host_by_key.get(key)
@@ -232,7 +223,11 @@ class KeyRing:
         This applies to all endpoints that are connected after this call. Raises SecurityError if
         the host has no key.
         """
-        opened.setsockopt(zmq.CURVE_SERVERKEY, self.get_public_key(host).encode())
+        if host not in self.public:
+            raise SecurityError(
+                f'host "{host}" has no key in the launch file; add its key to `hosts`'
+            )
+        opened.setsockopt(zmq.CURVE_SERVERKEY, self.public[host].encode())
         opened.setsockopt(zmq.CURVE_PUBLICKEY, self.public_key.encode())
         opened.setsockopt(zmq.CURVE_SECRETKEY, self.secret_key.encode())
 

@@ -38,9 +38,6 @@ class Interval:
     low: float
     high: float
 
-    def as_dict(self) -> dict[str, float]:
-        return {"value": self.value, "low": self.low, "high": self.high}
-
 
 def estimate_rms(errors: NDArray[np.float64]) -> Interval:
     """Estimate the root mean square of independent errors (n,), with its confidence interval.

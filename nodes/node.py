@@ -391,7 +391,7 @@ class Node:
         self.changed_parameters: dict[str, Any] = {}
         self.self_checks: tuple[SelfCheck, ...] = ()
         self.started_ns = clock.now_ns()
-        self._execution_log = ExecutionLog(clock)
+        self.execution_log = ExecutionLog(clock)
         if epoch is None:
             epoch = self.started_ns
         declared = find_ports(type(self))
@@ -406,9 +406,8 @@ class Node:
             if port.direction == "input":
                 self.inputs[port.name] = Input(topic, clock)
                 if not self.opens_devices:
-                    number = len(self.inputs) - 1
                     self.inputs[port.name].on_accept = partial(
-                        self._execution_log.add_message, number
+                        self.execution_log.add_message, len(self.inputs) - 1
                     )
                 setattr(self, port.name, self.inputs[port.name])
             else:
@@ -505,19 +504,13 @@ class Node:
         except Exception as error:
             self.report_error(what, error)
 
-    def drain_execution_log(self) -> NDArray[np.int64]:
-        """Return the log of handler calls for the next status message. `Status.execution_log`
-        describes the rows.
-        """
-        return self._execution_log.drain()
-
     async def call_timer(self, number: int, timer: Timer) -> None:
         """Call a periodic method, and add the call to the execution log.
 
         number: index of the method in the list of timers.
         """
         if not self.opens_devices:
-            self._execution_log.add_timer(number)
+            self.execution_log.add_timer(number)
         await self.call(timer.method, getattr(self, timer.method))
 
     def report_error(self, what: str, error: Exception) -> None:
@@ -531,15 +524,11 @@ class Node:
 
         Any thread may call this method.
         """
-        return self._mailboxes[port].has_waiting
+        return bool(self._mailboxes[port].waiting)
 
     def mailbox_tasks(self) -> list[asyncio.Task[None]]:
         """Return the tasks in which coroutine handlers run."""
         return [box.task for box in self._mailboxes.values() if box.task is not None]
-
-    def stop_mailboxes(self) -> None:
-        for mailbox in self._mailboxes.values():
-            mailbox.stop()
 
 
 class Mailbox:
@@ -553,12 +542,12 @@ class Mailbox:
         latest = self._input.topic.delivery is Delivery.LATEST
         self._capacity = 1 if latest else EVERY_QUEUE_LENGTH
         self._overflow_is_error = not latest
-        self._waiting: deque[tuple[Message, Header, str]] = deque()
+        self.waiting: deque[tuple[Message, Header, str]] = deque()
         self.task: asyncio.Task[None] | None = None
 
     def put(self, message: Message, header: Header, clock_problem: str) -> None:
-        if len(self._waiting) >= self._capacity:
-            self._waiting.popleft()
+        if len(self.waiting) >= self._capacity:
+            self.waiting.popleft()
             self._input.counts.dropped += 1
             if self._overflow_is_error:
                 self._node.report_error(
@@ -568,19 +557,10 @@ class Mailbox:
                         "lost; reduce the rate of the topic"
                     ),
                 )
-        self._waiting.append((message, header, clock_problem))
+        self.waiting.append((message, header, clock_problem))
         if self.task is None or self.task.done():
             self.task = asyncio.get_running_loop().create_task(self._drain())
 
-    @property
-    def has_waiting(self) -> bool:
-        """Return whether a message is in the queue."""
-        return bool(self._waiting)
-
     async def _drain(self) -> None:
-        while self._waiting:
-            await self._node.handle(self._port, *self._waiting.popleft())
-
-    def stop(self) -> None:
-        if self.task is not None:
-            self.task.cancel()
+        while self.waiting:
+            await self._node.handle(self._port, *self.waiting.popleft())

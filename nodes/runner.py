@@ -145,15 +145,12 @@ class NodeTransport:
             subscriber.start()
             self._subscribers.append(subscriber)
 
-        def deliver_to(port: str) -> Any:
-            return lambda message, header: node.deliver(port, message, header)
-
         for config in self._config.inputs:
             node_input = node.inputs[config.port]
             subscriber = Subscriber(
                 node_input.topic,
                 config.endpoints,
-                deliver_to(config.port),
+                partial(node.deliver, config.port),
                 node_input.counts,
                 on_problem=partial(self._report_problem, node),
                 raw=node.takes_frames,
@@ -318,7 +315,7 @@ def make_status(node: Node, state: Any, process: psutil.Process) -> Status:
         plan_hash=node.plan_hash,
         clock_id=node.clock.id,
         clock_offsets=tuple(node.clock_table.offsets.values()),
-        execution_log=node.drain_execution_log(),
+        execution_log=node.execution_log.drain(),
         self_checks=node.self_checks,
         changed_parameters=json.dumps(node.changed_parameters),
     )

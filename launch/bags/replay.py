@@ -259,7 +259,8 @@ async def _set_up(node: Node, result: ReplayResult) -> AsyncIterator[None]:
         yield
         await node.settle()
     finally:
-        node.stop_mailboxes()
+        for task in node.mailbox_tasks():
+            task.cancel()
         await node.close()
         result.errors += node.errors
         result.last_error = node.last_error or result.last_error

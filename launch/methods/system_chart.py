@@ -10,7 +10,7 @@ trial is a separate process.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -329,13 +329,13 @@ def summarize_configuration(
         "meets_tolerances": not failing,
         "failing": failing,
         "spread": {
-            key: one.as_dict()
+            key: asdict(one)
             for key, one in {"cpu_cores": cores, **intervals}.items()
             if one is not None
         },
-        "tolerance_ratios": {key: one.as_dict() for key, one in ratios.items() if one is not None},
+        "tolerance_ratios": {key: asdict(one) for key, one in ratios.items() if one is not None},
         "ratio_to_control": {
-            key: one.as_dict()
+            key: asdict(one)
             for key in COMPARED
             if (
                 one := compare_paired(

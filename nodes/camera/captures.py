@@ -58,6 +58,7 @@ class CapturedDevice(ABC):
 
     stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if unknown.
     wanted: requested value of each OpenCV property of the image format.
+    actual: values of OpenCV properties that are constant after the start.
     """
 
     def __init__(self, device: str) -> None:
@@ -69,6 +70,7 @@ class CapturedDevice(ABC):
             cv2.CAP_PROP_FRAME_HEIGHT: 480.0,
             cv2.CAP_PROP_FPS: 30.0,
         }
+        self.actual: dict[int, float] = {}
         self.started = False
 
     @abstractmethod
@@ -104,7 +106,7 @@ class CapturedDevice(ABC):
         return False
 
     def _get_control(self, property_id: int) -> float:
-        return 0.0
+        return self.actual.get(property_id, 0.0)
 
     def retrieve(self) -> tuple[bool, Image | None]:
         """Return the grey image (height, width) that was grabbed last, as (True, image).
@@ -254,7 +256,12 @@ class RealSenseCapture(CapturedDevice):
             if self._sensor.supports(option):
                 self._sensor.set_option(option, value)
         stream = profile.get_stream(rs.stream.infrared, 1).as_video_stream_profile()
-        self._format = (2.0 * stream.width(), float(stream.height()), float(stream.fps()))
+        self.actual = {
+            cv2.CAP_PROP_FRAME_WIDTH: 2.0 * stream.width(),
+            cv2.CAP_PROP_FRAME_HEIGHT: float(stream.height()),
+            cv2.CAP_PROP_FPS: float(stream.fps()),
+            cv2.CAP_PROP_FOURCC: float(cv2.VideoWriter.fourcc(*"GREY")),
+        }
 
     def _option(self, property_id: int) -> Any:
         option = self._rs.option
@@ -275,14 +282,9 @@ class RealSenseCapture(CapturedDevice):
         return True
 
     def _get_control(self, property_id: int) -> float:
-        sizes = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
-        if property_id in sizes:
-            return self._format[sizes.index(property_id)]
-        if property_id == cv2.CAP_PROP_FOURCC:
-            return float(cv2.VideoWriter.fourcc(*"GREY"))
         option = self._option(property_id)
         if option is None or not self._sensor.supports(option):
-            return 0.0
+            return super()._get_control(property_id)
         return float(self._sensor.get_option(option))
 
     def grab(self) -> bool:
@@ -330,7 +332,6 @@ class GstreamerCapture(CapturedDevice):
         self._gst = _import_introspected("Gst", "1.0")
         self._gst.init(None)
         self._pipeline: Any = None
-        self._size = (0.0, 0.0, 0.0)
 
     def _start(self) -> None:
         gst = self._gst
@@ -363,7 +364,11 @@ class GstreamerCapture(CapturedDevice):
         buffer, caps = sample.get_buffer(), sample.get_caps().get_structure(0)
         width, height = caps.get_value("width"), caps.get_value("height")
         found, rate, per = caps.get_fraction("framerate")
-        self._size = float(width), float(height), rate / per if found and per else 0.0
+        self.actual = {
+            cv2.CAP_PROP_FRAME_WIDTH: float(width),
+            cv2.CAP_PROP_FRAME_HEIGHT: float(height),
+            cv2.CAP_PROP_FPS: rate / per if found and per else 0.0,
+        }
         data = np.frombuffer(buffer.extract_dup(0, buffer.get_size()), np.uint8)
         # GStreamer pads the rows of a grey image to multiples of four bytes.
         self.image = data.reshape(height, -1)[:, :width].copy()
@@ -376,12 +381,6 @@ class GstreamerCapture(CapturedDevice):
         """Wait for the next image; return False if the pipeline has ended or delivers no image."""
         self._ensure_started()
         return self.grab_sample()
-
-    def _get_control(self, property_id: int) -> float:
-        sizes = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT, cv2.CAP_PROP_FPS)
-        if property_id in sizes:
-            return self._size[sizes.index(property_id)]
-        return 0.0
 
     def release(self) -> None:
         if self._pipeline is not None:

@@ -13,6 +13,7 @@ import numpy as np
 from flexsheet.messages.scene import Lens
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.camera.image_pair import DeviceError, Image
+from flexsheet.nodes.models.camera import camera_matrix
 from flexsheet.nodes.models.one_euro import OneEuro
 from flexsheet.nodes.models.rigid import apply
 
@@ -73,9 +74,7 @@ def locate_eyes(
     Both eyes are assumed to have the same depth. If the head is rotated about the vertical by an
     angle, the computed distance is too large by about 1 / cos(angle).
     """
-    matrix = np.array(
-        [[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]]
-    )
+    matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
     rays = np.ones((2, 3))
     rays[:, :2] = cv2.undistortPoints(
         pixels.reshape(2, 1, 2), matrix, np.array(lens.distortion)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict
 
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Lens, Scene
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.camera.image_pair import DeviceError, Region, Regions
 from flexsheet.nodes.models import camera, rigid
-
-Floats = NDArray[np.float64]
 
 GRID = 17
 """The number of grid points along each edge of the box in which the finger can be. Between two grid

@@ -42,10 +42,10 @@ class Backend:
     clock: whether CAP_PROP_POS_MSEC after a grab is the driver's timestamp of that frame.
     """
 
-    api: int
     exposure_unit_s: float
-    whole_units: bool
-    auto_exposure: tuple[int, float]
+    api: int = cv2.CAP_ANY
+    whole_units: bool = True
+    auto_exposure: tuple[int, float] = (cv2.CAP_PROP_AUTO_EXPOSURE, 0.0)
     autos: tuple[tuple[str, int], ...] = ()
     offsets: tuple[int, int] | None = None
     buffers: int | None = None
@@ -59,7 +59,6 @@ BACKENDS = {
     "v4l2": Backend(
         api=cv2.CAP_V4L2,
         exposure_unit_s=1e-4,
-        whole_units=True,
         auto_exposure=(cv2.CAP_PROP_AUTO_EXPOSURE, 1.0),
         autos=(
             ("auto white balance", cv2.CAP_PROP_AUTO_WB),
@@ -71,34 +70,14 @@ BACKENDS = {
     "ximea": Backend(
         api=cv2.CAP_XIAPI,
         exposure_unit_s=1e-6,
-        whole_units=True,
         auto_exposure=(cv2.CAP_PROP_XI_AEAG, 0.0),
         autos=(("auto white balance", cv2.CAP_PROP_XI_AUTO_WB),),
         offsets=(cv2.CAP_PROP_XI_OFFSET_X, cv2.CAP_PROP_XI_OFFSET_Y),
     ),
     # The module `captures` opens the next three backends.  OpenCV opens the other backends.
-    "aravis": Backend(
-        api=cv2.CAP_ANY,
-        exposure_unit_s=1e-6,
-        whole_units=False,
-        auto_exposure=(cv2.CAP_PROP_AUTO_EXPOSURE, 0.0),
-        clock=True,
-    ),
-    "realsense": Backend(
-        api=cv2.CAP_ANY,
-        exposure_unit_s=1e-6,
-        whole_units=True,
-        auto_exposure=(cv2.CAP_PROP_AUTO_EXPOSURE, 0.0),
-        clock=True,
-        stamp_fraction=0.0,
-    ),
-    "gstreamer": Backend(
-        api=cv2.CAP_ANY,
-        exposure_unit_s=1.0,
-        whole_units=False,
-        auto_exposure=(cv2.CAP_PROP_AUTO_EXPOSURE, 0.0),
-        clock=True,
-    ),
+    "aravis": Backend(exposure_unit_s=1e-6, whole_units=False, clock=True),
+    "realsense": Backend(exposure_unit_s=1e-6, clock=True, stamp_fraction=0.0),
+    "gstreamer": Backend(exposure_unit_s=1.0, whole_units=False, clock=True),
 }
 
 

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Finite, NonNegative, Positive
 from flexsheet.messages.types import Force, ForceAxis, ForceReason
-from flexsheet.nodes.gauge.serial_gauge import GaugeError, GaugeReader, SerialGauge
+from flexsheet.nodes.gauge.serial_gauge import GaugeError, SerialGauge
 from flexsheet.nodes.node import Node, NodeParameters, Output, periodic
 from flexsheet.nodes.parameter_marks import DeviceFile
 
@@ -23,9 +23,6 @@ class SerialSource(LimitedModel):
     kind: Literal["serial"] = "serial"
     port: DeviceFile = Field(description="path of the port, such as /dev/ttyUSB0")
     baud: int = Field(default=9600, description="rate of the serial port, bits per second")
-
-    def open(self) -> GaugeReader:
-        return SerialGauge(self.port, self.baud)
 
 
 class GaugeParameters(NodeParameters):
@@ -70,7 +67,7 @@ class Gauge(Node):
         return "it reads a device; the bag contains its readings as the topic force"
 
     async def setup(self) -> None:
-        self._reader: GaugeReader | None = None
+        self._reader: SerialGauge | None = None
         self._last_ns = self.clock.now_ns()
         self._last_n = 0.0
         self._problem = ""
@@ -80,8 +77,9 @@ class Gauge(Node):
         self._drop()
 
     def _open(self) -> None:
+        source = self.parameters.source
         try:
-            self._reader = self.parameters.source.open()
+            self._reader = SerialGauge(source.port, source.baud)
         except GaugeError as error:
             self._report(error)
             return

@@ -7,7 +7,6 @@ import math
 import os
 import re
 import termios
-from typing import Protocol
 
 from flexsheet.messages.errors import FlexsheetError
 
@@ -16,33 +15,13 @@ NUMBER = re.compile(rb"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 class GaugeError(FlexsheetError, OSError):
-    """An error for a gauge that cannot be opened or read.
-
-    The text names the device and the cause.
-    """
+    """Raised if a gauge cannot be opened or read. The text names the device and the cause."""
 
     code = "gauge"
     remedy = "Check the cable, the path in `port`, and the permission to open it (group dialout)."
 
     def __str__(self) -> str:
         return str(self.strerror)
-
-
-class GaugeReader(Protocol):
-    """The interface of a gauge driver.
-
-    A driver provides a file descriptor, on which the caller waits, and the received numbers.
-    """
-
-    unreadable: int
-
-    def fileno(self) -> int: ...
-
-    def read(self) -> list[float]:
-        """Return the numbers that have arrived; raise GaugeError if the connection is lost."""
-        ...
-
-    def close(self) -> None: ...
 
 
 class SerialGauge:
@@ -52,10 +31,7 @@ class SerialGauge:
     """
 
     def __init__(self, port: str, baud: int) -> None:
-        """Open the serial port without echo and control characters.
-
-        Raises GaugeError if the port cannot be opened.
-        """
+        """Open the serial port. Raises GaugeError if this fails."""
         self.port, self.unreadable, self._rest = port, 0, b""
         speed = getattr(termios, f"B{baud}", None)
         if speed is None:
@@ -75,9 +51,11 @@ class SerialGauge:
             raise GaugeError(0, f"{port}: cannot be opened as a serial port: {reason}") from error
 
     def fileno(self) -> int:
+        """Return the file descriptor on which the caller can wait for data."""
         return self._fd
 
     def read(self) -> list[float]:
+        """Return the numbers that have arrived. Raises GaugeError if the connection is lost."""
         try:
             data = os.read(self._fd, 4096)
         except BlockingIOError:

@@ -10,7 +10,6 @@ from flexsheet.nodes.models.shapes.geometries import (
     CuboidMap,
     GeometryDescription,
     map_nearest_points,
-    map_round_solid,
 )
 from flexsheet.nodes.models.shapes.smooth_mesh import SmoothMeshShape
 from flexsheet.nodes.models.shapes.solids import (
@@ -60,7 +59,6 @@ __all__ = [
     "SphereShape",
     "make_shape",
     "map_nearest_points",
-    "map_round_solid",
     "principal_curvatures",
     "projection_jacobian",
     "tightest_curvature",

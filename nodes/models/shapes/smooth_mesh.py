@@ -212,15 +212,8 @@ class SmoothMeshShape:
         sharpness = np.sqrt(np.square(operator).sum((1, 2)))
         on_edge = sharpness > EDGE * MAX_CURVATURE_RATIO / self.smoothing_m
         on_edge |= (np.abs(steepness - 1.0) > OFF_ONE) | (support < MIN_SUPPORT)
-        shape = queries.shape
-        return Nearest(
-            point.reshape(shape),
-            normal.reshape(shape),
-            height.reshape(shape[:-1]),
-            operator.reshape((*shape, 3)),
-            on_edge.reshape(shape[:-1]),
-            undecided.reshape(shape[:-1]),
-        )
+        found = Nearest(point, normal, height, operator, on_edge, undecided)
+        return found.reshape(queries.shape)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """Return the signed distances (m) of points to the solid, which are negative inside."""

@@ -176,15 +176,9 @@ class EllipsoidShape(Convex):
         hessian = np.diag(1.0 / np.square(self.semi_axes_m))
         operator = tangent @ hessian @ tangent / length[:, None, None]
         height = ((flat - point) * normal).sum(-1)
-        shape = queries.shape
-        return Nearest(
-            point.reshape(shape),
-            normal.reshape(shape),
-            height.reshape(shape[:-1]),
-            operator.reshape((*shape, 3)),
-            np.zeros(shape[:-1], dtype=bool),
-            undecided.reshape(shape[:-1]),
-        )
+        on_edge = np.zeros(len(flat), dtype=bool)
+        found = Nearest(point, normal, height, operator, on_edge, undecided)
+        return found.reshape(queries.shape)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         return self.closest(points).height_m
@@ -308,16 +302,10 @@ class RoundedBoxShape(Convex):
         flat_face = np.abs(normal).max(axis=-1) == 1.0
         operator = (rounded - _outer(normal)) / self.edge_radius_m
         operator[flat_face] = 0.0
-        shape = queries.shape
         point = nearest_core + self.edge_radius_m * normal
-        return Nearest(
-            point.reshape(shape),
-            normal.reshape(shape),
-            height.reshape(shape[:-1]),
-            operator.reshape((*shape, 3)),
-            np.zeros(shape[:-1], dtype=bool),
-            undecided.reshape(shape[:-1]),
-        )
+        on_edge = np.zeros(len(flat), dtype=bool)
+        found = Nearest(point, normal, height, operator, on_edge, undecided)
+        return found.reshape(queries.shape)
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         away = np.abs(check_points(points)) - self._core()

@@ -55,6 +55,17 @@ class Nearest:
     on_edge: Bools
     undecided: Bools
 
+    def reshape(self, shape: tuple[int, ...]) -> Nearest:
+        """Return a copy of flat results (n, ...) for queries of a shape (3,) or (n, 3)."""
+        return Nearest(
+            self.point.reshape(shape),
+            self.normal.reshape(shape),
+            self.height_m.reshape(shape[:-1]),
+            self.shape_operator.reshape((*shape, 3)),
+            self.on_edge.reshape(shape[:-1]),
+            self.undecided.reshape(shape[:-1]),
+        )
+
 
 class Shape(Protocol):
     """The interface of a solid with a touchable surface."""

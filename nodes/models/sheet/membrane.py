@@ -117,8 +117,8 @@ def push_path(
             f"the position {position_m} m is not on the sheet; give a position between the edges"
         )
     grid = _Grid(rubber, focus, MIN_CELL_RADII * finger_radius_m, cells)
-    state = _make_flat_state(grid, stretch_ratio)
-    state = _solve_equilibrium(grid, state, None)
+    flat = (grid.rest - grid.centre) * [stretch_ratio, 1.0]
+    state = _solve_equilibrium(grid, np.pad(flat, ((0, 0), (0, 1))), None)
     foot: Floats = np.array([*position_m, 0.0], dtype=np.float64)
     sticking = np.zeros(len(state), dtype=bool)
     depth = 0.0
@@ -402,12 +402,6 @@ class _FingerContact:
         return -(stiff * inside)[:, None] * outward, np.einsum(
             "n,ni,nj->nij", stiff, outward, outward
         )
-
-
-def _make_flat_state(grid: _Grid, stretch_ratio: float) -> Floats:
-    positions = np.zeros((len(grid.rest), 3))
-    positions[:, :2] = (grid.rest - grid.centre) * [stretch_ratio, 1.0]
-    return positions
 
 
 def _predict_state(
