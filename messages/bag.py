@@ -1,6 +1,6 @@
 """Read and write bags: MCAP files that contain encoded messages, their schemas and their times.
 
-This module defines what MCAP leaves to the application:
+The MCAP format leaves these details to the application:
 
 - The profile is "flexsheet". Each message type has a schema (JSON Schema). Each topic has a channel
   with the encoding "flexsheet/2". The channel's metadata contain the fingerprint of the type.
@@ -11,8 +11,8 @@ This module defines what MCAP leaves to the application:
   the frames follow. Each frame is padded with zeros to a multiple of eight bytes, so that arrays
   are aligned and can be read without a copy. All numbers are little-endian.
 
-A writer flushes its data to the disk every second. A reader scans the records from the start, so it
-does not need the index at the end. Therefore, a file that was truncated by a crash can be read up
+A writer flushes its data to the disk every second. A reader scans the records from the start and
+does not need the index at the end. If a crash has truncated a file, a reader can read the file up
 to the truncation. The attribute `BagReader.complete` is then false.
 """
 
@@ -73,8 +73,7 @@ class BagError(FlexsheetError):
 def join_frames(frames: Sequence[Any]) -> bytes:
     """Encode the frames of a message as the data of one MCAP record.
 
-    The layout is the number of frames, their lengths, and the frames, as the module's docstring
-    specifies.
+    The docstring of the module specifies the layout.
     """
     lengths = [len(frame) for frame in frames]
     parts: list[Any] = [struct.pack(f"<II{len(lengths)}Q", len(lengths), 0, *lengths)]
@@ -105,7 +104,7 @@ def split_frames(data: bytes) -> list[memoryview]:
 
 
 class BagWriter:
-    """A writer of one bag file, usable as a context manager.
+    """A writer of one bag file, which can be used as a context manager.
 
     All methods must be called from one thread. A separate thread flushes the file to the disk every
     second (fsync). If the process is killed, at most the last second of messages is lost. After a
@@ -194,7 +193,7 @@ class BagWriter:
             self._writer.add_attachment(0, 0, name, media_type, data)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Add a named table of text to the bag."""
+        """Add a named table of texts, which describes the recording, to the bag."""
         with self._writing():
             self._writer.add_metadata(name, dict(values))
 
@@ -301,8 +300,9 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class ChannelDecoder:
-    """The data that is needed to decode the messages of one channel.
+    """A decoder for the messages of one channel.
 
+    recorded_type, fingerprint: name and hash of the message type at the time of the recording.
     migrate: function that converts the decoded fields to the current message type.
     """
 
@@ -505,7 +505,7 @@ class BagReader:
     def info(self) -> BagInfo:
         """Return a summary of the whole bag.
 
-        The summary includes the topics and times that this reader does not read.
+        The summary also covers messages that this reader does not select.
         """
         times: dict[int, list[int]] = {}
         for chunk in self.chunks:
@@ -625,10 +625,10 @@ class BagReader:
         self.channels[channel.id] = channel
 
     def _index_remaining_chunks(self, file: IO[bytes]) -> None:
-        """Index the chunks of a truncated bag that the bag's own index does not cover.
+        """Index the chunks that the index in a truncated bag does not cover.
 
         The last chunk is always indexed, because the index record after it may be truncated. A
-        damaged chunk is added to `problem`, and raises an error only when its messages are read.
+        damaged chunk is reported in `problem`. Reading its messages raises an error.
         """
         for chunk in self.chunks:
             last = chunk is self.chunks[-1]
@@ -723,7 +723,7 @@ def _find_type_name(channel: mcap_records.Channel) -> str:
 
 
 def info(path: Path | str) -> BagInfo:
-    """Return a summary of a bag. Raises BagError if it cannot be read."""
+    """Return a summary of a bag. Raises BagError if the bag cannot be read."""
     return BagReader(path).info()
 
 
@@ -733,8 +733,9 @@ class RecoverReport:
 
     messages, attachments: numbers of recovered messages and attachments.
     was_complete: whether the original bag was complete.
-    problem: reason why the original bag was incomplete; empty if it was complete.
-    orphan_messages: number of messages that were lost because their channel is unknown.
+    problem: reason why the original bag was incomplete; empty for a complete bag.
+    orphan_messages: number of messages that were not recovered because the bag does not describe
+        their channel.
     """
 
     messages: int
@@ -838,8 +839,8 @@ def _read_at(file: IO[bytes], offset: int, length: int) -> bytes:
 def _decompress(chunk: mcap_records.Chunk) -> bytes:
     """Decompress a chunk up to the size that its header states.
 
-    The limit protects the memory, because a few compressed bytes can expand to a huge amount.
-    Raises ValueError if the stated size is too large or wrong.
+    The limit prevents a few compressed bytes from filling the memory. Raises ValueError if the
+    stated size is too large or wrong.
     """
     stated = chunk.uncompressed_size
     if stated > MAX_CHUNK_BYTES:

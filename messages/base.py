@@ -51,13 +51,13 @@ class Header:
 
     sequence: number of the message among the messages of its writer, starting at 1. A gap in the
         numbers means that messages were lost.
-    source_ns: time of the measurement on the clock `clock_id`. For all values that are derived from
-        an image, it is the midpoint of the exposure.
+    source_ns: time of the measurement on the clock `clock_id`. For values that are derived from an
+        image, the time is the midpoint of the exposure.
     publish_ns: time when the message was passed to the socket, on the same clock.
     clock_id: clock of both timestamps. Timestamps of different clocks must not be subtracted.
     writer: name of the node that published the message.
-    epoch: time when the writer started, in ns, on the same clock. It distinguishes a restart of the
-        writer from a loss of messages, and is used to reject messages from before a restart.
+    epoch: time when the writer started, in ns, on the same clock. A receiver thereby distinguishes
+        a restart from a loss of messages, and rejects messages from before a restart.
     plan: hash of the resolved launch file of the writer; empty in bags of the first wire protocol.
     """
 

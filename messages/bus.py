@@ -1,17 +1,18 @@
 """Publish and subscribe by ZeroMQ sockets in the asyncio event loop.
 
-A publisher binds its socket and subscribers connect to it, in any order. Either side may be
-restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and calls
-the handler there. This design has the smallest latency of those in `benchmarks/messaging.py`. No
-`recv` is ever pending, so no cancelled `recv` can lose a message.
+A publisher binds its socket and subscribers connect to it, in any order. Publishers and subscribers
+may be restarted. A subscriber reads plain (not asyncio) sockets in a callback of the event loop and
+calls the handler there. This design has the smallest latency of those in `benchmarks/messaging.py`.
+No `recv` is ever pending, so no cancelled `recv` can lose a message.
 
 A subscriber has one socket per host, which identifies the host of each message. From each host, the
 subscriber accepts only messages of the nodes that run there. Sockets that other computers can reach
 are bound and connected with keys only (`flexsheet.messages.security`).
 
-The file descriptor of a ZeroMQ socket is edge-triggered: it signals that a state changed, not that
-a message is ready. Any call on the socket can clear the signal. Each callback therefore reads until
-the socket is empty, or schedules itself again. No other code uses a socket that is being read.
+The file descriptor of a ZeroMQ socket is edge-triggered: its signal means that the state of the
+socket has changed, not that a message is ready. Any call on the socket can clear the signal. Each
+callback therefore reads until the socket is empty, or schedules itself again. No other code uses a
+socket that is being read.
 """
 
 from __future__ import annotations
@@ -125,7 +126,12 @@ class BusError(FlexsheetError, RuntimeError):
 
 
 class Counts(Protocol):
-    """The interface of an object that counts the messages not passed to a subscriber's handler."""
+    """The interface of counters for messages that a subscriber does not pass to its handler.
+
+    dropped: superseded messages.
+    gaps: lost messages.
+    rejected: invalid messages.
+    """
 
     dropped: int
     gaps: int
@@ -358,9 +364,9 @@ class Subscriber:
     connect: endpoints of all nodes that publish the topic. A node may start after the subscriber,
         and may restart.
     counts: counters of superseded, lost and rejected messages.
-    on_problem: function that is called with a text about a problem. It is called for the first
-        rejection of each cause, and for an exception in `on_message`. It is also called each time
-        the number of lost messages has doubled, except on topics with the delivery `latest`.
+    on_problem: function that is called with a text about a problem: the first rejection of each
+        cause, and each exception in `on_message`. Lost messages are a problem each time their
+        number has doubled, except on topics with the delivery `latest`.
     on_handshake_failed: function that is called with a text for each kind of failed handshake;
         None: `on_problem` is called.
     raw: whether `on_message(frames, header)` is called with the undecoded frames of every message.
@@ -371,7 +377,7 @@ class Subscriber:
         accepted.
     message_filter: function that is called with each valid message before `on_message`.
     on_disconnected: function that is called when a connection has ended, after its last message.
-    local: bus that delivers messages from nodes in this process. It is ignored if `raw` is true.
+    local: bus that delivers messages from nodes in this process; not used if `raw` is true.
     """
 
     def __init__(
@@ -461,7 +467,7 @@ class Subscriber:
                 connection.open()
 
     def accept(self, frames: list[Any], writers: frozenset[str] | None) -> Envelope | None:
-        """Decode the header of a message and check it as `accept_header` does.
+        """Decode the header of a message, and check the header as in `accept_header`.
 
         Return None if the message is rejected, or if it has arrived before.
         """
@@ -526,7 +532,9 @@ class Subscriber:
         self.call(message, header)
 
     def call(self, message: Any, header: Header) -> None:
-        """Call the handler, and report an exception that it raises without raising it again."""
+        """Call the handler. If the handler raises an exception, report the exception and
+        continue.
+        """
         try:
             self._on_message(message, header)
         except Exception as error:
@@ -537,7 +545,7 @@ class Subscriber:
             )
 
     def reject(self, error: WireError) -> None:
-        """Count a rejected message. Report it if it is the first rejection for this cause."""
+        """Count a rejected message. Report only the first rejection of each cause."""
         self.counts.rejected += 1
         if error.cause not in self._reported_causes:
             self._reported_causes.add(error.cause)
@@ -557,9 +565,9 @@ class Subscriber:
 class _Writer:
     """The start time (epoch) and the sequence number of the newest message of a node.
 
-    They are used to reject copies of old messages. A node that restarts on the same clock has a
-    later epoch. After a reboot of its host, the node has a new clock identifier, and messages with
-    an earlier clock identifier are rejected.
+    A subscriber uses these values to reject copies of old messages. A node that restarts on the
+    same clock has a later epoch. After a reboot of its host, the node has a new clock identifier,
+    and messages with an earlier clock identifier are rejected.
     """
 
     __slots__ = ("clock_id", "epoch", "past_clocks", "sequence")
@@ -734,7 +742,7 @@ class _HostConnection:
     def _deliver_newest(self) -> bool:
         """Deliver the newest message of each node, and skip older messages without validating them.
 
-        If the first message is younger than half the period of the topic, it is delivered at once.
+        A first message that is younger than half the period of the topic is delivered at once.
         Return whether the socket has no more messages.
         """
         newest: dict[str, Envelope] = {}
@@ -834,7 +842,7 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
 def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRing | None) -> str:
     """Bind a publisher's socket to an endpoint.
 
-    Return the endpoint, in which the actual port number replaces "*". Raises BusError if the socket
+    Return the endpoint with the actual port number instead of "*". Raises BusError if the socket
     cannot be bound.
     """
     _check_endpoint(topic, endpoint)
@@ -867,7 +875,7 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRi
 def _check_endpoint(topic: Topic, endpoint: str) -> None:
     """Raise BusError if an endpoint is invalid.
 
-    ZeroMQ would accept some invalid endpoints, or report them with an unclear error.
+    ZeroMQ accepts some invalid endpoints, and reports others with unclear errors.
     """
     transport, _, address = endpoint.partition("://")
     port = address.rpartition(":")[2]
@@ -906,7 +914,7 @@ def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
 def _ipc_is_served(endpoint: str) -> bool:
     """Return whether another process already listens at an ipc endpoint.
 
-    If this process bound the same endpoint, the other process would lose it.
+    Binding the same endpoint would disconnect the other process.
     """
     path = endpoint.removeprefix(IPC)
     if path == endpoint or path.startswith("@"):

@@ -8,7 +8,7 @@ from flexsheet.messages.types import CpuPressure, HostStatus
 MAX_LOAD_RATIO = 1.5
 """The maximum load average per core.
 
-It is used on computers that cannot measure how long processes wait for a processor.
+This limit is used on computers that cannot measure how long processes wait for a processor.
 """
 
 BUSY_REMEDY = (
@@ -23,7 +23,7 @@ def is_busy(host: HostStatus) -> bool:
 
 
 def describe_busy_remedy(*, nice_denied: bool) -> str:
-    """Return a text that tells the user of an overloaded computer what to do.
+    """Return the advice for the user of an overloaded computer.
 
     nice_denied: whether the nodes lack the process priority that the launch file requires.
     """
@@ -36,7 +36,9 @@ def describe_busy_remedy(*, nice_denied: bool) -> str:
 
 
 def describe_busy(host: HostStatus) -> str:
-    """Return a sentence that states why a computer is overloaded, or "" if it is not overloaded."""
+    """Return the reason why a computer is overloaded as a sentence, or "" for any other
+    computer.
+    """
     if not is_busy(host):
         return ""
     if host.cpu is None:

@@ -36,7 +36,8 @@ class ClockTable:
         self.offsets = {one.clock_id: one for one in clocks.offsets}
 
     def find_problem(self, clock_id: str, now_ns: int) -> str:
-        """Return why the offset of a clock is not accurate enough, or "" if it is.
+        """Return the reason why the offset of a clock is not accurate enough, or "" for an accurate
+        one.
 
         now_ns: current time on the local clock.
         """

@@ -1,14 +1,15 @@
 """Close tcp connections on which a peer sends a publisher more data than a subscriber would.
 
-A ZeroMQ publisher stores every subscription that a peer sends, which needs about 45 times its size
-in memory. The publisher stores them within the call that sends the next message, and that call does
-not return while more subscriptions arrive. ZeroMQ has no option that limits the number of
-subscriptions or the number of frames in a message.
+A ZeroMQ publisher stores every subscription that a peer sends, in about 45 times its size. The
+subscriptions are stored in the call that sends the next message. This call does not return while
+more subscriptions arrive. ZeroMQ has no option that limits the number of subscriptions or the
+number of frames in a message.
 
 A subscriber of this package sends only a handshake, one subscription, and one reply to each
 heartbeat. A thread therefore counts the bytes that the kernel has received on each accepted
-connection (TCP_INFO). It closes a connection that has received too many bytes. The thread sleeps
-until data arrives (edge-triggered epoll), so it needs no processor time while peers send nothing.
+connection (TCP_INFO). The thread closes a connection that has received too many bytes. The thread
+sleeps until data arrives (edge-triggered epoll), so it needs no processor time while peers send
+nothing.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ THREAD_NAME = "connection guard"
 TCP_INFO_FORMAT, TCP_INFO_BYTES_RECEIVED = "=Q", 128
 
 OnRefused = Callable[[str, str], None]
-"""A function that is called with a peer's address and the reason why it was refused.
+"""A function that is called with the address of a refused peer and the reason.
 
 The thread of the connection guard calls the function.
 """

@@ -31,7 +31,7 @@ def describe_field(field: FieldInfo) -> dict[str, str]:
 
 
 def get_annotation(field: FieldInfo) -> Any:
-    """Return the type of a field and its metadata as one `typing.Annotated`."""
+    """Return the type of a field, with its metadata, as a `typing.Annotated`."""
     annotation: Any = field.annotation
     for mark in field.metadata:
         annotation = Annotated[annotation, mark]

@@ -10,14 +10,14 @@ from pathlib import Path
 from flexsheet.messages.errors import FlexsheetError
 
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO})
-"""The error numbers (errno) of errors that the disk or its file system causes."""
+"""The values of errno for errors of the disk or of its file system."""
 
 
 class FileWriteError(FlexsheetError, OSError):
     """Raised if a file cannot be written.
 
-    The text contains the path and the cause. If the disk is full, it also contains the needed and
-    the free space.
+    The text contains the path and the cause. If the disk is full, the text also contains the needed
+    and the free space.
     """
 
     code = "file-write"

@@ -1,8 +1,8 @@
 """Define limits for numbers in scenes, launch files, parameters and calibrations.
 
 The limit of a number depends on the unit at the end of its field's name, such as `_m`. A few field
-names have their own limits. The limits are wide. They only exclude numbers that no hardware of this
-kind has and that could cause numerical errors in the nodes, such as overflow.
+names have their own limits. The limits are wide. Their purpose is to prevent numerical errors in
+the nodes, such as overflow, by numbers that no real hardware has.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ MIN_POSITIVE = 1e-9
 MAX_ROTATION_ERROR = 1e-4
 """The maximum error of an element of R R^T for a rotation matrix R, where R^T is its transpose.
 
-It corresponds to an error of 0.05 mm at a distance of half a metre.
+The resulting position error at a distance of half a metre is 0.05 mm.
 """
 
 

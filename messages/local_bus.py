@@ -1,7 +1,7 @@
 """Deliver messages between the nodes of one process without encoding them.
 
-A publisher passes each message to the subscribers in its process. It sends the message on its
-socket only while another process has subscribed. A subscriber applies the same checks as to
+A publisher passes each message to the subscribers in its process. The socket is used only while
+another process has subscribed. A subscriber applies the same checks as to
 messages from sockets: writer, plan, order, types, shapes and ranges. Arrays of at most
 `INLINE_BYTES` are copied, because a sender may reuse their memory. Larger arrays are shared. All
 arrays are read-only for the subscribers.

@@ -6,8 +6,8 @@ comparing the two schemas.
 
 A renamed field needs a line in `RENAMED_FIELDS`, a renamed literal value in `RENAMED_VALUES`, and a
 removed field in `REMOVED_FIELDS`. These lines apply to every recorded version of the type. Any
-other change needs a line in `MIGRATIONS`. It contains the type, its former fingerprint (`flexsheet
-bag info --json`), and a function that converts the recorded fields to the next version.
+other change needs a line in `MIGRATIONS`. The line contains the type, the former fingerprint
+(`flexsheet bag info --json`), and a function that converts the recorded fields to the next version.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Every host has one CURVE key pair. The secret key is in a file that only its owner may read. The
 launch file contains the public keys of all hosts. A bound socket accepts only connections from
-hosts in the launch file. ZeroMQ asks for this decision by its authentication protocol (ZAP), in the
-event loop. A connecting socket requires the key of one host. Each end of a connection therefore
+hosts in the launch file. A handler in the event loop answers ZeroMQ's authentication requests
+(protocol ZAP). A connecting socket requires the key of one host. Each end of a connection therefore
 knows the host at the other end.
 
 Keys are written as 40 characters in the encoding Z85.
@@ -301,8 +301,8 @@ class ZapAuthenticator:
     def reply(self, request: list[bytes]) -> list[bytes]:
         """Return the reply to an authentication request (ZAP).
 
-        The status is 200, with the name of the host, if the key belongs to a host. Otherwise it is
-        400.
+        The status is 200, with the name of the host, if the key belongs to a host. Otherwise, the
+        status is 400.
         """
         version, number, domain, address, _, mechanism, *credentials = request
         keys, on_refused = self._domains.get(domain, (None, lambda _: None))

@@ -44,8 +44,8 @@ StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "
 class StereoPair(Message):
     """A pair of images of the stereo camera.
 
-    The source timestamp is the midpoint of the exposure. If the two cameras have no common trigger,
-    it is the mean of the midpoints of both exposures.
+    The source timestamp is the midpoint of the exposure. Without a common trigger of both cameras,
+    the timestamp is the mean of the midpoints of both exposures.
     """
 
     device: str
@@ -142,7 +142,7 @@ SheetReason = Literal[
     "past_sheet_height",
     "concave_contact",
 ]
-"""The reason why the sheet does not follow the finger; "ok" if it does.
+"""The reason why the sheet does not follow the finger; "ok" while the sheet follows.
 
 With "concave_contact", the sheet follows the finger at a distance.
 """
@@ -151,8 +151,8 @@ With "concave_contact", the sheet follows the finger at a distance.
 class SheetTrajectory(MessagePart):
     """The motion of the sheet after the time of its target pose, until a newer target arrives.
 
-    The sheet keeps the target's velocity (twist) for `keep_s`, and then decelerates uniformly until
-    it rests.
+    The sheet keeps the target's velocity (twist) for `keep_s`, and then decelerates uniformly to
+    rest.
     """
 
     keep_s: float = Field(
@@ -482,8 +482,8 @@ class Bookmark(Message):
 class Arming(Message):
     """A command of the operator that permits or ends motion of the robot arms.
 
-    The value `ready` true permits motion. The value `ready` false stops the arms and relaxes the
-    sheet. After any stop, the arms rest until the next command.
+    If `ready` is true, the arms may move. If `ready` is false, the arms stop and relax the sheet.
+    After any stop, the arms rest until the next command.
     """
 
     ready: bool
@@ -532,7 +532,7 @@ class ClockPing(Message):
 
 
 class ClockOffset(MessagePart):
-    """The offset of another clock: its time minus the time of the header's clock, at `at_ns`."""
+    """The time of another clock minus the time of the header's clock, at `at_ns`."""
 
     clock_id: str
     at_ns: int = Field(ge=0)
