@@ -40,7 +40,7 @@ def default_cache_dir() -> Path:
 
 
 def make_digest(value: object) -> str:
-    """Return a hash of a JSON value as text. Equal values have equal hashes."""
+    """Return a hash of a JSON value, as 24 hexadecimal digits."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
 
 

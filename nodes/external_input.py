@@ -51,7 +51,7 @@ def check_period(at_ns: int, newest_ns: int | None) -> None:
 
 
 def check_finite(values: Floats) -> Floats:
-    """Return the given values. Raises RejectedError if a value is not finite."""
+    """Raise RejectedError if a value is not finite; otherwise return the values."""
     if not np.isfinite(values).all():
         raise RejectedError(Rejection.NOT_FINITE)
     return values
@@ -73,8 +73,8 @@ def make_eye(centre_world_m: Floats, right_world: Floats, scene: Scene) -> Eye:
     """Make a message with the position of the user's eyes.
 
     centre_world_m (3,): midpoint of the eyes. right_world (3,): unit vector from the left to the
-    right eye. Raises RejectedError if the position is not finite, or too far from that in the
-    scene.
+    right eye. Raises RejectedError if the position is not finite, or too far from the scene's
+    position.
     """
     check_finite(centre_world_m)
     if np.linalg.norm(centre_world_m - scene.eyes.centre_world_m) > MAX_EYE_OFFSET_M:

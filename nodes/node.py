@@ -11,8 +11,8 @@ are named after ports.
         def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
             self.sheet_target.publish(..., source_ns=header.source_ns)
 
-A node does not use sockets. Its arguments are parameters, a clock and a function that sends
-messages. Therefore the same class runs live (`nodes.runner`), in a replay and in a unit test.
+A node does not use sockets. The arguments of a node are parameters, a clock and a function that
+sends messages. Therefore the same class runs live (`nodes.runner`), in a replay and in a unit test.
 Handlers are functions or coroutines. Only one call of a coroutine handler runs at a time. On a
 topic with the delivery `latest`, the handler does not receive messages that were superseded during
 its last call.
@@ -108,7 +108,7 @@ class PortCounts:
 
 
 class ExecutionLog:
-    """A log of the order of a node's handler calls. A replay repeats the calls in this order.
+    """A log of a node's handler calls. A replay repeats the calls in the same order.
 
     `flexsheet.messages.types.Status.execution_log` describes the rows.
     """
@@ -125,9 +125,7 @@ class ExecutionLog:
         self._rows.append((-1 - number, 0, 0, self._clock.now_ns()))
 
     def drain(self) -> NDArray[np.int64]:
-        """Return the rows (n, 4) of the log. Delete them if RESEND_NS have passed since the
-        start.
-        """
+        """Return the rows (n, 4) of the log, and delete the rows after RESEND_NS from the start."""
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
         if self._clock.now_ns() > self._started_ns + RESEND_NS:
             self._rows.clear()
@@ -140,8 +138,8 @@ class Input(Generic[M]):
     All timestamps are converted to this host's clock.
 
     clock_problem: reason why the conversion is not reliable, or "".
-    has_ended: whether the connection to the writer has ended since the last message. It is updated
-        only for the `watched_inputs` of a node.
+    has_ended: whether the connection to the writer has ended since the last message; updated only
+        for the `watched_inputs` of a node.
     """
 
     def __init__(self, topic: Topic, clock: Clock) -> None:
@@ -334,8 +332,8 @@ class Node:
 
     @classmethod
     def omission_reason(cls, parameters: Any, scene: Scene) -> OmissionReason | None:
-        """Return the reason why a graph with this scene can omit the node, or None if it may need
-        the node.
+        """Return the reason to omit the node from a graph with this scene, or None to start the
+        node.
         """
         return None
 
@@ -492,8 +490,7 @@ class Node:
             await self.call(f"on_{port}", handler, message, header)
 
     async def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> None:
-        """Call a handler or a timer method. If it raises an exception, count, log and report the
-        exception.
+        """Call a handler or a timer method. Count, log and report an exception of the method.
 
         what: name of the handler or timer in the log.
         """
@@ -532,8 +529,8 @@ class Node:
 
 
 class Mailbox:
-    """A queue of messages for a coroutine handler. It stores only the latest message, or a limited
-    number of messages.
+    """A queue of messages for a coroutine handler. On a topic with the delivery `latest`, the queue
+    stores only the newest message.
     """
 
     def __init__(self, node: Node, port: str) -> None:

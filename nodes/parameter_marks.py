@@ -14,7 +14,7 @@ from pydantic import BaseModel, Field
 
 
 class ParameterMark(StrEnum):
-    """A mark of a node parameter, from which the launcher knows how the value is used."""
+    """A mark that informs the launcher about the use of a node parameter."""
 
     LISTEN_PORT = "listen_port"
     DEVICE_HOST = "device_host"

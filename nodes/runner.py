@@ -47,7 +47,7 @@ KEYS_PERIOD_S = 1.0
 class PortConfig(BaseModel):
     """The connection of a node's port to a topic.
 
-    endpoints: ZeroMQ endpoints. Those of an input can name the expected writer.
+    endpoints: ZeroMQ endpoints. The endpoints of an input can name the expected writer.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -171,7 +171,9 @@ class NodeTransport:
                 self._open_stop_socket(node, config.port)
 
     def _open_stop_socket(self, node: Node, port: str) -> None:
-        """Open a socket for e-stops from tools. It works even if the launcher does not respond."""
+        """Open a socket for e-stops from tools, which also works if the launcher does not
+        respond.
+        """
 
         def stop(reason: str) -> None:
             now_ns = node.clock.now_ns()
@@ -256,9 +258,7 @@ class NodeTransport:
 
 
 async def run_timer(node: Node, number: int, timer: Timer) -> None:
-    """Call a node's periodic method on a fixed time grid. Times that have already passed are
-    skipped.
-    """
+    """Call a node's periodic method on a fixed time grid, and skip times that have passed."""
     period_s = 1.0 / float(getattr(node.parameters, timer.rate_parameter))
     loop = asyncio.get_running_loop()
     due_s = loop.time()
@@ -393,8 +393,7 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
 
 
 class Heartbeat:
-    """A pipe to the launcher. The first heartbeat reports that all nodes are ready, and the
-    following heartbeats report that they run.
+    """A pipe for heartbeats to the launcher. The first heartbeat reports that all nodes are ready.
 
     fd: write end of the pipe; None if there is no launcher. Writing never blocks.
     nodes: number of nodes in the process.

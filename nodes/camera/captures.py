@@ -1,4 +1,4 @@
-"""Read cameras that OpenCV's Python package does not support.
+"""Read cameras that the Python package of OpenCV does not support.
 
 The classes have the interface of cv2.VideoCapture. The packages that they need are optional, and
 are imported when a device is opened. `settings.BACKENDS` defines the units of the controls.
@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from flexsheet.nodes.camera.image_pair import DeviceError, Image
 
 GRAB_S = 1.0
-"""The maximum time to wait for a frame. With this limit, the reading thread can end even if a
-camera sends no images."""
+"""The maximum time (s) to wait for a frame, so that the reading thread can end without one."""
 
 BUFFERS = 4
 
@@ -54,7 +53,7 @@ def _monotonic_ms(real_time_ns: int) -> float:
 
 
 class CapturedDevice(ABC):
-    """A base class of captures that start their device when it is first used.
+    """A base class of captures that start their device on its first use.
 
     stamp_ms: timestamp of the grabbed frame on the monotonic clock; 0 if unknown.
     wanted: requested value of each OpenCV property of the image format.
@@ -75,7 +74,7 @@ class CapturedDevice(ABC):
 
     @abstractmethod
     def _start(self) -> None:
-        """Start the device with the requested image format; raise DeviceError if this fails."""
+        """Start the device with the requested image format. Raises DeviceError if this fails."""
 
     def _ensure_started(self) -> None:
         if not self.started:
@@ -117,7 +116,7 @@ class CapturedDevice(ABC):
 
 
 class AravisCapture(CapturedDevice):
-    """A GenICam camera (GigE Vision or USB3 Vision) that is read with Aravis.
+    """A capture of a GenICam camera (GigE Vision or USB3 Vision) with the library Aravis.
 
     device: name of the camera, or empty for the only camera.
     """
@@ -131,7 +130,7 @@ class AravisCapture(CapturedDevice):
         self._camera = self._call(lambda: self._aravis.Camera.new(device or None), "open")
 
     def _call(self, call: Any, what: str) -> Any:
-        """Call a function of Aravis; raise DeviceError if the call fails.
+        """Call a function of Aravis. Raises DeviceError if the call fails.
 
         what: name of the action in the error text, such as "start".
         """
@@ -214,7 +213,7 @@ class AravisCapture(CapturedDevice):
 
 
 class RealSenseCapture(CapturedDevice):
-    """The infrared image pair of a RealSense camera, as one image with both views side by side.
+    """A capture of the infrared pair of a RealSense camera, as one image with both views.
 
     device: serial number, or empty for any camera.
     The dot projector of the camera is switched off. Both sensors are triggered together. The

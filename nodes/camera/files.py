@@ -26,7 +26,7 @@ from flexsheet.nodes.camera.stamps import Pairing
 
 @dataclass(frozen=True, slots=True)
 class FileFrame:
-    """A decoded image of a file, and its time since the first image of the file."""
+    """A decoded image of a file, and the time since the first image of the file."""
 
     image: Image
     time_ns: int
@@ -35,7 +35,7 @@ class FileFrame:
 class VideoFile:
     """A video file that is read frame by frame.
 
-    rate_hz: frame rate. If it is None, the frame times in the file are used.
+    rate_hz: frame rate; None: the frame times in the file are used.
     Raises DeviceError if the file cannot be opened.
     """
 
@@ -92,7 +92,7 @@ class FileReader:
 
 
 class VideoReader(FileReader):
-    """A reader of one video file with both views, or of two video files that are paired by time."""
+    """A reader of one video file with both views, or of two video files with paired frames."""
 
     def __init__(self, source: VideoSource, camera_rate_hz: float) -> None:
         self._source, self._camera_rate_hz = source, camera_rate_hz
@@ -115,7 +115,7 @@ class VideoReader(FileReader):
         self._pairing = Pairing(1.0 / rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next image pair, or None at the end; raise DeviceError for a faulty file."""
+        """Return the next image pair, or None at the end. Raises DeviceError for a faulty file."""
         frames = self._next()
         if frames is None and self._source.loop:
             self.close()
@@ -266,7 +266,9 @@ class ImagesReader(FileReader):
         self._clock = _LoopClock(rate_hz)
 
     def read(self) -> ImagePair | None:
-        """Return the next image pair, or None at the end; raise DeviceError if a file is faulty."""
+        """Return the next pair of images, or None at the end. Raises DeviceError for a faulty
+        file.
+        """
         if self._next == len(self._pairs):
             if not self._loop:
                 return None

@@ -178,8 +178,8 @@ class HeadCamera(Node):
     async def watch(self) -> None:
         """Publish invalid eyes while no images arrive.
 
-        Their timestamp is `silence_s` in the past. The eyes in an image that is still being
-        searched are therefore newer.
+        The timestamp is `silence_s` in the past, and therefore older than that of an image that is
+        still being searched.
         """
         p = self.parameters
         at_ns = self.clock.now_ns() - round(1e9 * (p.delay_s + p.silence_s))
@@ -223,7 +223,7 @@ class FaceReader(threading.Thread):
                 self.stopping.wait(self._parameters.retry_s)
 
     def _read(self, detect: Detector) -> None:
-        """Search images until the thread is stopped; raise DeviceError if the camera fails."""
+        """Search images until the thread is stopped. Raises DeviceError if the camera fails."""
         p = self._parameters
         capture = open_capture(p.device)
         try:

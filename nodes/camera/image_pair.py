@@ -20,7 +20,7 @@ Now = Callable[[], int]
 
 
 class DeviceError(FlexsheetError, RuntimeError):
-    """An error for a device or file that cannot be read, or that delivers unexpected images."""
+    """Raised if a device or file cannot be read, or delivers images of an unexpected size."""
 
     code = "device"
     remedy = (
@@ -55,10 +55,10 @@ Regions = tuple[Region, Region]
 
 @dataclass(frozen=True, slots=True)
 class ImagePair:
-    """A left and a right grey image (height, width) that were taken at about the same time.
+    """A left and a right grey image (height, width) with nearly equal exposure times.
 
-    exposure_ns: mean of both mid-exposure times on the reader's clock. For files, it is the time
-        since the start of the file.
+    exposure_ns: mean of both mid-exposure times on the reader's clock; for files, the time since
+        the start of the file.
     exposure_s: duration of the exposure that the device reports; None if unknown.
     skew_s: mid-exposure time of the right image minus that of the left image.
     regions: sensor regions of the images; None for full sensors.
@@ -77,9 +77,9 @@ class ImagePair:
 class Reader(Protocol):
     """The interface of readers of image pairs.
 
-    paced: whether `read` returns immediately, as for files. The caller must then wait until each
-        image pair is due.
-    rate_hz: frame rate of a device, which is used to count lost frames; None for files.
+    paced: whether `read` returns immediately, as for files. In that case, the caller must wait
+        until each image pair is due.
+    rate_hz: frame rate of a device, to count lost frames; None for files.
     warnings: texts about settings that the device did not accept.
     opened: texts about the actual format and settings of each device; empty for files.
     """
@@ -90,7 +90,7 @@ class Reader(Protocol):
     opened: tuple[str, ...]
 
     def read(self) -> ImagePair | None:
-        """Wait for the next image pair and return it, or None at the end; may raise DeviceError."""
+        """Wait for the next image pair; return None at the end. Raises DeviceError on failure."""
         ...
 
     def interrupt(self) -> None:
@@ -144,7 +144,7 @@ def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
 
 
 def describe_skew(skew_s: float, limit_s: float) -> str:
-    """Return a text that explains why an image pair was rejected.
+    """Return the reason for the rejection of an image pair, as text.
 
     skew_s: time between the left and the right exposure. limit_s: maximum of this time.
     """
@@ -157,7 +157,7 @@ def describe_skew(skew_s: float, limit_s: float) -> str:
 def convert_to_gray(image: NDArray[Any]) -> Image:
     """Convert an image to a grey image (h, w).
 
-    image: grey (h, w) or (h, w, 1), BGR (h, w, 3), or brightness and another channel (h, w, 2).
+    image: grey (h, w) or (h, w, 1), BGR (h, w, 3), or brightness and a second channel (h, w, 2).
     """
     if image.ndim == 3:
         image = image[:, :, 0] if image.shape[2] < 3 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
@@ -180,7 +180,7 @@ def split_side_by_side(image: Image, name: object) -> tuple[Image, Image]:
 
 
 def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
-    """Check the image size; raise DeviceError if it differs from the region or from the scene.
+    """Raise DeviceError if the image size differs from the region or from the scene.
 
     name: name of the source in the error text.
     """
@@ -201,7 +201,7 @@ def check_size(images: ImagePair, camera: StereoCamera, name: object) -> None:
 
 
 def crop(images: ImagePair, regions: Regions) -> ImagePair:
-    """Crop images to sensor regions; raise DeviceError if an image does not contain its region."""
+    """Crop images to sensor regions. Raises DeviceError if an image lacks a part of its region."""
     if images.regions == regions:
         return images
     parts = []

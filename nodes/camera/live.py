@@ -35,7 +35,7 @@ MAX_WAITING_FRAMES = 4
 """The maximum number of frames in the queue for pairing. If the queue is full, a new frame replaces
 the oldest frame."""
 FIRST_FRAME_S = 5.0
-"""The minimum timeout for the first frame after the start, because sensors need time to start."""
+"""The minimum timeout (s) for the first frame, because sensors need time to start."""
 RELEASE_S = 0.5
 
 RATE_FRAMES = 61
@@ -44,7 +44,7 @@ RATE_FRAMES = 61
 
 @dataclass(frozen=True, slots=True)
 class CapturedFrame:
-    """An image of one camera with two estimates of its mid-exposure time.
+    """An image of one camera with two estimates of the mid-exposure time.
 
     by_arrival_ns: estimate that is based on the time of arrival. by_stamp_ns: estimate that is
         based on the driver's timestamp; None without a timestamp.
@@ -56,7 +56,7 @@ class CapturedFrame:
 
 
 def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
-    """Open a device, file or stream with OpenCV; raise DeviceError if this fails."""
+    """Open a device, file or stream with OpenCV. Raises DeviceError if this fails."""
     capture = cv2.VideoCapture(device, api)
     if not capture.isOpened():
         capture.release()
@@ -68,7 +68,7 @@ def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
 
 
 def open_device(device: int | str, api: str | None, backend: Backend | None) -> Any:
-    """Open a camera with the backend's driver; raise DeviceError if this fails.
+    """Open a camera with the driver of a backend. Raises DeviceError if this fails.
 
     The result has the interface of cv2.VideoCapture.
     """
@@ -153,7 +153,7 @@ class Stream(threading.Thread):
             self._capture.release()
 
     def _next(self) -> CapturedFrame | None:
-        """Read the next frame; return None if its timestamp is implausible.
+        """Read the next frame; return None if the frame has an implausible timestamp.
 
         Raises DeviceError if the camera delivers no image.
         """
@@ -228,7 +228,7 @@ class CameraReader:
             stream.start()
 
     def read(self) -> ImagePair | None:
-        """Wait for the next image pair and return it; raise DeviceError if no pair arrives."""
+        """Wait for the next image pair and return it. Raises DeviceError if no pair arrives."""
         with self._changed:
             counts = [stream.count for stream in self._streams]
             limit_ns = self._now() + round(1e9 * self._wait_s)
@@ -291,7 +291,7 @@ class CameraReader:
         )
 
     def _describe_silence(self, counts: list[int]) -> str:
-        """Return an error text that explains why no image pair arrived.
+        """Return an error text with the reason why no image pair arrived.
 
         counts: number of frames of each camera at the start of the wait.
         """

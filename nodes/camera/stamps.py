@@ -12,8 +12,9 @@ MAX_FUTURE_NS = 1_000_000
 """The maximum time by which a timestamp may be later than the frame's arrival, because of
 rounding."""
 MAX_AGE_NS = 1_000_000_000
-"""The maximum age of a timestamp when the frame arrives. It permits a driver with several frame
-buffers at rates of at least 10 Hz."""
+"""The maximum age (ns) of a timestamp when the frame arrives. Drivers with several frame buffers
+need this time at 10 Hz.
+"""
 MAX_IMPLAUSIBLE = 3
 SLACK = 0.05
 """The tolerance for the pairing of frames, as a fraction of the frame period. Without a tolerance,
@@ -26,8 +27,8 @@ class StampCheck:
     The timestamps must be times of this computer's monotonic clock. A timestamp is plausible if it
     is later than the previous timestamp, and at most MAX_AGE_NS before the frame's arrival.
     Timestamps of another clock differ by hours or years.
-    trusted: whether the timestamps may be used. It is False after MAX_IMPLAUSIBLE consecutive
-        implausible timestamps.
+    trusted: whether the timestamps may be used; False after MAX_IMPLAUSIBLE consecutive implausible
+        timestamps.
     """
 
     def __init__(self) -> None:
@@ -49,7 +50,7 @@ class StampCheck:
 
 
 class Pairing:
-    """A matcher that pairs the frames of two cameras with equal frame rates by exposure time.
+    """A matcher of the frames of two cameras with equal frame rates by exposure time.
 
     The cameras have no common trigger. Two frames are a pair if the time between their exposures is
     at most half a period, plus a tolerance. Otherwise the older frame is dropped.

@@ -11,9 +11,9 @@ and the sheet's offset s:
     s(t) = slope (y_j + y'_j (t - j T - delay))
 
 Here y_j is the filtered depth of measurement j, and y'_j is the filter's estimate of the rate of
-the depth. The alpha-beta filter estimates the depth and its rate. Its depth does not lag behind a
-depth that changes at a constant rate. The state changes over one period by a linear map, which is
-computed exactly. The control loop is stable if all eigenvalues of this map are inside the unit
+the depth. The alpha-beta filter estimates the depth and its rate. The filtered depth does not lag
+behind a depth with a constant rate. A linear map, computed exactly, describes the change of the
+state over one period. The control loop is stable if all eigenvalues of this map are inside the unit
 circle.
 """
 
@@ -79,8 +79,7 @@ Mussa-Ivaldi, Hogan and Bizzi 1985. The damping ratios of wrist and arm are 0.15
 """
 
 LIMITING_HANDS = tuple(hand for name, hand in HANDS.items() if "low damping" in name)
-"""The hands with low damping. These hands become unstable first, so only they determine the bounds.
-"""
+"""The hands with low damping, which determine the bounds because they become unstable first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +102,7 @@ def compute_filter_gains(bandwidth_rad_per_s: float, step_s: float) -> tuple[flo
     """Return the gains (alpha, beta) of the depth's filter for a step of `step_s`.
 
     The filter has the poles of a continuous filter with the damping ratio `FILTER_DAMPING_RATIO`.
-    With an infinite bandwidth, it returns the measured depth and the last change of this depth.
+    With an infinite bandwidth, the filter returns the measured depth and its last change.
     """
     if math.isinf(bandwidth_rad_per_s):
         return 1.0, 1.0
@@ -118,9 +117,9 @@ def make_loop_matrices(
 ) -> Floats:
     """Return the matrices (k, n, n) that map the state over one period, for slopes (k,).
 
-    The state contains depth and speed, and the filter's estimates of both. It also contains the
-    sheet offsets that have not yet taken effect, and the last two offsets that have taken effect.
-    The offsets are sorted from newest to oldest.
+    The state contains depth and speed, the filter's estimates of both, and sheet offsets from
+    newest to oldest. These are all offsets that have not yet taken effect, and the last two that
+    have.
     """
     whole, fraction = divmod(loop.delay_s / loop.period_s, 1.0)
     waiting = int(whole) + 1
@@ -224,7 +223,7 @@ class OffsetBounds:
     max_retreats: Floats
 
     def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) of a motion of the sheet towards the finger.
+        """Return the maximum slopes (n,) at which the sheet may move towards the finger.
 
         A slope is the sheet offset divided by the finger depth. stiffnesses_n_per_m (n,):
         stiffnesses of the sheet.
@@ -232,7 +231,7 @@ class OffsetBounds:
         return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
-        """Return the maximum slopes (n,) of a motion of the sheet away from the finger.
+        """Return the maximum slopes (n,) at which the sheet may move away from the finger.
 
         A slope is the sheet offset divided by the finger depth. stiffnesses_n_per_m (n,):
         stiffnesses of the sheet.
@@ -320,8 +319,6 @@ def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBou
 
 
 def _descend(slopes: Floats) -> Floats:
-    """Reduce slopes (d, f, k) so that they never increase with the delay (d) or the stiffness
-    (k).
-    """
+    """Make slopes (d, f, k) non-increasing over the delay (d) and the stiffness (k)."""
     result = np.minimum.accumulate(np.minimum.accumulate(slopes, axis=0), axis=2)
     return np.asarray(result)

@@ -18,8 +18,8 @@ period."""
 class MeasuredPeriod:
     """An estimator of the period of messages that are published once per camera image.
 
-    scene_period_s: camera period in the scene, s. It is used until enough messages have been added,
-        and while the measured period is close to it.
+    scene_period_s: camera period in the scene, s. This period is used until enough messages have
+        been added, and as long as the measured period is close.
     """
 
     def __init__(self, scene_period_s: float) -> None:
@@ -30,7 +30,7 @@ class MeasuredPeriod:
     def add(self, source_ns: int) -> float:
         """Add a message, and return the estimated period (s).
 
-        source_ns: source timestamp of the message, which is the time of the camera exposure.
+        source_ns: source timestamp of the message: the time of the camera exposure.
         """
         interval_s = (source_ns - self._last_ns) * 1e-9
         self._last_ns = source_ns

@@ -31,8 +31,8 @@ def closing_speed(distance: Floats | float, deceleration: Floats | float, step_s
     """Return the maximum speeds (n,) at which a point can stop within distances (n,) >= 0 (m).
 
     In each step, the point moves by speed * step_s, and then its speed decreases by deceleration *
-    step_s. The speed w fulfils w^2/(2 a) + w dt/2 = distance, with deceleration a and step dt. It
-    is at most distance / dt.
+    step_s. The speed w fulfils w^2/(2 a) + w dt/2 = distance, with deceleration a and step dt. The
+    speed is at most distance / dt.
     """
     half = 0.5 * deceleration * step_s
     speed = np.sqrt(half * half + 2.0 * deceleration * distance) - half

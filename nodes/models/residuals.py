@@ -1,6 +1,6 @@
 """Detect from noisy residuals that the scene describes the hardware incorrectly.
 
-A residual is a measured value minus its expected value. Its mean is computed with exponentially
+A residual is a measured value minus its expected value. The mean of the residuals has exponentially
 decaying weights. An error is suspected when the mean has exceeded a threshold for some time without
 interruption.
 """

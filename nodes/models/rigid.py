@@ -75,7 +75,7 @@ def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
 def vector_from_rotation(rotation: Floats) -> Floats:
     """Return the rotation vector (3,), rad, of a rotation matrix (3, 3).
 
-    Its length is from 0 to pi. It is accurate near both limits.
+    The length of the vector is from 0 to pi. The result is accurate near both limits.
     """
     w, x, y, z = quaternion_from_rotation(rotation).tolist()
     length = sqrt(x * x + y * y + z * z)
@@ -142,8 +142,7 @@ def apply(a_from_b: Floats, points_b: Floats) -> Floats:
 
 
 def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
-    """Return whether a matrix is a rigid transform: finite, of shape (4, 4), with the last row (0 0
-    0 1).
+    """Return whether a matrix is a finite rigid transform (4, 4) with the last row (0 0 0 1).
 
     tolerance: maximum magnitude of the dot product of two different rows of the rotation matrix.
     """

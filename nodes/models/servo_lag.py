@@ -107,14 +107,14 @@ class ServoLagEstimator:
     """An estimator of the lag of one arm behind its commands.
 
     estimate: newest estimate; None before the first estimate.
-    lag_s: lag to use, in seconds, always within the bounds. It starts at the initial lag and
+    lag_s: lag to use, in seconds, always within the bounds. The value starts at the initial lag and
         changes slowly towards the estimate.
     """
 
     def __init__(self, initial_s: float, bounds: LagBounds) -> None:
         """Create an estimator without data.
 
-        initial_s: initial lag, which is limited to the bounds, s.
+        initial_s: initial lag, s; limited to the bounds.
         """
         self.estimate: LagEstimate | None = None
         self.lag_s = bounds.clip(initial_s)

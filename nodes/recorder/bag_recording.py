@@ -27,11 +27,12 @@ RETRY_NS = 5_000_000_000
 
 
 class BagRecording:
-    """A recorder of messages to bags, which writes while recording is requested.
+    """A recorder that writes messages to bags while recording is requested.
 
-    A bag is closed when the free disk space falls to `keep_free_bytes`, which leaves space for the
-    bag's index. When twice as much space is free again, a new bag starts with the last messages of
-    all latched topics. Disk errors during writing are passed to `on_error` and not raised.
+    A bag is closed when the free disk space falls to `keep_free_bytes`. The remaining space
+    suffices for the index of the bag. When twice as much space is free again, a new bag starts with
+    the last messages of all latched topics. Disk errors during writing are passed to `on_error` and
+    not raised.
 
     note: state of the recording in one line. lost: number of messages that were lost since the last
         bag.
@@ -62,7 +63,7 @@ class BagRecording:
         return None if self._bag is None else self._bag.path
 
     def start(self) -> None:
-        """Start a bag whose name contains the current time; raises BagError or OSError."""
+        """Start a bag with the current time in its name. Raises BagError or OSError."""
         self.requested, self.lost = True, 0
         # The time of day is only used to name the bag.
         now = datetime.now(UTC)
@@ -93,7 +94,7 @@ class BagRecording:
             self._end_bag(error)
 
     def check_disk(self) -> None:
-        """End the bag if free disk space is low, and start a new bag when there is enough space.
+        """End the bag if free disk space is low, and start a new bag if there is enough space.
 
         A new bag is also started when the current bag reaches the maximum size or duration.
         """
@@ -151,7 +152,7 @@ class BagRecording:
         return self.requested
 
     def close(self) -> None:
-        """Close the bag; raise BagError if the bag could not be written completely."""
+        """Close the bag. Raises BagError if the bag is incomplete."""
         if self._bag is not None:
             self._bag.close()
 
@@ -199,7 +200,7 @@ def free_path(path: Path) -> Path:
 def open_bag(
     path: Path, recording: Mapping[str, str], *, compress: bool, attach: Iterable[Path]
 ) -> BagWriter:
-    """Open a bag at a free path, and attach files to the bag; raises BagError or OSError.
+    """Open a bag at a free path, and attach files. Raises BagError or OSError.
 
     recording: texts that identify the recording, by name. attach: files to store in the bag.
     """

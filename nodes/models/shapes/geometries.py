@@ -72,8 +72,7 @@ def map_round_solid(half_m: Floats) -> CuboidMap:
 
 
 def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
-    """Return a map for meshing. It moves points on the surface of a box to their nearest points on
-    `shape`.
+    """Return a map for meshing, from the surface of a box to the nearest points on `shape`.
 
     half_m (3,): half extents of the box.
     """
@@ -83,8 +82,8 @@ def map_nearest_points(half_m: Floats, shape: Shape) -> CuboidMap:
 def cube_to_sphere(w: Floats) -> Floats:
     """Map points w (n, 3) on the surface of the cube [-1, 1]^3 to the unit sphere.
 
-    The map is smooth and nearly area-preserving. Its first coordinate is w1 sqrt(1 - w2^2/2 -
-    w3^2/2 + w2^2 w3^2/3). The other coordinates follow by cyclic permutation.
+    The map is smooth and nearly area-preserving. The first coordinate of the result is w1 sqrt(1 -
+    w2^2/2 - w3^2/2 + w2^2 w3^2/3). The other coordinates follow by cyclic permutation.
     """
     square = np.square(w)
     second, third = np.roll(square, -1, axis=1), np.roll(square, -2, axis=1)

@@ -223,10 +223,10 @@ class EllipsoidShape(Convex):
         With the semi-axes e_i, the nearest point to a query q is x_i = e_i^2 q_i / (t + e_i^2). t
         is the largest root of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to
         an Ellipsoid, 2013). Newton's method is applied to the reciprocal of the square root of this
-        sum, which is concave in t, so the method converges monotonically (Conn, Gould, Toint,
-        Trust-Region Methods, sec. 7.3). On a plane of symmetry, the terms have poles. Therefore
-        queries on such a plane are moved by a billionth of the shortest axis in the directions
-        `sides` (n, 3).
+        sum. This function is concave in t, so the method converges monotonically (Conn, Gould,
+        Toint, Trust-Region Methods, sec. 7.3). On a plane of symmetry, the terms have poles.
+        Therefore queries on such a plane are moved by a billionth of the shortest axis in the
+        directions `sides` (n, 3).
         """
         axes = np.array(self.semi_axes_m)
         nudge = 1e-9 * axes.min()

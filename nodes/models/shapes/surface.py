@@ -29,8 +29,8 @@ MAX_QUERY_M = 1e6
 FRONT = np.array([0.0, 0.0, 1.0])
 """The direction in which the nearest point is chosen if several surface points are equally near.
 
-This direction is used if there is no previous point. It points to the user if the object is not
-rotated.
+This direction is used if there is no previous point. Without a rotation of the object, the
+direction points to the user.
 """
 
 
@@ -74,9 +74,9 @@ class Shape(Protocol):
         """Find the touchable surface points that are nearest to `points`.
 
         previous: nearest points of the previous queries, with the shape of `points`; None for a new
-            contact. They make the results continuous over time. The locally nearest point that
-            continues a previous point is returned as long as it exists. It is returned even if
-            another point is equally near, or nearer inside the object.
+            contact. The results are then continuous over time: the search returns the local minimum
+            of the distance that continues the previous point, as long as this minimum exists.
+            Another point may be equally near, or nearer inside the object.
 
         Raises ValueError for points that are not finite, not of shape (3,) or (n, 3), or beyond
         `MAX_QUERY_M`.
@@ -91,7 +91,7 @@ class Shape(Protocol):
         ...
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return the height (m) by which the object rises above its tangent plane at a point (3,).
+        """Return the maximum height (m) of the object above its tangent plane at a point (3,).
 
         normal (3,): unit normal at the point. radius_m: maximum considered distance from the point,
             measured along the plane.
@@ -108,7 +108,7 @@ class Convex:
     __slots__ = ()
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """Return 0, because a convex solid is never above its tangent planes."""
+        """Return 0."""
         return 0.0
 
 
@@ -139,8 +139,9 @@ def tightest_curvature(shape_operator: Floats) -> float:
 def projection_jacobian(found: Nearest) -> Floats:
     """Return the derivative (..., 3, 3) of the nearest point with respect to the query.
 
-    It is (I + h W)^-1 P with the height h of the query and the shape operator W. P projects onto
-    the tangent plane. Raises LinAlgError at a centre of curvature, where I + h W is singular.
+    The derivative is (I + h W)^-1 P with the height h of the query, the shape operator W and the
+    projection P onto the tangent plane. Raises LinAlgError at a centre of curvature, where I + h W
+    is singular.
     """
     normal, operator = found.normal, found.shape_operator
     tangent = np.eye(3) - normal[..., :, None] * normal[..., None, :]
@@ -166,7 +167,7 @@ def check_points(points: ArrayLike, name: str = "points") -> Floats:
 
 
 def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
-    """Convert the nearest points of the previous query to a float array; return None for None.
+    """Convert the previous nearest points to a float array; return None for None.
 
     Raises ValueError if their shape differs from that of `points`.
     """
@@ -188,8 +189,8 @@ def check_positive(**lengths_m: float) -> None:
 LevelSet = Callable[[Floats], tuple[Floats, Floats, Floats, Floats]]
 """A function f of points (n, 3) that describes a surface by f = 0 and increases outwards.
 
-It returns values (n,), gradients (n, 3), Hessians (n, 3, 3) and supports (n,). The support measures
-how well f is defined at a point. It is 0 far away from the surface.
+The function returns values (n,), gradients (n, 3), Hessians (n, 3, 3) and supports (n,). The
+support is a measure of the validity of f at a point, and is 0 far away from the surface.
 """
 
 
@@ -287,8 +288,7 @@ def descend_one(
 ) -> SurfaceProjections:
     """Project one query (3,) by the method of `descend`. The results have length one.
 
-    The code computes the two tangent directions with Python numbers, which is faster than
-    operations on small arrays.
+    The computation with Python numbers is faster than operations on small arrays.
     """
     qx, qy, qz = query.tolist()
     x, y, z = start.tolist()

@@ -39,10 +39,10 @@ def check_mesh(vertices: Floats, triangles: Indices) -> None:
 
     vertices (v, 3): positions, m. triangles (t, 3): indices of vertices.
 
-    The check covers array shapes, size and vertex indices, degenerate and repeated triangles, and
-    holes. It also covers edges of more than two triangles, inconsistent winding, parts that share a
-    single vertex, folded neighbours, and wrong orientation. It does not search for intersections of
-    triangles, which `count_intersections` counts.
+    The check covers array shapes, size, vertex indices, degenerate and repeated triangles, holes,
+    edges of more than two triangles, inconsistent winding, parts that share a single vertex, folded
+    neighbours, and wrong orientation. Intersections of triangles are not checked; see
+    `count_intersections`.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise MeshError(

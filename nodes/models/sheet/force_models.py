@@ -106,8 +106,9 @@ def relative_position(
 
 
 MAX_RELATIVE_X = 0.98
-"""The maximum relative x that closed-form models use. At x = 1 (the clamp), their force is
-infinite."""
+"""The maximum relative x in closed-form models. At x = 1 (the clamp), the force would be
+infinite.
+"""
 
 
 MAX_STRETCH_RATIO = 1.13
@@ -182,8 +183,8 @@ class ScaledSheetModel:
     a, b, c, g, p, q, r and A are fitted. A and c depend on position, fingertip radius and height.
 
     cubic_ratio: ratio of the calibrated cubic term to that of ideal rubber.
-    stretch_scale: ratio of the calibrated to the nominal stretch ratio. It corrects the sheet's
-        slack width.
+    stretch_scale: ratio of the calibrated to the nominal stretch ratio, which corrects the slack
+        width of the sheet.
     """
 
     rubber: Rubber
@@ -246,7 +247,7 @@ class ScaledSheetModel:
 
 @dataclass(frozen=True, slots=True)
 class MembraneSheetModel:
-    """A finite-element membrane model of the sheet's force, which is the most accurate force model.
+    """A finite-element membrane model of the sheet's force. This force model is the most accurate.
 
     One evaluation takes seconds. cells: number of elements along each side of the sheet.
     """

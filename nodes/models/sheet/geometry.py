@@ -35,7 +35,7 @@ def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats
 def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_m: float) -> Floats:
     """Return the sheet's corners (4, 3), m, in the world frame.
 
-    Their order is bottom left, bottom right, top right, top left. height_m: length of an edge.
+    The order is bottom left, bottom right, top right, top left. height_m: length of an edge.
     """
     half = 0.5 * height_m
     left, right = world_from_left_edge, world_from_right_edge
@@ -50,8 +50,7 @@ def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_
 
 
 def flange_pose(world_from_edge: Floats, flange_from_edge: Floats) -> Floats:
-    """Return the pose world_from_flange (4, 4) of an arm's flange from the pose of its clamped
-    edge.
+    """Return the pose world_from_flange (4, 4) of the flange that holds a clamped edge.
 
     flange_from_edge (4, 4): pose of the edge in the frame of the flange.
     """

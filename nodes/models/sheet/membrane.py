@@ -1,7 +1,7 @@
 """Compute the shape and forces of the pushed sheet by finite elements of a membrane.
 
 The elements are bilinear cells with four integration points. The material is incompressible
-Mooney-Rivlin rubber in plane stress. Its energy W per volume has the constants C1 and C2. E is
+Mooney-Rivlin rubber in plane stress. The energy W per volume has the constants C1 and C2. E is
 Young's modulus, and C2 = 0 is a neo-Hookean material:
 
     W = C1 (I1 - 3) + C2 (I2 - 3),    E = 6 (C1 + C2)
@@ -12,8 +12,8 @@ gradient. A membrane wrinkles under compression (tension field theory: Pipkin, I
 energy is that of uniaxial tension. If l1 is below 1 too, the energy is zero. Stress and tangent
 (its derivative with respect to the strain) are computed in the principal frame of C.
 
-The fingertip is a rigid sphere that is pushed along the flat sheet's normal. Nodes that it touches
-stick to it. Newton's method computes each equilibrium from the previous equilibrium, with
+The fingertip is a rigid sphere that is pushed along the flat sheet's normal. Touched nodes stick to
+the sphere. Newton's method computes each equilibrium from the previous equilibrium, with
 Levenberg-Marquardt damping where the slack sheet has no stiffness.
 """
 
@@ -407,8 +407,8 @@ class _FingerContact:
 def _predict_state(
     grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """Predict the next equilibrium by scaling the indentation to the new depth. The first one is a
-    cone.
+    """Predict the next equilibrium by scaling the indentation to the new depth. The first
+    indentation is a cone.
 
     push: current depth and its increase in this step (m).
     """

@@ -28,7 +28,7 @@ stretch ratios from 1.02 to 1.08 and |v| up to 0.25.
 """
 
 GRAVITY_M_PER_S2 = 9.81
-"""The gravitational acceleration, m/s^2. It acts along the negative y axis of the world."""
+"""The gravitational acceleration, m/s^2, along the negative y axis of the world."""
 
 PUSH_FACTOR = 0.95
 """The factor on edge force / width that gives the stiffness of a small push.
@@ -40,8 +40,8 @@ The factor is 0.9 to 1.0 for a fingertip with a radius of 10 mm.
 def strain_measure(stretch_ratio: float, mooney_ratio: float = 0.0) -> float:
     """Return the ratio of the nominal stress to Young's modulus in uniaxial tension of rubber.
 
-    The ratio is (s - s^-2)/3 (1 - m + m/s) with the stretch ratio s and the Mooney ratio m. It is 0
-    for a slack sheet.
+    The ratio is (s - s^-2)/3 (1 - m + m/s) with the stretch ratio s and the Mooney ratio m. The
+    ratio is 0 for a slack sheet.
     """
     s = max(stretch_ratio, 1.0)
     return (s - s**-2) / 3.0 * (1.0 - mooney_ratio + mooney_ratio / s)
