@@ -48,9 +48,11 @@ def make_digest(value: object) -> str:
 class Specification(Generic[T]):
     """The key of a cached result, and the functions that convert the result to arrays and back.
 
-    kind: first part of the file name. depends_on: JSON value of all inputs, including the version
-    of the code that computes the result. decode: function from arrays to the result, which raises
-    one of the exceptions `DAMAGE` for invalid arrays.
+    kind: first part of the file name.
+    depends_on: JSON value of all inputs, including the version of the code that computes the
+        result.
+    decode: function from arrays to the result, which raises one of the exceptions `DAMAGE` for
+        invalid arrays.
     """
 
     kind: str
@@ -213,8 +215,8 @@ class EtaEstimator:
     def text(self, done: int, total: int, now_s: float) -> str:
         """Return the progress as text, such as "40 %, about 3 min left".
 
-        done, total: numbers of steps. now_s: current time. If `total` changes or `done` decreases,
-        a new estimate starts.
+        done, total: numbers of steps.
+        now_s: current time. If `total` changes or `done` decreases, a new estimate starts.
         """
         if total != self._total or done < self._last:
             self._total, self._start_s = total, now_s

@@ -72,9 +72,10 @@ def rotate_x_axis(quaternion: Floats) -> Floats:
 def make_eye(centre_world_m: Floats, right_world: Floats, scene: Scene) -> Eye:
     """Make a message with the position of the user's eyes.
 
-    centre_world_m (3,): midpoint of the eyes. right_world (3,): unit vector from the left to the
-    right eye. Raises RejectedError if the position is not finite, or too far from the scene's
-    position.
+    centre_world_m (3,): midpoint of the eyes.
+    right_world (3,): unit vector from the left to the right eye.
+
+    Raises RejectedError if the position is not finite, or too far from the scene's position.
     """
     check_finite(centre_world_m)
     if np.linalg.norm(centre_world_m - scene.eyes.centre_world_m) > MAX_EYE_OFFSET_M:

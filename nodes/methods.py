@@ -69,13 +69,15 @@ def estimate_median(values: Sequence[float]) -> Interval:
 class Trial:
     """A measurement of one method at one case.
 
-    run: function whose time is measured. error: function from the result of `run` to the error in
-    the unit of the method family. It returns an interval if the error is estimated from random
-    samples. in_range: whether the method's valid range includes the case. in_scene: whether the
-    scene's working range includes the case. size: size of the solved problem, such as
-    {"skin_nodes": 1210}. extra_metrics: function from the result of `run` to further results, with
-    units in their names. reference_uncertainty: uncertainty of the reference, by the name of the
-    result ("error" or an extra metric).
+    run: function whose time is measured.
+    error: function from the result of `run` to the error in the unit of the method family. It
+        returns an interval if the error is estimated from random samples.
+    in_range: whether the method's valid range includes the case.
+    in_scene: whether the scene's working range includes the case.
+    size: size of the solved problem, such as {"skin_nodes": 1210}.
+    extra_metrics: function from the result of `run` to further results, with units in their names.
+    reference_uncertainty: uncertainty of the reference, by the name of the result ("error" or an
+        extra metric).
     """
 
     method: str
@@ -120,8 +122,9 @@ class Point:
     """The measured time and error of one method at one case. The class `Trial` describes further
     fields.
 
-    params: case and size of the solved problem. median_range_s, error_range: limits of the 95 %
-    confidence intervals; None if the value is exact or its spread was not measured.
+    params: case and size of the solved problem.
+    median_range_s, error_range: limits of the 95 % confidence intervals; None if the value is exact
+        or its spread was not measured.
     """
 
     method: str

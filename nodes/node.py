@@ -481,8 +481,8 @@ class Node:
     async def handle(self, port: str, message: Message, header: Header, clock_problem: str) -> None:
         """Store a message in its input, call its handler, and wait until it is finished.
 
-        header: header with timestamps of this host's clock. clock_problem: reason why they are not
-        reliable, or "".
+        header: header with timestamps of this host's clock.
+        clock_problem: reason why they are not reliable, or "".
         """
         self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)

@@ -330,8 +330,8 @@ async def run_node(
 ) -> None:
     """Create and connect a node, and run it until `stop` is set or one of its tasks fails.
 
-    heartbeat: pipe to the launcher; None if there is no launcher. local: bus between the nodes of
-    one process; None if the process has only one node.
+    heartbeat: pipe to the launcher; None if there is no launcher.
+    local: bus between the nodes of one process; None if the process has only one node.
     """
     heartbeat = heartbeat or Heartbeat(None)
     class_ = node_class(config.type)

@@ -30,8 +30,9 @@ def open_reader(
 ) -> Reader:
     """Open the source of a camera's images.
 
-    camera: camera of the scene. now: function that returns the current time (ns). requested: sensor
-        regions that the camera must deliver; None for the full sensors.
+    camera: camera of the scene.
+    now: function that returns the current time (ns).
+    requested: sensor regions that the camera must deliver; None for the full sensors.
     Raises DeviceError if the source cannot be opened.
     """
     if isinstance(source, OpenCvSource):

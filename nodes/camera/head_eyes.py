@@ -87,8 +87,8 @@ def locate_eyes(
 class EyeFilter:
     """A 1 euro filter for the positions of the eyes.
 
-    min_cutoff_hz: cut-off frequency at rest. cutoff_per_speed_hz: increase of the cut-off frequency
-        per unit of speed.
+    min_cutoff_hz: cut-off frequency at rest.
+    cutoff_per_speed_hz: increase of the cut-off frequency per unit of speed.
     """
 
     def __init__(self, min_cutoff_hz: float, cutoff_per_speed_hz: float) -> None:

@@ -135,7 +135,8 @@ class HeadCamera(Node):
     def _receive(self, at_ns: int, pixels: Floats | None) -> None:
         """Publish the eye positions in one image.
 
-        at_ns: time of the exposure. pixels: positions (2, 2) of both eyes, px; None without a face.
+        at_ns: time of the exposure.
+        pixels: positions (2, 2) of both eyes, px; None without a face.
         """
         scene, last_ns = self.current_scene, self._published_ns
         if scene is None or (last_ns is not None and at_ns <= last_ns):

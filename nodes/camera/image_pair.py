@@ -108,7 +108,8 @@ def make_stereo_message(
 ) -> StereoPair:
     """Make the message for an image pair.
 
-    device: name of the camera. exposure_s: exposure time that is used if the device reports none.
+    device: name of the camera.
+    exposure_s: exposure time that is used if the device reports none.
     """
     origins = [(region.column, region.row) for region in images.regions or ()] or [(0, 0)] * 2
     return StereoPair(
@@ -146,7 +147,8 @@ def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
 def describe_skew(skew_s: float, limit_s: float) -> str:
     """Return the reason for the rejection of an image pair, as text.
 
-    skew_s: time between the left and the right exposure. limit_s: maximum of this time.
+    skew_s: time between the left and the right exposure.
+    limit_s: maximum of this time.
     """
     return (
         f"{1e3 * skew_s:.1f} ms between left and right exposure, maximum {1e3 * limit_s:g} ms; "

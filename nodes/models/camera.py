@@ -69,7 +69,8 @@ def undistort(distorted: Floats, distortion: Floats) -> Floats:
 def project(points_camera: Floats, matrix: Floats, distortion: Floats) -> Floats:
     """Return the pixels (..., 2) of points (..., 3) in the camera frame, m, with z > 0.
 
-    matrix: camera matrix (3, 3). distortion: coefficients, as for `distort`.
+    matrix: camera matrix (3, 3).
+    distortion: coefficients, as for `distort`.
     """
     normalized = distort(points_camera[..., :2] / points_camera[..., 2:], distortion)
     return normalized @ matrix[:2, :2].T + matrix[:2, 2]
@@ -78,8 +79,10 @@ def project(points_camera: Floats, matrix: Floats, distortion: Floats) -> Floats
 def normalize(pixels: Floats, matrix: Floats, distortion: Floats) -> Floats:
     """Return the undistorted normalized coordinates (..., 2) of pixels (..., 2).
 
-    The ray of normalized coordinates (x, y) has the direction (x, y, 1). matrix: camera matrix (3,
-    3). distortion: coefficients, as for `distort`.
+    The ray of normalized coordinates (x, y) has the direction (x, y, 1).
+
+    matrix: camera matrix (3, 3).
+    distortion: coefficients, as for `distort`.
     """
     distorted = (pixels - matrix[:2, 2]) / np.array([matrix[0, 0], matrix[1, 1]])
     return undistort(distorted, distortion)

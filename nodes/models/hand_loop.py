@@ -225,16 +225,18 @@ class OffsetBounds:
     def max_advance(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
         """Return the maximum slopes (n,) at which the sheet may move towards the finger.
 
-        A slope is the sheet offset divided by the finger depth. stiffnesses_n_per_m (n,):
-        stiffnesses of the sheet.
+        A slope is the sheet offset divided by the finger depth.
+
+        stiffnesses_n_per_m (n,): stiffnesses of the sheet.
         """
         return self._interpolate(self.max_advances, bandwidth_rad_per_s, stiffnesses_n_per_m)
 
     def max_retreat(self, bandwidth_rad_per_s: float, stiffnesses_n_per_m: Floats) -> Floats:
         """Return the maximum slopes (n,) at which the sheet may move away from the finger.
 
-        A slope is the sheet offset divided by the finger depth. stiffnesses_n_per_m (n,):
-        stiffnesses of the sheet.
+        A slope is the sheet offset divided by the finger depth.
+
+        stiffnesses_n_per_m (n,): stiffnesses of the sheet.
         """
         return self._interpolate(self.max_retreats, bandwidth_rad_per_s, stiffnesses_n_per_m)
 

@@ -110,7 +110,8 @@ def _clamp_length(vector: Floats, longest: float) -> Floats:
 class SheetMotion:
     """The state of the sheet's motion.
 
-    world_from_sheet: pose (4, 4), m. twist_world: linear and angular velocity (6,), m/s and rad/s.
+    world_from_sheet: pose (4, 4), m.
+    twist_world: linear and angular velocity (6,), m/s and rad/s.
     stretch_ratio, stretch_rate_per_s: stretch ratio and its rate of change.
     """
 
@@ -159,7 +160,8 @@ def follow_sheet(
 ) -> SheetMotion:
     """Return the sheet's motion after one step towards `target`.
 
-    target: motion of the target at the end of the step. step_s: duration of the step.
+    target: motion of the target at the end of the step.
+    step_s: duration of the step.
     """
     away = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(
@@ -225,7 +227,8 @@ def follow_sheet(
 def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> SheetMotion:
     """Return the sheet's motion after one step of maximum deceleration.
 
-    bounds: limits of the deceleration. step_s: duration of the step.
+    bounds: limits of the deceleration.
+    step_s: duration of the step.
     """
     linear = _decelerate(now.twist_world[:3], bounds.acceleration_m_per_s2 * step_s)
     angular = _decelerate(now.twist_world[3:], bounds.turn_acceleration_rad_per_s2 * step_s)

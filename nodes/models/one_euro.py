@@ -14,9 +14,9 @@ from flexsheet.nodes.arrays import Floats
 class OneEuro:
     """A low-pass filter of a vector (n,) whose cut-off frequency increases with the speed.
 
-    min_cutoff_hz: cut-off frequency at rest. cutoff_per_speed: increase of the cut-off frequency
-    (Hz) per unit of speed. speed_cutoff_hz: cut-off frequency of the low-pass filter of the
-    velocity.
+    min_cutoff_hz: cut-off frequency at rest.
+    cutoff_per_speed: increase of the cut-off frequency (Hz) per unit of speed.
+    speed_cutoff_hz: cut-off frequency of the low-pass filter of the velocity.
     """
 
     min_cutoff_hz: float

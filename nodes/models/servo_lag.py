@@ -184,8 +184,9 @@ class ServoLagEstimator:
     def _add(self, measured: Floats, wanted_s: Floats, timing_s: Floats, step_s: float) -> None:
         """Add one measurement to the weighted means and variances of all lags.
 
-        measured (6,): measured joint angles, rad. wanted_s: times of the commands with which the
-        angles are compared, one for each lag. timing_s (2,): answer delay and command interval.
+        measured (6,): measured joint angles, rad.
+        wanted_s: times of the commands with which the angles are compared, one for each lag.
+        timing_s (2,): answer delay and command interval.
         step_s: weight of the measurement.
         """
         times, joints = self._times_s[: self._count], self._joints[: self._count]

@@ -34,8 +34,8 @@ class BagRecording:
     the last messages of all latched topics. Disk errors during writing are passed to `on_error` and
     not raised.
 
-    note: state of the recording in one line. lost: number of messages that were lost since the last
-        bag.
+    note: state of the recording in one line.
+    lost: number of messages that were lost since the last bag.
     """
 
     def __init__(
@@ -202,7 +202,8 @@ def open_bag(
 ) -> BagWriter:
     """Open a bag at a free path, and attach files. Raises BagError or OSError.
 
-    recording: texts that identify the recording, by name. attach: files to store in the bag.
+    recording: texts that identify the recording, by name.
+    attach: files to store in the bag.
     """
     bag = BagWriter(free_path(path), {"recording": recording}, compress=compress)
     try:

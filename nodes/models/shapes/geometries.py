@@ -33,10 +33,10 @@ size."""
 class CuboidMap:
     """A map from the surface of the cube [-1, 1]^3 to the surface of a solid, used for meshing.
 
-    half_m: half extents (3,) of the solid. inner_m: half extents (3,) that the mesh's lattice has
-    before it is distorted. surface: function that maps points (n, 3) on the cube to points (n, 3),
-    in m, on the solid. is_round: whether the whole surface is curved, as on an ellipsoid; false if
-    it has flat faces.
+    half_m: half extents (3,) of the solid.
+    inner_m: half extents (3,) that the mesh's lattice has before it is distorted.
+    surface: function that maps points (n, 3) on the cube to points (n, 3), in m, on the solid.
+    is_round: whether the whole surface is curved, as on an ellipsoid; false if it has flat faces.
     """
 
     half_m: Floats

@@ -116,7 +116,8 @@ if TYPE_CHECKING:
 def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
     """Return the default smoothing length (m) of a mesh: 1.75 times its median edge length.
 
-    vertices (v, 3): positions, m. triangles (t, 3): indices of vertices.
+    vertices (v, 3): positions, m.
+    triangles (t, 3): indices of vertices.
 
     With a shorter length, users would feel the facets. With a longer length, curved parts would be
     flattened. `benchmarks.shapes` measures both effects.
@@ -132,7 +133,8 @@ class SmoothMeshShape:
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
         """Fit the local quadratics (jets) that define the smooth surface of a closed mesh.
 
-        vertices_m (v, 3), triangles (t, 3): mesh. smoothing_m: smoothing length, m.
+        vertices_m (v, 3), triangles (t, 3): mesh.
+        smoothing_m: smoothing length, m.
 
         Raises MeshError for a mesh that does not bound a solid, or that is too small for the
         smoothing length. Raises ValueError for a smoothing length that is not positive.
@@ -300,9 +302,9 @@ class SmoothMeshShape:
     ) -> tuple[Indices, Indices]:
         """Choose further starting points for the search for a nearer surface point.
 
-        lists: indices of the candidate jets (local quadratic fits) of each query. feet (n, 3),
-            distance (n,): nearest surface points found before, and their distances from the
-            queries, in m.
+        lists: indices of the candidate jets (local quadratic fits) of each query.
+        feet (n, 3), distance (n,): nearest surface points found before, and their distances from
+            the queries, in m.
 
         Return k pairs: indices of the queries (k,) and of the jets (k,) at which to start. A jet is
         chosen if the nearest point on its quadratic is close to the jet and not much farther than
@@ -531,7 +533,8 @@ def _put(
 ) -> None:
     """Replace rows of `feet` by rows of `other`, in place.
 
-    rows: indices of the replaced rows. chosen: selects the rows of `other`.
+    rows: indices of the replaced rows.
+    chosen: selects the rows of `other`.
     """
     feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
     feet.shape_operator[rows] = other.shape_operator[chosen]

@@ -253,8 +253,8 @@ class EllipsoidShape(Convex):
 class RoundedBoxShape(Convex):
     """A box centred on the origin, with rounded edges and corners.
 
-    size_m: full extents along x, y and z, including the rounding. edge_radius_m: radius of edges
-    and corners, at most half of the smallest extent.
+    size_m: full extents along x, y and z, including the rounding.
+    edge_radius_m: radius of edges and corners, at most half of the smallest extent.
 
     The normal is continuous along the surface, but the curvature is not. The core is the box that
     contains the centres of curvature of all edges and corners.

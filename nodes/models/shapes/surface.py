@@ -93,8 +93,8 @@ class Shape(Protocol):
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
         """Return the maximum height (m) of the object above its tangent plane at a point (3,).
 
-        normal (3,): unit normal at the point. radius_m: maximum considered distance from the point,
-            measured along the plane.
+        normal (3,): unit normal at the point.
+        radius_m: maximum considered distance from the point, measured along the plane.
 
         The result is 0 where the object is not concave. Heights near the limit of the radius are
         reduced, so that the result changes continuously with the point.
@@ -227,7 +227,8 @@ def descend(
 ) -> SurfaceProjections:
     """Project `queries` (n, 3) to their nearest surface points, starting at `starts` (n, 3), m.
 
-    stride_m: maximum step. rest_m: step below which the method has converged.
+    stride_m: maximum step.
+    rest_m: step below which the method has converged.
 
     Newton's method minimises |x - q|^2 for each query q on the surface f(x) = 0 (Nocedal and
     Wright, Numerical Optimization, ch. 18). A step has a part along the gradient, towards the
@@ -352,8 +353,10 @@ def _downhill(
 ) -> tuple[float, float, float]:
     """Solve the symmetric 2x2 system of a Newton step, after its eigenvalues are made positive.
 
-    b11, b12, b22: entries of the matrix. slope: right-hand side. Return the two components of the
-    step and the smaller eigenvalue of the original matrix.
+    b11, b12, b22: entries of the matrix.
+    slope: right-hand side.
+
+    Return the two components of the step and the smaller eigenvalue of the original matrix.
     """
     middle, spread = 0.5 * (b11 + b22), hypot(0.5 * (b11 - b22), b12)
     angle = 0.5 * atan2(2.0 * b12, b11 - b22)

@@ -37,7 +37,8 @@ class MeshError(FlexsheetError, ValueError):
 def check_mesh(vertices: Floats, triangles: Indices) -> None:
     """Raise MeshError unless a mesh is the closed, consistently wound surface of a solid.
 
-    vertices (v, 3): positions, m. triangles (t, 3): indices of vertices.
+    vertices (v, 3): positions, m.
+    triangles (t, 3): indices of vertices.
 
     The check covers array shapes, size, vertex indices, degenerate and repeated triangles, holes,
     edges of more than two triangles, inconsistent winding, parts that share a single vertex, folded
@@ -360,7 +361,8 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
     """Return whether each segment passes through the interior of its triangle, as an array (n,).
 
-    start, end (n, 3): end points of the segments. corners (n, 3, 3): one triangle for each segment.
+    start, end (n, 3): end points of the segments.
+    corners (n, 3, 3): one triangle for each segment.
 
     Source: Möller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997.
     """

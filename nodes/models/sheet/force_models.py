@@ -49,8 +49,9 @@ class SheetPush:
 class SheetForce:
     """The result of a force model at depths (n,).
 
-    force_n (n,): normal force. stiffness_n_per_m (n,): derivative of the normal force with respect
-        to depth. edge_force_n (n,): force on each clamp.
+    force_n (n,): normal force.
+    stiffness_n_per_m (n,): derivative of the normal force with respect to depth.
+    edge_force_n (n,): force on each clamp.
     """
 
     force_n: Floats
@@ -155,8 +156,8 @@ def _push_tension(
 ) -> tuple[Floats, float]:
     """Return the additional force (n,), N, on each clamp due to a push, and the factor E t W, N.
 
-    depths (n,): depths of the push, m. relative: coordinates (x, y) of the push, from 0 (centre) to
-    1 (edge).
+    depths (n,): depths of the push, m.
+    relative: coordinates (x, y) of the push, from 0 (centre) to 1 (edge).
     """
     modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
     depth_ratio = depths / rubber.width_m
@@ -249,7 +250,9 @@ class ScaledSheetModel:
 class MembraneSheetModel:
     """A finite-element membrane model of the sheet's force. This force model is the most accurate.
 
-    One evaluation takes seconds. cells: number of elements along each side of the sheet.
+    One evaluation takes seconds.
+
+    cells: number of elements along each side of the sheet.
     """
 
     rubber: Rubber

@@ -35,7 +35,9 @@ def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats
 def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_m: float) -> Floats:
     """Return the sheet's corners (4, 3), m, in the world frame.
 
-    The order is bottom left, bottom right, top right, top left. height_m: length of an edge.
+    The order is bottom left, bottom right, top right, top left.
+
+    height_m: length of an edge.
     """
     half = 0.5 * height_m
     left, right = world_from_left_edge, world_from_right_edge

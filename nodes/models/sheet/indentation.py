@@ -40,7 +40,8 @@ class IndentationRange:
     """The range of the precomputed pushes: stretch ratios and maximum depth (m).
 
     stretch_nodes, place_nodes, depth_nodes: numbers of interpolation nodes over stretch, over each
-        coordinate of the position, and over depth. element_cells: finite elements along each side.
+        coordinate of the position, and over depth.
+    element_cells: finite elements along each side.
     """
 
     min_stretch: float

@@ -63,10 +63,10 @@ class NoEquilibriumError(FlexsheetError, ArithmeticError):
 class PushPath:
     """The equilibria of the sheet at depths (n,), m, of one push.
 
-    forces_n (n,): normal force of the sheet on the finger. edge_forces_n (n,): mean force on the
-    clamps along the line between them. positions (n, rows, columns, 3): positions (m) of the mesh
-    nodes in the sheet's frame. rest_m (rows, columns, 2): positions of these nodes in the slack
-    sheet, relative to its centre.
+    forces_n (n,): normal force of the sheet on the finger.
+    edge_forces_n (n,): mean force on the clamps along the line between them.
+    positions (n, rows, columns, 3): positions (m) of the mesh nodes in the sheet's frame.
+    rest_m (rows, columns, 2): positions of these nodes in the slack sheet, relative to its centre.
     """
 
     depths_m: Floats
@@ -259,8 +259,9 @@ class _Grid:
         """Return the energy gradient (3 nodes,), N, and the sparse stiffness matrix (N/m) of the
         free coordinates.
 
-        added (nodes, 3, 3): stiffness of the contact, N/m. free (3 nodes,): whether each coordinate
-        may move. damping: value (N/m) that is added to the diagonal.
+        added (nodes, 3, 3): stiffness of the contact, N/m.
+        free (3 nodes,): whether each coordinate may move.
+        damping: value (N/m) that is added to the diagonal.
         """
         deformed, c = self.strain(positions)
         stress, tangent = stress_and_tangent(c, self.c1, self.c2, tangent=True)
@@ -309,9 +310,9 @@ def relaxed_energy(
 ) -> tuple[Floats, Floats, Floats]:
     """Return the energy W per rest volume according to tension field theory, and its derivatives.
 
-    large, small (n,): squared principal stretches p >= q. c1, c2: material constants, Pa. The
-        results are W (n,), its first derivatives [W_p, W_q] (2, n) and its second derivatives
-        [W_pp, W_qq, W_pq] (3, n).
+    large, small (n,): squared principal stretches p >= q.
+    c1, c2: material constants, Pa. The results are W (n,), its first derivatives [W_p, W_q] (2, n)
+        and its second derivatives [W_pp, W_qq, W_pq] (3, n).
     """
     p = np.maximum(large, 1.0)
     taut = small > p**-0.5
@@ -344,9 +345,10 @@ def relaxed_energy(
 def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tuple[Floats, Floats]:
     """Return the second Piola-Kirchhoff stress (n, 2, 2), Pa, and its tangent (n, 3, 3), Pa.
 
-    c (n, 2, 2): Cauchy-Green tensors. c1, c2: material constants, Pa. tangent: whether the tangent
-    is computed; if false, it is empty. The rows and columns of the tangent belong to the strains
-    [E11, E22, 2 E12].
+    c (n, 2, 2): Cauchy-Green tensors.
+    c1, c2: material constants, Pa.
+    tangent: whether the tangent is computed; if false, it is empty. The rows and columns of the
+        tangent belong to the strains [E11, E22, 2 E12].
     """
     large, small, direction = principal(c)
     _, first, second = relaxed_energy(large, small, c1, c2)

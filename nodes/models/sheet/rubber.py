@@ -11,9 +11,10 @@ import numpy as np
 class Rubber:
     """The dimensions and material of an unstretched sheet that is clamped along two edges.
 
-    width_m: distance between the clamped edges. height_m: length of an edge. mooney_ratio: C2 / (C1
-    + C2) of incompressible Mooney-Rivlin rubber, from 0 (neo-Hookean) to below 1. Young's modulus
-    is E = 6 (C1 + C2).
+    width_m: distance between the clamped edges.
+    height_m: length of an edge.
+    mooney_ratio: C2 / (C1 + C2) of incompressible Mooney-Rivlin rubber, from 0 (neo-Hookean) to
+        below 1. Young's modulus is E = 6 (C1 + C2).
 
     Raises ValueError for a value outside its range.
     """

@@ -81,7 +81,8 @@ def _clamp_factor(sheet: SlackSheet) -> float:
 def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
     """Return the stiffness (N/m) that a small push at the sheet's centre feels.
 
-    edge_force: force on each clamp, N. width_m: distance of the clamps.
+    edge_force: force on each clamp, N.
+    width_m: distance of the clamps.
     """
     return PUSH_FACTOR * edge_force / width_m
 
