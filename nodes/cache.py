@@ -216,7 +216,9 @@ class EtaEstimator:
         """Return the progress as text, such as "40 %, about 3 min left".
 
         done, total: numbers of steps.
-        now_s: current time. If `total` changes or `done` decreases, a new estimate starts.
+        now_s: current time.
+
+        If `total` changes or `done` decreases, a new estimate starts.
         """
         if total != self._total or done < self._last:
             self._total, self._start_s = total, now_s

@@ -70,8 +70,8 @@ class Trial:
     """A measurement of one method at one case.
 
     run: function whose time is measured.
-    error: function from the result of `run` to the error in the unit of the method family. It
-        returns an interval if the error is estimated from random samples.
+    error: function from the result of `run` to the error in the unit of the method family. The
+        result is an interval if the error is estimated from random samples.
     in_range: whether the method's valid range includes the case.
     in_scene: whether the scene's working range includes the case.
     size: size of the solved problem, such as {"skin_nodes": 1210}.

@@ -216,6 +216,7 @@ class RealSenseCapture(CapturedDevice):
     """A capture of the infrared pair of a RealSense camera, as one image with both views.
 
     device: serial number, or empty for any camera.
+
     The dot projector of the camera is switched off. Both sensors are triggered together. The
     timestamp is the middle of the exposure if the camera reports sensor timestamps.
     """
@@ -323,6 +324,7 @@ class GstreamerCapture(CapturedDevice):
     """A capture of a GStreamer pipeline, which determines the image format and the controls.
 
     device: description of the pipeline up to raw video, such as `v4l2src device=/dev/video0`.
+
     The source element of the pipeline provides the timestamps.
     """
 
@@ -399,6 +401,7 @@ def list_devices(sysfs: Path = Path("/sys/class/video4linux")) -> list[str]:
     """Return a line of text for each connected camera, with its `api` and its name.
 
     sysfs: folder in which Linux lists video devices.
+
     A camera is not listed if its optional package is not installed.
     """
     found = []

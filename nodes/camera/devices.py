@@ -33,6 +33,7 @@ def open_reader(
     camera: camera of the scene.
     now: function that returns the current time (ns).
     requested: sensor regions that the camera must deliver; None for the full sensors.
+
     Raises DeviceError if the source cannot be opened.
     """
     if isinstance(source, OpenCvSource):

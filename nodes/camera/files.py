@@ -36,6 +36,7 @@ class VideoFile:
     """A video file that is read frame by frame.
 
     rate_hz: frame rate; None: the frame times in the file are used.
+
     Raises DeviceError if the file cannot be opened.
     """
 
@@ -170,6 +171,7 @@ class _LoopClock:
     """A clock whose time continues to increase when a file is read again from its start.
 
     The interval between two passes equals the interval between the last two images of the file.
+
     rate_hz: frame rate, which determines the interval if the file has a single image.
     """
 
@@ -196,6 +198,7 @@ def read_times(path: Path, pairs: int) -> list[int]:
     """Read the times of image pairs from the column `t_s` (seconds) of a CSV file.
 
     pairs: required number of rows.
+
     Returns the times (ns) since the first image pair. Raises DeviceError if the file cannot be
     read, or if its times are not ascending numbers.
     """

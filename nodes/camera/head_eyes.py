@@ -34,6 +34,7 @@ def load_detector(search_width_px: int) -> Detector:
 
     search_width_px: width to which larger images are reduced for the face search. The eyes are then
         detected in the full image. If an image contains several faces, the largest face is used.
+
     Raises DeviceError if dlib or its models are not installed.
     """
     # The module with the models is only located, because its import needs setuptools.
@@ -69,8 +70,10 @@ def locate_eyes(
     """Return the midpoint (3,) of the eyes and the vector (3,) from the left to the right eye.
 
     Both results are in the world frame, m.
+
     pixels: positions (2, 2) of the left and the right eye in the image, px.
     interocular_m: distance between the eyes.
+
     Both eyes are assumed to have the same depth. If the head is rotated about the vertical by an
     angle, the computed distance is too large by about 1 / cos(angle).
     """

@@ -194,6 +194,7 @@ class FaceReader(threading.Thread):
     deliver(at_ns, pixels): called for each searched image, with the time of its exposure and the
         pixel positions (2, 2) of the eyes, or None without a face.
     fail(error): called for each DeviceError. The camera is then opened again after a delay.
+
     Both functions are called in the thread itself.
     """
 

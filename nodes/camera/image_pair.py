@@ -170,6 +170,7 @@ def split_side_by_side(image: Image, name: object) -> tuple[Image, Image]:
     """Split an image (h, 2w) with both views side by side into the left and right view (h, w).
 
     name: name of the source in the error text.
+
     Raises DeviceError if the width is odd.
     """
     if image.shape[1] % 2:

@@ -83,6 +83,7 @@ class Stream(threading.Thread):
     views: 2 if each image contains both views side by side, otherwise 1.
     requested: region of the sensor to read; None for the full sensor.
     changed: condition that is notified after each frame and after a failure.
+
     The thread also releases the device, because OpenCV crashes if another thread releases the
     device while a frame is grabbed. Raises DeviceError if the device cannot be opened or
     configured.

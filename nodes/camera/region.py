@@ -98,6 +98,7 @@ def resolve_regions(setting: str | ExplicitRegions, scene: Scene) -> Regions | N
     """Return the sensor regions to publish, or None for both full sensors.
 
     setting: "full", "finger" (the regions in which the finger can appear), or explicit regions.
+
     Raises DeviceError if a region is not inside its sensor.
     """
     if setting == "full":

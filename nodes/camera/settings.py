@@ -100,6 +100,7 @@ def choose_backend(device: int | str, api: str | None) -> Backend | None:
     """Choose the OpenCV backend for a device.
 
     api: name of a backend, or None to choose the backend by the device.
+
     Returns None if OpenCV must choose the backend. The units of the camera's controls are then
     unknown.
     """
@@ -115,6 +116,7 @@ def set_format(
 
     views: 2 if each image contains both views side by side, otherwise 1.
     pixel_format: four characters such as MJPG, or "" if OpenCV chooses the format.
+
     The device may ignore the request.
     """
     if backend is not None and backend.buffers is not None:

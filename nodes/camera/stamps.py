@@ -27,6 +27,7 @@ class StampCheck:
     The timestamps must be times of this computer's monotonic clock. A timestamp is plausible if it
     is later than the previous timestamp, and at most MAX_AGE_NS before the frame's arrival.
     Timestamps of another clock differ by hours or years.
+
     trusted: whether the timestamps may be used; False after MAX_IMPLAUSIBLE consecutive implausible
         timestamps.
     """
@@ -54,6 +55,7 @@ class Pairing:
 
     The cameras have no common trigger. Two frames are a pair if the time between their exposures is
     at most half a period, plus a tolerance. Otherwise the older frame is dropped.
+
     unpaired: number of dropped frames.
     """
 

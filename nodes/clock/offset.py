@@ -38,6 +38,7 @@ class OffsetEstimate:
     """An estimate of the other clock minus the own clock, with guaranteed bounds.
 
     The bounds are offset_ns +- half_ns at time `at_ns` of the own clock.
+
     drift_ratio: estimated rate of change of the offset.
     """
 
@@ -53,6 +54,7 @@ def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -
     t1, t4: times on the own clock when the ping was sent and when its reply was received.
     t2, t3: times on the other clock when the ping was received and when its reply was sent.
     max_drift_ratio: maximum relative drift of the clocks.
+
     Returns None if the timestamps are inconsistent.
     """
     round_trip_ns, remote_ns = t4 - t1, t3 - t2
@@ -70,6 +72,7 @@ def compute_bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float)
     """Return the lower and the upper bound of the clock offset (ns) at time `at_ns`.
 
     max_drift_ratio: maximum relative drift of the clocks.
+
     Every sample limits the offset. If the samples are inconsistent, the lower bound is above the
     upper bound.
     """
@@ -107,6 +110,7 @@ class OtherClock:
     """The offset measurements of another clock during the last minute.
 
     Only the most accurate sample of each half second is stored.
+
     max_drift_ratio: maximum relative drift of the clocks.
     resets: number of times when all samples were deleted because a new sample was inconsistent with
         them. This happens, for example, after a clock was set.

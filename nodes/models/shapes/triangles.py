@@ -337,8 +337,10 @@ def count_intersections(vertices: Floats, triangles: Indices) -> int:
 def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indices]]:
     """Yield the pairs of overlapping spheres in batches, as two arrays of sphere indices.
 
-    centre (n, 3), radius (n,): spheres, m. Spheres of similar size are searched together, because
-    the search radius must be that of the largest sphere.
+    centre (n, 3), radius (n,): spheres, m.
+
+    Spheres of similar size are searched together, because the search radius must be that of the
+        largest sphere.
     """
     from scipy.spatial import cKDTree
 
