@@ -1,4 +1,4 @@
-"""A camera node that runs, small pictures that tell their number, and a box of fake cameras."""
+"""Provide a running camera node, small numbered images, and fake cameras for tests."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Image = NDArray[np.uint8]
 
 
 def load_scene(width_px: int = WIDTH, height_px: int = HEIGHT) -> Scene:
-    """Load the paper's scene with a small camera and scaled optics."""
+    """Load the scene of the paper with a small camera image."""
     scene = load_cylinder()
     size = {"width_px": width_px, "height_px": height_px}
     scale = width_px / scene.camera.width_px
@@ -48,7 +48,7 @@ def load_scene(width_px: int = WIDTH, height_px: int = HEIGHT) -> Scene:
 
 
 def picture(number: int, side: int, width: int = WIDTH) -> Image:
-    """Make a uniform image whose level encodes its number and side."""
+    """Make a uniform image whose grey level encodes its number and side."""
     return np.full((HEIGHT, width), 20 + 20 * number + 100 * side, np.uint8)
 
 
@@ -68,7 +68,7 @@ def write_video(path: Path, frames: list[Image], rate_hz: float = 50.0) -> Path:
 
 
 class CameraHarness(NodeHarness[Camera, Clock]):
-    """Running camera node and its messages."""
+    """A running camera node and its messages."""
 
     until = staticmethod(until)
 
@@ -103,7 +103,7 @@ async def running(
 
 @dataclass
 class Shot:
-    """Frame of a fake camera: image, arrival time and driver's stamp, ns."""
+    """A frame of a fake camera: image, arrival time (ns) and driver's timestamp (ns)."""
 
     image: Image
     arrival_ns: int
@@ -111,7 +111,7 @@ class Shot:
 
 
 class FakeCamera:
-    """Fake camera that can be unplugged, and that rejects or clips settings."""
+    """A fake camera that can be unplugged, and that can reject or limit settings."""
 
     def __init__(self, bag: CameraBag) -> None:
         self.bag = bag
@@ -132,8 +132,9 @@ class FakeCamera:
         stamp_ns: int | None = None,
         image: Image | None = None,
     ) -> None:
-        """Deliver a frame with the driver's stamp `at_ns` (or `stamp_ns`) that arrives 8 ms
-        later."""
+        """Deliver a frame with the driver's timestamp `at_ns` (or `stamp_ns`), which arrives 8 ms
+        later.
+        """
         pixels = picture(number, side) if image is None else image
         stamp = self.bag.base_ns + at_ns if stamp_ns is None else stamp_ns
         self.shots.put(Shot(pixels, self.bag.base_ns + at_ns + 8_000_000, stamp))
@@ -144,7 +145,7 @@ class FakeCamera:
 
 
 class FakeCapture:
-    """Substitute for cv2.VideoCapture."""
+    """A replacement of cv2.VideoCapture."""
 
     def __init__(self, camera: FakeCamera | None) -> None:
         self.camera = camera
@@ -190,7 +191,9 @@ class FakeCapture:
 
 
 class CameraBag:
-    """All fake cameras, with a clock that each reader thread reads at its frame's arrival."""
+    """All fake cameras of a test. For each reader thread, the clock shows the arrival time of the
+    newest frame.
+    """
 
     def __init__(self) -> None:
         self.base_ns = time.monotonic_ns()
@@ -202,7 +205,10 @@ class CameraBag:
         return getattr(self.arrived, "ns", time.monotonic_ns())
 
     def plug(self, device: int | str, **properties: float) -> FakeCamera:
-        """Plug in a UVC camera as V4L2 reports it; properties: OpenCV's names without CAP_PROP_."""
+        """Add a UVC camera with the properties of V4L2.
+
+        properties: names in OpenCV without CAP_PROP_.
+        """
         camera = self.cameras[device] = FakeCamera(self)
         usual = {
             "BUFFERSIZE": 4,
@@ -229,7 +235,7 @@ class CameraBag:
         return capture
 
     def empty(self) -> None:
-        """Let every grab that still waits end."""
+        """Wake all threads that wait for a frame."""
         for camera in self.cameras.values():
             for _ in camera.captures:
                 camera.shots.put(None)

@@ -1,4 +1,4 @@
-"""Write a small bag with one message of most topics, for tests of exports."""
+"""Write a small bag with one message of most topics."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ RECORDED: tuple[tuple[str, Message], ...] = (
 
 
 def write_example(path: Path, recorded: tuple[tuple[str, Message], ...] = RECORDED) -> Path:
-    """Write the messages to a bag, one every STEP_NS of a clock that starts at STARTED."""
+    """Write the messages to a bag, at intervals of STEP_NS from the time STARTED."""
     recording = {"clock_id": "c", "started": STARTED, "started_ns": str(STARTED_NS)}
     with BagWriter(path, {"recording": recording}) as writer:
         for number, (topic, message) in enumerate(recorded):

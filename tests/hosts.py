@@ -1,4 +1,4 @@
-"""Create hosts with keys for tests: secret files and rings in a folder."""
+"""Create hosts with secret files and key rings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ from flexsheet.messages.security import (
 
 
 class Hosts:
-    """Key pairs of named hosts; `ring` is that of a host's processes, `stranger` is in no ring."""
+    """Key pairs of named hosts.
+
+    ring: key ring of each host.
+    stranger: key that is not in any ring.
+    """
 
     def __init__(self, folder: Path, *names: str) -> None:
         self.folder, self.names = folder, names
@@ -39,7 +43,7 @@ class Hosts:
         return public
 
     def write_ring(self, name: str) -> Path:
-        """Write the ring of a host's processes; a stranger's ring also contains its own key."""
+        """Write the key ring of a host. The ring of a stranger also contains its own key."""
         file = self.folder / f"keys-{name}.json"
         public = (
             self.public

@@ -1,6 +1,7 @@
-"""Read the bags of a lab: true joints, bridge states, targets and missing messages.
+"""Read the bags of a test with several computers: true joints, states, targets and missing
+messages.
 
-All stamps are of one clock, that of the computer with the namespaces.
+All computers share one clock.
 """
 
 from __future__ import annotations
@@ -36,11 +37,12 @@ MOMENT_NS = 10_000_000
 
 @dataclass(frozen=True, slots=True)
 class Arm:
-    """Records of an arm in the bags of its computer.
+    """The recorded data of one arm.
 
-    times_ns (n,), joints_rad (n, 6), edges_world_m (n, 3): truth, with its epochs (n,) of the
-    simulator's starts. said_ns (m,), modes (m,): published by the bridge. sent_ns (m,),
-    commanded_rad (m, 6): last command to the arm.
+    times_ns (n,), joints_rad (n, 6), edges_world_m (n, 3): true values of the simulator, with its
+        epochs (n,).
+    said_ns (m,), modes (m,): states that the bridge published.
+    sent_ns (m,), commanded_rad (m, 6): last command to the arm.
     """
 
     times_ns: Times
@@ -57,12 +59,14 @@ class Arm:
         return self.joints_rad[(self.times_ns >= span[0]) & (self.times_ns <= span[1])]
 
     def turned_rad(self, span: Span) -> float:
-        """Return the maximum rotation of a joint in a time span, rad; 0 if the truth is unknown."""
+        """Return the maximum rotation (rad) of a joint in a time span; 0 without recorded true
+        angles.
+        """
         joints = self.between(span)
         return float(np.ptp(joints, axis=0).max()) if len(joints) else 0.0
 
     def spans(self, mode: str) -> list[Span]:
-        """Return the time spans of a mode, without silent periods."""
+        """Return the time spans in which an arm has a mode, without periods without messages."""
         spans = []
         begin: int | None = None
         for i, (at_ns, printed) in enumerate(zip(self.said_ns, self.modes, strict=True)):
@@ -75,13 +79,13 @@ class Arm:
         return spans if begin is None else [*spans, (begin, int(self.said_ns[-1]))]
 
     def follows(self, times_ns: Times) -> NDArray[np.bool_]:
-        """Return whether the bridge reported following, within SILENT_NS."""
+        """Return whether the bridge has reported the mode `follow` within SILENT_NS."""
         newest = np.searchsorted(self.said_ns, times_ns, side="right") - 1
         fresh = (newest >= 0) & (times_ns - self.said_ns[newest] <= SILENT_NS)
         return np.asarray(fresh & (self.modes[newest] == "follow"), dtype=np.bool_)
 
     def knows(self, times_ns: Times) -> NDArray[np.bool_]:
-        """Return whether the truth is recorded just before and just after these times."""
+        """Return whether true angles are recorded just before and just after given times."""
         after = np.searchsorted(self.times_ns, times_ns)
         inside = (after > 0) & (after < len(self.times_ns))
         after = after.clip(1, len(self.times_ns) - 1)
@@ -89,15 +93,16 @@ class Arm:
         return np.asarray(inside & near, dtype=np.bool_)
 
     def edge_at(self, times_ns: Times) -> Floats:
-        """Return the middle of the arm's edge of the sheet (k, 3)."""
+        """Return the centres (k, 3), m, of the arm's edge of the sheet."""
         zero = self.times_ns[0]
         x, xp = (times_ns - zero).astype(np.float64), (self.times_ns - zero).astype(np.float64)
         return np.column_stack([np.interp(x, xp, column) for column in self.edges_world_m.T])
 
     def fastest(self) -> float:
-        """Return the maximum ratio to the manufacturer's speeds, of true joints and of commands.
+        """Return the maximum ratio of the speed to the specified speed, for true joints and for
+        commands.
 
-        Motions across a restart of the simulator are excluded.
+        Motions during a restart of the simulator are excluded.
         """
         steps_s = np.diff(self.times_ns) * 1e-9
         same = (np.diff(self.epochs) == 0) & (steps_s > 0)
@@ -118,13 +123,13 @@ class Arm:
         return float((speeds[steps_s < 2 * SPEED_OVER_S] / SPEED_RAD_PER_S).max(initial=0.0))
 
     def leaves_range(self) -> bool:
-        """Return whether a joint was ever outside its range."""
+        """Return whether a joint was outside its range at any time."""
         low, high = RANGE_RAD.T
         return bool(((self.joints_rad < low) | (self.joints_rad > high)).any())
 
 
 def bags(folder: Path, host: str) -> list[Path]:
-    """Return a host's bags, in the order of creation."""
+    """Return the bags of a host, in the order of creation."""
     return sorted(folder.glob(f"{host}*.mcap"), key=lambda bag: bag.stat().st_mtime_ns)
 
 
@@ -137,10 +142,10 @@ def _all(folder: Path, host: str, *topics: str) -> Iterator[tuple[str, Message, 
 def read_arm(
     folder: Path, side: str, scene: Scene, *, host: str | None = None, truth: str | None = None
 ) -> Arm:
-    """Read the records of an arm from a lab's bags.
+    """Read the data of an arm from bags.
 
-    host: host of the bags; None: the arm's own. truth: topic of the true joints; None: that of the
-    arm's own simulator.
+    host: host that recorded the bags; None: the host of the arm.
+    truth: topic of the true joint angles; None: the topic of the arm's own simulator.
     """
     mount = (scene.arms.left if side == "left" else scene.arms.right).flange_from_edge
     flange_from_edge = transform_from_rpy(mount.position_m, mount.rpy_rad)
@@ -174,8 +179,9 @@ def read_arm(
 
 
 def wanted(folder: Path) -> tuple[Times, Floats]:
-    """Return the times (n,) and positions (n, 3) of the sheet's target from the main computer's
-    bags."""
+    """Return the times (n,) and positions (n, 3), m, of the sheet targets in the bags of the host
+    `main`.
+    """
     found = [
         (message.valid_at_ns, message.world_from_sheet[:3, 3])
         for _, message, _ in _all(folder, "main", "sheet_target")
@@ -187,10 +193,10 @@ def wanted(folder: Path) -> tuple[Times, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class SheetHold:
-    """Positioning of the sheet in a time span.
+    """The errors of the sheet's position in a time span.
 
-    errors_m (k,): distance of the true sheet centre from each target. followed: fraction of the
-    time in which both arms followed.
+    errors_m (k,): distance between the true sheet centre and each target.
+    followed: fraction of the time in which both arms followed.
     """
 
     errors_m: Floats
@@ -201,7 +207,7 @@ class SheetHold:
 
 
 def measure_hold(arms: tuple[Arm, Arm], targets: tuple[Times, Floats], span: Span) -> SheetHold:
-    """Compute the positioning of the sheet in a time span."""
+    """Compute the errors of the sheet's position in a time span."""
     left, right = arms
     times, centres = targets
     keep = (times >= span[0]) & (times <= span[1]) & left.knows(times) & right.knows(times)
@@ -216,9 +222,10 @@ def measure_hold(arms: tuple[Arm, Arm], targets: tuple[Times, Floats], span: Spa
 
 @dataclass(frozen=True, slots=True, order=True)
 class Gap:
-    """Gap in one writer's messages in the main computer's bags, by sequence numbers.
+    """A gap in the messages of one writer, found by sequence numbers.
 
-    from_ns, to_ns: publication of the last message before and of the first after it.
+    from_ns, to_ns: publication of the last message before the gap, and of the first message after
+        it.
     """
 
     seconds: float
@@ -229,7 +236,7 @@ class Gap:
 
 
 def gaps(folder: Path) -> list[Gap]:
-    """Find the gaps; a restart of a killed writer is none."""
+    """Find the gaps. A restart of a killed writer does not count."""
     last: dict[tuple[str, str, str, int], Header] = {}
     found = []
     for topic, _, header in _all(folder, "main"):

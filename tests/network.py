@@ -1,4 +1,4 @@
-"""Simulate cables that can be cut: a TCP relay on loopback, and computers at a switch."""
+"""Simulate network faults: a TCP relay, and computers whose cables can be unplugged."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 class TcpRelay:
-    """TCP relay to a port; `half_open` discards data in both directions."""
+    """A relay to a TCP port. If `half_open` is true, the relay discards data in both directions."""
 
     def __init__(self, target_port: int) -> None:
         self.half_open = False
@@ -59,10 +59,9 @@ class TcpRelay:
 
 
 class Computers:
-    """Network namespaces as computers at one switch, whose cables can be unplugged.
+    """A set of network namespaces that simulate computers at one switch.
 
-    This requires permission to create namespaces; `missing` returns the reason if it fails, or
-    None.
+    The system must permit namespaces; otherwise, `missing` returns the reason.
     """
 
     def __init__(self, *names: str) -> None:
@@ -106,7 +105,7 @@ class Computers:
         _ip("-n", space, "link", "set", "eth", "up")
 
     def power_cut(self, name: str, *processes: subprocess.Popen[bytes]) -> None:
-        """Remove a computer with its processes without notice to the others."""
+        """Remove a computer with its processes, without closing its connections."""
         self.plug(name, into_switch=False)
         for process in processes:
             process.kill()
@@ -119,11 +118,14 @@ class Computers:
         self._set_up(name)
 
     def plug(self, name: str, *, into_switch: bool) -> None:
-        """Unplug a computer's cable, or plug it in again."""
+        """Unplug or plug in the network cable of a computer."""
         _ip("-n", self._switch, "link", "set", name, "up" if into_switch else "down")
 
     def start(self, name: str, *arguments: str, ahead_s: int = 0) -> subprocess.Popen[bytes]:
-        """Run this Python with those arguments on a computer, whose clock is ahead by `ahead_s`."""
+        """Start a Python process on a computer.
+
+        ahead_s: offset of the computer's clock, s.
+        """
         command = ["ip", "netns", "exec", self._space(name)]
         if ahead_s:
             # Of a process of its own, which is why `end` speaks to a group of them.
@@ -137,7 +139,7 @@ class Computers:
 
     @staticmethod
     def end(process: subprocess.Popen[bytes]) -> None:
-        """Terminate a process on a computer, and wait for its end."""
+        """Terminate a process on a computer, and wait until the process has ended."""
         os.killpg(process.pid, signal.SIGTERM)
 
     def _space(self, name: str) -> str:

@@ -1,4 +1,4 @@
-"""Build one node for a test, with a clock that the test moves, and collect its messages."""
+"""Run one node in a test, with a virtual clock, and collect its messages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ C = TypeVar("C", bound=Clock)
 
 
 class NodeHarness(Generic[N, C]):
-    """Node with its clock and its published messages: (topic, message, header), in order."""
+    """A node with a virtual clock, and its published messages as (topic, message, header)."""
 
     def __init__(
         self,
@@ -44,7 +44,9 @@ class NodeHarness(Generic[N, C]):
     async def step(
         self, port: str, message: Message, *, age_ms: float = 0.0, sequence: int = 1
     ) -> None:
-        """Pass a message whose source stamp is `age_ms` old, and wait for its handler."""
+        """Deliver a message with a source timestamp that is `age_ms` old, and wait for its
+        handler.
+        """
         now_ns = self.clock.now_ns()
         header = Header(sequence, now_ns - int(1e6 * age_ms), now_ns, self.clock.id, "test", 1)
         await self.node.step(port, message, header)

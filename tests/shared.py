@@ -1,4 +1,4 @@
-"""Results that are expensive to compute: once per run of the tests, for all its processes."""
+"""Share expensive results between all processes of a test run."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ FOLDER_VARIABLE = "FLEXSHEET_TESTS_SHARED"
 
 
 def compute_once(name: str, compute: Callable[[], T]) -> T:
-    """Return what `compute` returns, from the process of this run that computed it first.
+    """Return the result of `compute`, which only one process of the test run executes.
 
-    name: of the result; the same name must mean the same computation.
+    name: name of the result. Each name must belong to one computation.
     """
     folder = os.environ.get(FOLDER_VARIABLE)
     if folder is None:

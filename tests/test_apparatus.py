@@ -1,4 +1,4 @@
-"""The apparatus: its file, the draws from the table of tolerances, and who may read it."""
+"""Test the apparatus: files, draws from the table of tolerances, and read access."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ DEMO = ROOT / "launch" / "demo.yaml"
 
 
 class Spy(Node):
-    """Ask for what only the simulator may know."""
+    """A node that subscribes to the true parameters, which only the simulator may read."""
 
     twin__apparatus: Input[Apparatus]
 
@@ -293,7 +293,7 @@ def test_bags_carry_the_apparatus(tmp_path: Path) -> None:
 
 
 def models_in(annotation: Any) -> set[Any]:
-    """All models that a field's type mentions, at any depth."""
+    """Return all models in the type of a field, at any depth."""
     found = set()
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         found.add(annotation)

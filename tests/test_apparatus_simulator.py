@@ -1,4 +1,6 @@
-"""The simulator obeys the apparatus: each quantity changes what it should, and nothing else."""
+"""Test that each parameter of the apparatus affects the simulator, and only the intended
+quantity.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,7 @@ def header(sequence: int = 1, at_ns: int = START_NS) -> Header:
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """Messages that the finger's node published for one exposure."""
+    """The messages that the finger simulator published for one exposure."""
 
     truth: TwinFinger
     pair: StereoPair
@@ -75,7 +77,7 @@ class Shot:
 
 
 async def expose(given: Apparatus | None) -> Shot:
-    """Expose a finger that moves, trembles and wanders."""
+    """Simulate exposures of a finger with tremor and slow random motion."""
     clock = VirtualClock(START_NS)
     sent: list[Any] = []
     node = TwinFingerNode(
@@ -143,7 +145,7 @@ async def test_the_rate_and_read_out_are_those_of_the_apparatus() -> None:
 
 
 def light_centre(camera: TwinCamera, tip: Floats) -> list[Floats]:
-    """Centre of the marker's light in both images, by its share in each pixel."""
+    """Return the centre of the marker's light in both images, weighted by brightness."""
     lit, unlit = (
         camera.levels(lambda _: tip, exposure_s=0.004, marker=marker) for marker in (True, False)
     )
@@ -156,7 +158,7 @@ def light_centre(camera: TwinCamera, tip: Floats) -> list[Floats]:
 
 
 def light_amount(camera: TwinCamera, tip: Floats) -> float:
-    """Pixels that the marker covers in the left image."""
+    """Return the number of pixels that the marker covers in the left image."""
     lit, unlit = (
         camera.levels(lambda _: tip, exposure_s=0.004, marker=marker)[0] for marker in (True, False)
     )
@@ -174,7 +176,9 @@ def camera_with(finger: FingerTruth | None) -> TwinCamera:
 
 @pytest.mark.parametrize("shape", ["ball", "disc"])
 def test_the_marker_is_on_the_nail(shape: Any) -> None:
-    """Without tilt, z of the finger is up and towards the user, y to the right."""
+    """Without tilt, the finger's z axis points up and towards the user, and the y axis to the
+    right.
+    """
     tip = np.array([0.01, 0.0, 0.02])
     finger = FingerTruth(marker_from_pad_m=(0.0, 0.002, 0.01), marker_shape=shape)
     nail = np.array([0.002, 0.00866, 0.005]) / np.array([1.0, 0.99998, 0.99998])
@@ -184,7 +188,7 @@ def test_the_marker_is_on_the_nail(shape: Any) -> None:
 
 
 def test_a_flat_marker_is_seen_as_an_ellipse() -> None:
-    """Its area is that of a ball times the cosine of the angle to the ray."""
+    """The area of the marker is that of a ball times the cosine of the angle to the ray."""
     tip = np.array([0.0, 0.0, 0.02])
     ball = light_amount(camera_with(None), tip)
     areas, cosines = [], []
@@ -208,7 +212,7 @@ def test_a_flat_marker_that_faces_away_is_not_seen() -> None:
 
 
 async def arms_of(given: Apparatus | None, joints_file: Path) -> tuple[TwinArms, TwinArmsNode]:
-    """Switch the arms on where the file says, and return their first true poses."""
+    """Start the simulated arms, and return their first true poses."""
     sent: list[TwinArms] = []
     node = TwinArmsNode(
         TwinArmsParameters(
@@ -287,7 +291,9 @@ async def test_controllers_are_those_of_the_apparatus(tmp_path: Path) -> None:
 
 
 def move_time_s(**options: float) -> float:
-    """Time from a set-point until the arm begins to move, to 0.1 ms."""
+    """Return the time from a set-point until the arm begins to move, with a resolution of 0.1
+    ms.
+    """
     arm = Controller(JOINTS, servo_lag_s=0.025, noise_rad=0.0, watchdog_s=1.0, **options)
     arm.advance(0.0005)
     arm.state, arm.wanted_rad = 1, JOINTS + 0.1
@@ -453,7 +459,7 @@ async def test_a_frame_may_be_exposed_while_the_last_is_read_out() -> None:
 
 @pytest.mark.parametrize("seed", long_except([0, 1, 2], 2))
 async def test_slow_cameras_are_tracked(seed: int) -> None:
-    """A calibrated rig measures the flat marker of each draw; seed 2 has 15 Hz."""
+    """A calibrated camera measures the flat marker for each seed. Seed 2 has a rate of 15 Hz."""
     given = sample_apparatus(SCENE, seed, profile=Profile.PAPER, calibrated=True)
     rate_hz = given.camera.rate_hz
     assert rate_hz is not None

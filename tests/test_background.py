@@ -12,8 +12,9 @@ from flexsheet.nodes.fem_solver.precompute_table import local_processes
 
 
 def priority_in(workers: Executor) -> tuple[int, int]:
-    """Return niceness and scheduling class of a worker, in a program that imports nothing of this
-    file."""
+    """Return niceness and scheduling class of a worker process, in a program that does not import
+    this file.
+    """
     niceness = workers.submit(os.getpriority, os.PRIO_PROCESS, 0)
     scheduling = workers.submit(os.sched_getscheduler, 0)
     return niceness.result(), scheduling.result()
@@ -25,7 +26,7 @@ def test_a_background_process_has_the_lowest_priority() -> None:
 
 
 def test_ctrl_c_does_not_interrupt_the_workers_of_a_soft_bodys_table() -> None:
-    """The terminal sends SIGINT to all of its processes; the node stops its workers itself."""
+    """The terminal sends SIGINT to all processes. Only the node stops the workers."""
     with local_processes(1) as workers:
         worker = workers.submit(os.getpid).result()
         job = workers.submit(sum, range(20_000_000))

@@ -16,7 +16,7 @@ TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class ProcFiles:
-    """Counters of processes in a folder, in the kernel's format, and a clock."""
+    """A folder with the counters of processes in the kernel's format, and a clock."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.now_s = folder, 100.0
@@ -26,7 +26,7 @@ class ProcFiles:
         (folder / "pressure").mkdir()
 
     def let(self, name: str, pid: int, *, wait_s: float = 0.0, run_s: float = 0.0) -> None:
-        """Let a process wait and run for some time."""
+        """Add waiting time and processor time to the counters of a process."""
         self._waited_s[pid] = self._waited_s.get(pid, 0.0) + wait_s
         self._used_s[pid] = self._used_s.get(pid, 0.0) + run_s
         folder = self.folder / str(pid)
@@ -46,7 +46,7 @@ ARMS = {"left": 11, "right": 12}
 
 
 def run(kernel: ProcFiles, seconds: int, *, left_s: float, right_s: float) -> CpuPressure | None:
-    """Let both arms' nodes wait for some time in each second."""
+    """Let the nodes of both arms wait for a part of each second."""
     found = None
     for _ in range(seconds):
         kernel.let("python", 11, wait_s=left_s, run_s=0.3)
@@ -80,7 +80,7 @@ def test_a_busy_computer_names_who_waits_and_who_runs(kernel: ProcFiles) -> None
 def test_a_wait_that_began_before_the_window_is_at_most_all_of_the_window(
     kernel: ProcFiles,
 ) -> None:
-    """The kernel counts a wait of 8 s when it ends."""
+    """The kernel adds a wait of 8 s to the counter at the end of the wait."""
     run(kernel, 10, left_s=0.0, right_s=0.0)
     found = run(kernel, 1, left_s=8.0, right_s=0.0)
     assert found is not None

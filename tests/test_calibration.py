@@ -1,4 +1,4 @@
-"""Test the stereo calibration with rendered boards, real pairs, and unusable images."""
+"""Test the stereo calibration with rendered boards, recorded pairs and invalid images."""
 
 from __future__ import annotations
 
@@ -47,21 +47,23 @@ RIGHT_FROM_LEFT = rigid.transform(
 
 
 def rays_of(matrix: Floats) -> Floats:
-    """Return the rays of a distorted camera's pixels."""
+    """Return the rays of the pixels of a camera with distortion."""
     y, x = np.mgrid[: SIZE[1], : SIZE[0]].astype(np.float64)
     seen = camera.normalize(np.stack([x, y], axis=-1), matrix, DISTORTION)
     return np.concatenate([seen, np.ones((*seen.shape[:2], 1))], axis=-1)
 
 
 def wave(squares: Floats, square_px: Floats) -> Floats:
-    """Alternate between -1 and 1 from square to square, with ramps of a pixel between."""
+    """Return a pattern of -1 and 1 that alternates from square to square, with ramps of one
+    pixel.
+    """
     line = np.rint(squares)
     flipped = np.where(line % 2 == 0, 1.0, -1.0)
     return np.asarray(flipped * np.clip(2.0 * square_px * (squares - line), -1.0, 1.0))
 
 
 def render(left_from_board: Floats, rays: Floats, camera_from_left: Floats) -> NDArray[np.uint8]:
-    """Render a chessboard with a white margin on grey."""
+    """Render a chessboard with a white margin on a grey background."""
     board_from_camera = rigid.inverse(camera_from_left @ left_from_board)
     directions = rays @ board_from_camera[:3, :3].T
     origin = board_from_camera[:3, 3]
@@ -80,8 +82,9 @@ def render(left_from_board: Floats, rays: Floats, camera_from_left: Floats) -> N
 
 
 def pose(number: int) -> Floats:
-    """Return pose `number` of left_from_board: the board's middle in view, tilted in all
-    directions."""
+    """Return pose `number` of left_from_board, with the board in view and tilted in various
+    directions.
+    """
     generator = np.random.default_rng(number)
     tilt = generator.uniform(-0.5, 0.5, 3) * [1.0, 1.0, 0.4]
     rotation = rigid.rotation_from_rpy(tilt)
@@ -98,7 +101,7 @@ class Pictures:
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Pictures:
-    """Render twelve pairs of a virtual board."""
+    """Render twelve image pairs of a board."""
     folder = tmp_path_factory.mktemp("boards")
     pictures = Pictures([], [])
     left_rays, right_rays = rays_of(LEFT_MATRIX), rays_of(RIGHT_MATRIX)
@@ -321,7 +324,9 @@ def test_the_joint_fit_is_the_least_squares_that_opencv_finds(rendered: Pictures
 def test_outlying_corners_are_left_out(
     rendered: Pictures, calibration: StereoCalibration, tmp_path: Path
 ) -> None:
-    """Three corners are painted over, so that they are detected a pixel or more away."""
+    """Three corners are painted over, so that the detected positions are wrong by at least one
+    pixel.
+    """
     image = cv2.imread(str(rendered.left[2]), cv2.IMREAD_GRAYSCALE)
     pair = found(rendered)[2]
     for x, y in np.rint(pair.left.pixels[[8, 16, 24]]).astype(int):
@@ -345,7 +350,7 @@ def test_an_image_given_twice_counts_once(rendered: Pictures) -> None:
 
 
 def test_untilted_boards_do_not_determine_a_rig(tmp_path: Path) -> None:
-    """With frontal boards only, focal length and distance are not observable."""
+    """Frontal views do not determine focal length and distance."""
     pictures = Pictures([], [])
     middle = board_points(BOARD).mean(axis=0)
     left_rays, right_rays = rays_of(LEFT_MATRIX), rays_of(RIGHT_MATRIX)
@@ -384,7 +389,7 @@ def test_every_pair_is_left_out_once(rendered: Pictures) -> None:
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data is not here")
 def test_real_pairs_beat_plain_opencv_on_held_out_pairs() -> None:
-    """OpenCV's calibration of these pairs has an error of 0.56 mm on other pairs."""
+    """The calibration of OpenCV has an error of 0.56 mm on other pairs."""
     left, right = sorted(REAL.glob("left*.jpg")), sorted(REAL.glob("right*.jpg"))
     board = Board(columns=9, rows=6, square_m=0.02423)
     calibration = calibrate_stereo(left[::2], right[::2], board=board, device="real").calibration
@@ -402,7 +407,9 @@ def test_real_pairs_beat_plain_opencv_on_held_out_pairs() -> None:
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data is not here")
 def test_real_halves_differ_by_what_they_state() -> None:
-    """Two calibrations of one rig from different images give different fingertips."""
+    """Two calibrations of one camera from different images differ by no more than their
+    uncertainty.
+    """
     left, right = sorted(REAL.glob("left*.jpg")), sorted(REAL.glob("right*.jpg"))
     board = Board(columns=9, rows=6, square_m=0.02423)
     halves = [

@@ -1,4 +1,4 @@
-"""Test the camera node with real decoders: replay, retries, rejections, crops and reports."""
+"""Test the camera node with video and image files."""
 
 from __future__ import annotations
 
@@ -114,7 +114,9 @@ async def test_looping_images_and_a_new_scene(scene: Scene, images: dict[str, st
 
 
 async def test_a_live_camera_is_reopened_when_it_ends(scene: Scene, side_by_side: Path) -> None:
-    """OpenCV opens a file like a camera; its end is like an unplugged camera."""
+    """OpenCV opens a video file like a camera. The end of the file corresponds to an unplugged
+    camera.
+    """
     source = {"kind": "opencv", "left": str(side_by_side)}
     async with running(scene, source=source, retry_s=0.01) as bench:
         # A file has no exposure control and its own rate: both are reported once.
@@ -233,7 +235,7 @@ def test_a_side_by_side_image_of_odd_width_is_rejected() -> None:
 
 
 class StutteringReader:
-    """Reader at 60 Hz without three of its frames."""
+    """A reader at 60 Hz that loses three frames."""
 
     paced = False
     rate_hz: float | None = 60.0
@@ -250,7 +252,7 @@ class StutteringReader:
         return ImagePair(picture(0, 0), picture(0, 1), round(frame * 1e9 / 60))
 
     def interrupt(self) -> None:
-        """Do nothing, since `read` does not wait."""
+        """Do nothing."""
 
     def close(self) -> None:
         """Do nothing."""
@@ -278,7 +280,7 @@ def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
 
 
 class BrokenReader(StutteringReader):
-    """Reader with an error of OpenCV."""
+    """A reader that raises an error of OpenCV."""
 
     def read(self) -> ImagePair | None:
         raise cv2.error("no such colour")

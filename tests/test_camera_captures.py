@@ -1,7 +1,7 @@
-"""Test cameras that OpenCV cannot open: Aravis's simulated camera, and stand-ins of libraries.
+"""Test cameras that OpenCV does not support, with the simulated camera of Aravis and with fake
+libraries.
 
-The stand-ins have the parts of the libraries' interfaces that the driver uses; no real device of
-these kinds has been run.
+The fake libraries have only the functions that the driver uses. No test uses real hardware.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class FakeFrame:
 
 
 class FakeRealSense(ModuleType):
-    """Stand-in of pyrealsense2 with one camera of one mode."""
+    """A fake of the package pyrealsense2 with one camera."""
 
     def __init__(self) -> None:
         super().__init__("pyrealsense2")

@@ -1,4 +1,4 @@
-"""Test that video and image files keep their times, with the real decoders."""
+"""Test the frame times of video and image files."""
 
 from __future__ import annotations
 
@@ -38,8 +38,7 @@ def scene() -> Scene:
 
 
 def write_timed_video(path: Path, frames: list[Image], times_ms: list[int]) -> Path:
-    """Write a motion JPEG video of variable frame rate in a container with the time of each
-    frame."""
+    """Write a motion JPEG video in which each frame has its own time."""
     codec = cv2.VideoWriter.fourcc(*"MJPG")
     height, width = frames[0].shape
     raw = [cv2.VIDEOWRITER_PROP_RAW_VIDEO, 1]
@@ -120,7 +119,7 @@ async def test_the_published_stamps_follow_the_files_time(scene: Scene, tmp_path
 
 
 def test_two_videos_are_paired_by_their_times(scene: Scene, tmp_path: Path) -> None:
-    """The right video lacks a frame and is 3 ms late from the second frame on."""
+    """The right video lacks a frame, and its frames are 3 ms late from the second frame on."""
     left = write_timed_video(
         tmp_path / "l.mkv", [picture(n, 0) for n in range(6)], [0, 20, 40, 60, 80, 100]
     )
@@ -150,7 +149,7 @@ def test_time_runs_on_when_a_video_begins_again(scene: Scene, tmp_path: Path) ->
 
 
 class TimelessVideo:
-    """Decoder without frame times, as for a raw stream."""
+    """A decoder of a video without frame times."""
 
     def __init__(self, path: str, api: int) -> None:
         """Do nothing."""
@@ -269,7 +268,7 @@ def test_times_that_are_not_text_are_reported(tmp_path: Path) -> None:
 
 
 def test_all_errors_of_a_reader_are_reported() -> None:
-    """A thread that ends without a report would leave a node that seems healthy."""
+    """Without a report, the node would seem healthy after the end of the thread."""
     errors: list[DeviceError] = []
 
     def corrupted() -> Reader:

@@ -1,7 +1,4 @@
-"""Test live cameras: stamps, pairs and skew, settings, regions, unplugged and hanging devices.
-
-The devices are substitutes for cv2.VideoCapture; the threads are real.
-"""
+"""Test live cameras with fakes of cv2.VideoCapture and real threads."""
 
 from __future__ import annotations
 
@@ -108,7 +105,6 @@ def test_a_driver_that_stamps_the_beginning_of_the_exposure(
 def test_stamps_of_another_clock_are_replaced_by_the_arrival(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene, stamp_ns: int
 ) -> None:
-    """Check one camera alone, since the two are compared by one kind of stamp."""
     left, right = cameras
     with reading(bag, scene) as reader:
         for number in range(MAX_IMPLAUSIBLE):
@@ -124,7 +120,7 @@ def test_stamps_of_another_clock_are_replaced_by_the_arrival(
 def test_a_stated_delay_from_exposure_to_arrival(
     bag: CameraBag, scene: Scene, cameras: tuple[FakeCamera, FakeCamera]
 ) -> None:
-    """OpenCV has no driver stamps of a stream: they are not requested."""
+    """OpenCV provides no timestamps for a network stream."""
     bag.cameras = {"rtsp://left": cameras[0], "rtsp://right": cameras[1]}
     source = {"left": "rtsp://left", "right": "rtsp://right", "exposure_to_grab_s": 0.020}
     with reading(bag, scene, **source) as reader:
@@ -175,7 +171,7 @@ def test_one_lapse_costs_one_frame_and_a_repeated_stamp_is_one() -> None:
 def test_frames_meet_their_own_partner(
     phase: float, lost_left: set[int], lost_right: set[int], jitter: list[float]
 ) -> None:
-    """Two free-running cameras lose frames, and their frames arrive in any order."""
+    """Two cameras without a common trigger lose frames, and the frames arrive in any order."""
     moments = {
         ("left", n): round((n + jitter[n]) * PERIOD_NS) for n in range(40) if n not in lost_left
     } | {

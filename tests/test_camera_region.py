@@ -30,7 +30,7 @@ RAMP = np.add.outer(np.arange(HEIGHT), 2 * np.arange(WIDTH)).astype(np.uint8)
 
 
 def moved(scene: Scene, position_m: tuple[float, float, float], tilt_rad: float) -> Scene:
-    """Return the scene with the camera at another position, tilted from its direction."""
+    """Return the scene with a displaced and tilted camera."""
     pose = scene.camera.world_from_left
     there = Pose(position_m=position_m, rpy_rad=(pose.rpy_rad[0] + tilt_rad, *pose.rpy_rad[1:]))
     camera = scene.camera.model_copy(update={"world_from_left": there})
@@ -81,8 +81,7 @@ def test_every_finger_that_a_view_can_see_lies_in_its_region(
 
 
 def test_a_region_is_no_larger_than_it_need_be() -> None:
-    """The region of a small volume half a metre away is its image, the finger's radius and the
-    margin."""
+    """The region contains the image of the volume, the finger's radius and the margin."""
     finger = SCENE.finger.model_copy(
         update={"volume_min_m": (-0.02, -0.02, -0.02), "volume_max_m": (0.02, 0.02, 0.02)}
     )
@@ -95,8 +94,7 @@ def test_a_region_is_no_larger_than_it_need_be() -> None:
 
 
 def test_a_lens_that_folds_back_outside_the_image_loses_nothing() -> None:
-    """With k1 = -0.5 the distortion folds back at 0.8 of the focal length; the volume extends
-    further."""
+    """With k1 = -0.5, the distortion polynomial is not monotonic beyond 0.8 focal lengths."""
     lens = Lens(fx_px=540, fy_px=540, cx_px=319.5, cy_px=239.5, distortion=(-0.5, 0, 0, 0, 0))
     line = np.stack([np.linspace(0.0, 3.0, 4000), np.zeros(4000), np.ones(4000)], axis=-1)
     region = find_visible_region(line, lens, WIDE, HIGH)

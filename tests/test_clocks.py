@@ -1,4 +1,4 @@
-"""Test clocks of several hosts: guaranteed bounds, and conversion of stamps."""
+"""Test the clocks of several hosts: guaranteed bounds, and conversion of timestamps."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MS = 1_000_000
 
 
 class DriftingClock:
-    """Clock with a drift against the true one, of a bounded varying rate."""
+    """A clock whose drift relative to the true time varies within bounds."""
 
     def __init__(self, offset_ns: int, drift: float, sway: float = 0.0) -> None:
         self.offset_ns, self.drift, self.sway = offset_ns, drift, sway
@@ -52,8 +52,9 @@ def measured(
     max_drift: float,
     every_ns: int,
 ) -> tuple[OtherClock, int]:
-    """Return the estimate after pings with (there, back) delays in ns, and the true time of the
-    last one."""
+    """Return the estimate after pings with delays (there, back) in ns, and the true time of the
+    last ping.
+    """
     clock, now = OtherClock(max_drift), 0
     for there, back in delays:
         now += every_ns
@@ -88,7 +89,7 @@ def test_the_true_offset_is_always_within_the_bounds(
     every: int,
     later: int,
 ) -> None:
-    """The offset is within its bounds for any delays, asymmetry, age and varying rates."""
+    """Delays, asymmetry, age and drift are arbitrary."""
     clock, now = measured(ours, theirs, delays, max_drift=5e-4, every_ns=every)
     now += later
     found = clock.estimate(ours.at(now))
@@ -99,7 +100,7 @@ def test_the_true_offset_is_always_within_the_bounds(
 
 @pytest.mark.parametrize("asymmetric", [False, True])
 def test_the_best_ping_decides_and_drift_is_found(asymmetric: bool) -> None:
-    """With 20 +- 10 ms of jitter over 60 s the error is that of the shortest delays."""
+    """With 20 +- 10 ms of jitter over 60 s, the error is that of the shortest delays."""
     chance = random.Random(3)
     base = 2 * MS
 
@@ -165,8 +166,9 @@ def offset(clock_id: str = "there", **keys: Any) -> ClockOffset:
 
 @given(st.integers(-60 * S, 60 * S), st.floats(-4e-4, 4e-4), st.integers(-(10**15), 10**15))
 def test_a_stamp_is_converted_with_the_drift(since: int, drift: float, apart: int) -> None:
-    """The error is below a microsecond, a minute after the measurement, for clocks eleven days
-    apart."""
+    """One minute after the measurement, the error is below a microsecond, for clocks eleven days
+    apart.
+    """
     table = ClockTable("here")
     table.update(clocks(a=offset(offset_ns=apart, drift_ratio=drift)))
     ours = 100 * S + since
@@ -204,7 +206,7 @@ def test_an_unknown_clock_s_message_counts_from_its_arrival_and_is_not_trusted()
 
 
 class Pair:
-    """Two clock nodes with message delays in each direction."""
+    """Two clock nodes with message delays in both directions."""
 
     def __init__(self, far_ns: int, **parameters: Any) -> None:
         self.true_ns, self.far_ns = S, far_ns
@@ -233,7 +235,7 @@ class Pair:
         self.clocks["far"].move_to(self.true_ns + self.far_ns)
 
     async def run(self, seconds: float, delay_ns: int = MS) -> dict[str, Clocks]:
-        """Exchange pings; return the newest `clocks` of each node."""
+        """Exchange pings, and return the newest `clocks` message of each node."""
         newest: dict[str, Clocks] = {}
         for node in self.nodes.values():
             await node.setup() if not hasattr(node, "_heard") else None
@@ -279,7 +281,9 @@ async def test_a_clock_that_falls_silent_is_known_less_and_less_and_then_not_at_
 
 
 class ForwardingNode(Node):
-    """Node that forwards a fingertip's stamp, as all nodes do that process the finger."""
+    """A node that forwards the timestamp of the fingertip, as all nodes do that use the
+    fingertip.
+    """
 
     parameters: NodeParameters
     fingertip: Input[Fingertip]

@@ -1,4 +1,4 @@
-"""Test that a command on a full disk ends with one line, and leaves no incomplete file."""
+"""Test that a command on a full disk prints one line, and leaves no incomplete file."""
 
 from __future__ import annotations
 

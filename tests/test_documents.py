@@ -1,4 +1,6 @@
-"""Test that launch files and scenes that are too large, too deep or not text are rejected early."""
+"""Test that launch files and scenes that are too large, too deeply nested or not text are
+rejected.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,7 @@ HOSTILE = {
 
 @pytest.fixture
 def tokens(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Count the tokens that a test has read from a file."""
+    """Count the YAML tokens that a test has read from a file."""
     counted = [0]
     scan = YAML.scan
 
@@ -99,7 +101,7 @@ def test_errors_name_no_class(tmp_path: Path, text: str) -> None:
 
 
 class Choice(BaseModel):
-    """Model whose errors quote pydantic's texts, and whose keys look like its tags."""
+    """A model with error texts and keys that resemble those of pydantic."""
 
     model_config = ConfigDict(extra="forbid")
 

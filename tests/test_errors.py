@@ -1,4 +1,4 @@
-"""Test users' errors: each kind has a code and a remedy, and `flexsheet explain` finds it."""
+"""Test errors that are shown to users: codes, remedies and `flexsheet explain`."""
 
 from __future__ import annotations
 
@@ -29,8 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def kinds_of(kind: type[FlexsheetError]) -> list[type[FlexsheetError]]:
-    """Return all classes of the project that derive from an error; `entries` imports their
-    modules."""
+    """Return all subclasses of an error class. The function `entries` imports their modules."""
     derived = [one for one in kind.__subclasses__() if one.__module__.startswith("flexsheet.")]
     return derived + [below for one in derived for below in kinds_of(one)]
 

@@ -24,7 +24,9 @@ __all__ = ["connections"]
 
 
 async def test_a_stuck_reader_slows_no_other_and_fills_no_memory(connections: Connections) -> None:
-    """The reader never reads; the publisher does not block, and another reader loses nothing."""
+    """One subscriber never reads. The publisher does not block, and another subscriber receives all
+    messages.
+    """
     topic = TOPICS["twin/stereo"]
     publisher, receiver = connections.sender(topic), connections.receiver(topic)
     receiver.extra = lambda _: receiver.inbox.append(
@@ -58,7 +60,7 @@ def large_pictures(number: int) -> StereoPair:
 async def test_a_storm_is_dropped_on_latest_topics_and_reported_on_others(
     connections: Connections, name: str
 ) -> None:
-    """The storm has a hundred times the topic's rate, more than can be handled."""
+    """Messages arrive at a hundred times the rate of the topic."""
     topic = replace(TOPICS["twin/finger"], delivery=TOPICS[name].delivery, rate_hz=(30, 150))
     publisher, receiver = connections.sender(topic), connections.receiver(topic)
     start = await connected(publisher, receiver, finger) + 1
@@ -81,7 +83,7 @@ async def test_a_storm_is_dropped_on_latest_topics_and_reported_on_others(
 async def test_of_thousands_of_forgeries_over_a_socket_none_is_accepted(
     connections: Connections,
 ) -> None:
-    """They are malformed, of another type, from an earlier start, or repeated; they are counted."""
+    """The messages are malformed, of another type, from an earlier start, or repeated."""
     topic = TOPICS["fingertip"]
     endpoint = connections.endpoint("forger")
     forger = connections.raw(zmq.PUB, endpoint)

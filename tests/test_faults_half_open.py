@@ -1,4 +1,4 @@
-"""Test half-open connections: one end disappeared without notice to the other."""
+"""Test half-open connections, in which one end has disappeared without notice."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 class Relay:
-    """Relay to a publisher's tcp port whose connections can become half-open; new ones work."""
+    """A relay to the tcp port of a publisher. Its present connections can become half-open."""
 
     def __init__(self, publisher: Publisher) -> None:
         (tcp,) = (one for one in publisher.endpoints if one.startswith("tcp:"))
@@ -80,7 +80,7 @@ class Relay:
         self._standing.clear()
 
     def wake(self) -> None:
-        """Reset the connections that vanished."""
+        """Reset all connections that have stopped."""
         for ends in self.gone:
             for _, writer in ends:
                 writer.transport.abort()
@@ -89,7 +89,7 @@ class Relay:
 
 @asynccontextmanager
 async def relay_to(publisher: Publisher) -> AsyncIterator[tuple[Relay, str]]:
-    """Return a relay to a publisher, and its endpoint."""
+    """Return a relay to a publisher, and the endpoint of the relay."""
     relay = Relay(publisher)
     server = await asyncio.start_server(relay.take, "127.0.0.1", 0)
     try:
@@ -103,7 +103,7 @@ async def relay_to(publisher: Publisher) -> AsyncIterator[tuple[Relay, str]]:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Use heartbeats ten times as fast as the bus has them."""
+    """Send heartbeats ten times as fast as normal."""
     for option, value in list(bus.HEARTBEATS.items()):
         monkeypatch.setitem(bus.HEARTBEATS, option, value // 10)
 
@@ -147,7 +147,7 @@ async def test_a_reader_that_vanished_is_hung_up_on_and_costs_its_publisher_noth
 async def test_a_quiet_topics_publisher_that_vanished_is_hung_up_on_for_the_next_one(
     connections: Connections,
 ) -> None:
-    """Heartbeats cover rare messages; the latched message of the new process is received."""
+    """Heartbeats detect the end of a publisher that rarely sends messages."""
     topic = TOPICS["estop"]
     publisher = connections.sender(topic, "tcp://127.0.0.1:*")
     async with relay_to(publisher) as (relay, endpoint):
@@ -169,14 +169,14 @@ async def test_a_quiet_topics_publisher_that_vanished_is_hung_up_on_for_the_next
 
 
 def established(pid: int, port: int) -> int:
-    """Return the open connections to a port according to a process's own system."""
+    """Return the open connections to a port, as listed by the operating system."""
     rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text().splitlines()[1:]]
     wanted = f":{port:04X}"
     return sum(row[2].endswith(wanted) and row[3] == ESTABLISHED for row in rows)
 
 
 async def test_a_power_cut_in_mid_stream_is_detected_and_recovered() -> None:
-    """Its messages are so frequent that libzmq's heartbeats would not notice."""
+    """The frequent messages prevent libzmq from detecting missing heartbeats."""
     if why := Computers.missing():
         pytest.skip(why)
     with Computers("main", "left") as computers, hosts("main", "left") as known:
@@ -212,8 +212,9 @@ async def test_a_power_cut_in_mid_stream_is_detected_and_recovered() -> None:
 
 
 async def listen(ring: Path, endpoint: str, record: Path) -> None:
-    """Record the epoch and sequence of all received messages, with a timeout of 2 s instead of
-    5."""
+    """Record epoch and sequence number of all received messages, with a timeout of 2 s instead of 5
+    s.
+    """
     bus.TCP_KEEPALIVE_OPTIONS[zmq.TCP_MAXRT] = 2000
     with record.open("a", buffering=1) as file:
 
@@ -226,7 +227,7 @@ async def listen(ring: Path, endpoint: str, record: Path) -> None:
 
 
 async def publish_until(ring: Path, endpoint: str, epoch: int) -> None:
-    """Publish at 100 Hz."""
+    """Publish messages at 100 Hz."""
     publisher, number = Publisher(FINGER, [endpoint], keys=KeyRing(ring)), 0
     while True:
         number += 1

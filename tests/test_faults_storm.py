@@ -1,4 +1,4 @@
-"""Test a defective writer of the plan: a hundred times its rate, and only invalid targets.
+"""Test a defective planner that sends invalid targets at a hundred times its normal rate.
 
 The test runs in virtual time, so that the interval of every command is known.
 """
@@ -40,7 +40,7 @@ MAX_LENGTH_M = 0.24 * 1.09
 
 @dataclass
 class Sent:
-    """Command as received by the arm."""
+    """A command that an arm has received."""
 
     at_s: float
     mode: str
@@ -49,7 +49,9 @@ class Sent:
 
 @dataclass
 class Bench:
-    """Both bridges with the simulated controllers; time passes only in `pass_tick`."""
+    """Both bridges with the simulated controllers, in virtual time. The method `pass_tick` advances
+    the time.
+    """
 
     monkeypatch: pytest.MonkeyPatch
     clock: VirtualClock = field(default_factory=lambda: VirtualClock(10**9))
@@ -99,7 +101,7 @@ class Bench:
             self.bridges[other].deliver("other_arm", message, header)
 
     async def sleep(self, delay_s: float) -> None:
-        """Substitute for the loop's sleep."""
+        """Replace asyncio.sleep."""
         wakes: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._sleepers.append((self.clock.now_ns() + int(delay_s * 1e9), wakes))
         await wakes
@@ -126,7 +128,7 @@ class Bench:
             await self._yield()
 
     async def run(self, seconds: float, targets: Iterator[SheetTarget], *, rate_hz: float) -> None:
-        """Let time pass while the planner sends these targets at a rate."""
+        """Advance the time while the planner sends targets at a rate."""
         begin_ns, reported = self.clock.now_ns(), 0
         while (passed_s := (self.clock.now_ns() - begin_ns) * 1e-9) < seconds:
             if passed_s * rate_hz >= reported:
@@ -140,7 +142,9 @@ class Bench:
 
 @dataclass
 class Link:
-    """Link to an arm without a network: the simulated controller answers after a millisecond."""
+    """A link to a simulated arm controller that answers after one millisecond, without a
+    network.
+    """
 
     bench: Bench
     side: str
@@ -196,7 +200,7 @@ def steady(clock: VirtualClock) -> Iterator[SheetTarget]:
 
 
 def mad(clock: VirtualClock) -> Iterator[SheetTarget]:
-    """Yield random targets at impossible speeds, with past and future stamps."""
+    """Yield random targets with impossible speeds, and with timestamps in the past and future."""
     chance = np.random.default_rng(3)
     while True:
         moment_ns = clock.now_ns() + int(chance.uniform(-0.05, 0.05) * 1e9)
@@ -204,7 +208,7 @@ def mad(clock: VirtualClock) -> Iterator[SheetTarget]:
 
 
 def accelerations(sent: list[Sent]) -> tuple[Floats, Floats]:
-    """Return velocities and accelerations (n, 6) of commands over their true intervals."""
+    """Return velocities and accelerations (n, 6) of commands, from the true times between them."""
     joints_rad = np.array([one.joints_rad for one in sent])
     steps_s = np.diff([one.at_s for one in sent])[:, None]
     velocities = np.diff(joints_rad, axis=0) / steps_s

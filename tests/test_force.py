@@ -1,4 +1,4 @@
-"""Test measured forces: the gauge, the simulated gauge, the calibration and the self-check."""
+"""Test measured forces: gauge, simulated gauge, calibration and self-check."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def force(newtons: float, *, valid: bool = True) -> Force:
 
 
 def flanges(stretch_ratio: float) -> tuple[Floats, Floats]:
-    """Return the flange poses of a sheet in the plane z = 0 with this stretch."""
+    """Return the flange poses for a stretched sheet in the plane z = 0."""
     half_m = 0.5 * stretch_ratio * SHEET.width_m
     found = []
     for side, arm in ((-1.0, SCENE.arms.left), (1.0, SCENE.arms.right)):
@@ -90,7 +90,7 @@ def test_a_line_gives_its_first_number(line: bytes, value: float | None) -> None
 
 @pytest.fixture
 def port() -> Iterator[tuple[int, str]]:
-    """Yield the descriptor of a simulated serial device, and the path of its port."""
+    """Yield the file descriptor of a simulated serial device, and the path of its port."""
     device, end = os.openpty()
     yield device, os.ttyname(end)
     for fd in (device, end):
@@ -174,7 +174,7 @@ def test_a_gauge_that_is_absent_is_reported_once_and_opened_later(port: tuple[in
 
 
 def run_twin_gauge(apparatus: Apparatus | None, depths_m: list[float]) -> list[tuple[Force, int]]:
-    """Return the readings of the simulated gauge at depths, with their stamps after the pose."""
+    """Return the readings of the simulated gauge at given depths, with their timestamps."""
 
     async def run() -> list[tuple[Force, int]]:
         harness = build_node(TwinGauge, TwinGaugeParameters(apparatus=apparatus))
@@ -240,7 +240,7 @@ def test_the_simulated_gauge_measures_the_true_sheet() -> None:
 
 @dataclass
 class Recorded:
-    """Fingertip, flange poses and forces of pushes; each depth is held for one second."""
+    """Fingertips, flange poses and forces of simulated pushes. Each depth lasts one second."""
 
     apparatus: Apparatus | None
     stretches: tuple[float, ...] = (1.03,)
@@ -329,7 +329,7 @@ def test_a_recording_with_forces_calibrates_the_sheet(
 
 
 def write_bag(path: Path, recorded: Recorded, *, with_force: bool = True) -> Path:
-    """Write the recorded poses and forces, as a graph with a gauge records them."""
+    """Write the poses and forces to a bag, as in a graph with a gauge."""
     with BagWriter(path, {"recording": {"clock_id": "clock", "started_ns": "1"}}) as writer:
 
         def write(topic: str, message: Message, at_ns: int) -> None:
@@ -370,7 +370,7 @@ def test_a_bag_without_forces_is_refused(tmp_path: Path) -> None:
 
 
 def compare(apparatus: Apparatus | None, depths_m: tuple[float, ...]) -> MeasuredForceCheck:
-    """Run the self-check with the true force of an apparatus at resting depths."""
+    """Run the self-check with the true force of a simulated sheet at constant depths."""
     check = MeasuredForceCheck(SCENE, make_force_model(SHEET))
     truth = TrueSheetForce(SCENE, apparatus)
     left, right = flanges(1.05)

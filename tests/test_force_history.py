@@ -1,4 +1,4 @@
-"""Test hysteresis and creep of the simulator's sheet against their definitions."""
+"""Test the hysteresis and creep of the simulated sheet."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def apparatus(**sheet: float) -> Apparatus:
 
 
 def cycle(hysteresis: float, creep: float, period_s: float = 2.0) -> tuple[Floats, Floats]:
-    """Return displacement and force of the fifth loading and unloading from zero to one newton."""
+    """Return displacement and force of the fifth loading cycle from zero to one newton."""
     times = np.linspace(0.0, 5.0 * period_s, 5001)
     elastic = 0.5 - 0.5 * np.cos(2.0 * np.pi * times / period_s)
     force = apply_history(ForceHistory(hysteresis, creep), times, elastic)
@@ -25,7 +25,7 @@ def cycle(hysteresis: float, creep: float, period_s: float = 2.0) -> tuple[Float
 
 
 def lost_ratio(displacement: Floats, force: Floats) -> float:
-    """Return the energy that a cycle loses over that of its loading."""
+    """Return the energy loss of a cycle divided by the loading energy."""
     peak = int(np.argmax(displacement))
     loading = np.trapezoid(force[: peak + 1], displacement[: peak + 1])
     return float(np.trapezoid(force, displacement) / loading)

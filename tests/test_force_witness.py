@@ -1,4 +1,4 @@
-"""Test the comparison with CalculiX, except for the program, which is not installed here."""
+"""Test the comparison with CalculiX, without the program CalculiX."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Test that forged fingertips and forged states of the other arm move no arm beyond a limit.
+"""Test that forged fingertips and forged states of the other arm do not move an arm beyond a limit.
 
-Planner, both bridges and the simulated controllers run in virtual time. Speeds are those of the
-simulated joints, and of the tool by the simulator's kinematics.
+Planner, bridges and simulated controllers run in virtual time. Speeds are those of the simulated
+joints and tools.
 """
 
 from __future__ import annotations
@@ -52,7 +52,9 @@ STOPPED = {"idle", "stopping", "hold", "relax", "fault"}
 
 
 def tool_points(side: str, joints_rad: Floats) -> Floats:
-    """Return both ends of the clamped edge and the flange (3, 3) m, in the arm's base."""
+    """Return both ends of the clamped edge, and the flange, as points (3, 3), m, in the arm's base
+    frame.
+    """
     arm = SCENE.arms.left if side == "left" else SCENE.arms.right
     clamp = transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)
     half = 0.5 * SCENE.sheet.height_m * clamp[:3, 1]
@@ -62,7 +64,7 @@ def tool_points(side: str, joints_rad: Floats) -> Floats:
 
 
 class Immediate(PathChecker):
-    """Path checker without delay, for virtual time."""
+    """A path checker without delay, for virtual time."""
 
     def poll(
         self, question: PathCheckRequest | None
@@ -73,7 +75,9 @@ class Immediate(PathChecker):
 
 
 def edge_distance_m(joints_rad: Mapping[str, Floats]) -> float:
-    """Return the distance (m) of both edges' centres, by the simulator's kinematics."""
+    """Return the distance (m) between the centres of both edges, from the simulated joint
+    angles.
+    """
     places = []
     for side, arm in (("left", SCENE.arms.left), ("right", SCENE.arms.right)):
         world_from_base = transform_from_rpy(
@@ -86,7 +90,7 @@ def edge_distance_m(joints_rad: Mapping[str, Floats]) -> float:
 
 @dataclass
 class ForgedBench(Bench):
-    """Harness with a planner, and with a replacement of the other arm's states."""
+    """A test bench with a planner, which can replace the states of the other arm."""
 
     forge_state: Callable[[ArmState, Header], tuple[ArmState, Header]] | None = None
     targets_published: list[SheetTarget] = field(default_factory=list)
@@ -145,7 +149,7 @@ class ForgedBench(Bench):
         *,
         at_most_until: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Let time pass while the planner receives these fingertips."""
+        """Advance the time while the planner receives fingertips."""
         begin_ns, reported = self.clock.now_ns(), 0
         while (passed_s := (self.clock.now_ns() - begin_ns) * 1e-9) < seconds:
             if at_most_until():
@@ -227,7 +231,7 @@ def forged_tip(bench: ForgedBench, kind: str, random: Random) -> tuple[Fingertip
 
 
 def run_bench(test: Callable[[ForgedBench], Awaitable[None]]) -> None:
-    """Run a test with a new harness."""
+    """Run a test with a new test bench."""
 
     async def main() -> None:
         with pytest.MonkeyPatch.context() as patch:
@@ -296,7 +300,7 @@ Forge = Callable[[ArmState, Random], dict[str, Any]]
 
 
 def moved_pose(pose: Floats, random: Random) -> Floats:
-    """Return the pose with a small or large offset and rotation."""
+    """Return the pose with a small or a large random displacement and rotation."""
     shift = random.normal(0.0, random.choice([0.005, 0.05, 0.5]), 3)
     turn = random.normal(0.0, random.choice([0.02, 0.3, 2.0]), 3)
     return np.asarray(transform_from_rpy(shift, turn) @ pose)
@@ -334,7 +338,7 @@ STATES: dict[str, Forge] = {
 def forger(
     kinds: list[str], random: Random, share: float
 ) -> Callable[[ArmState, Header], tuple[ArmState, Header]]:
-    """Replace this fraction of the states."""
+    """Return a function that replaces a fraction of the states."""
 
     def forge(state: ArmState, header: Header) -> tuple[ArmState, Header]:
         if random.random() > share:

@@ -1,4 +1,4 @@
-"""Test the head camera with a fake device and detector, and the real detector on a photograph."""
+"""Test the head camera with a fake camera, and the detector with a photograph."""
 
 from __future__ import annotations
 
@@ -56,7 +56,9 @@ def project(points: Floats) -> Floats:
 
 
 def eyes_at(centre: Floats, yaw_rad: float = 0.0) -> Floats:
-    """Return the left and right eye (2, 3) of a head that is rotated about the vertical."""
+    """Return the positions (2, 3) of the left and right eye of a head, rotated about the
+    vertical.
+    """
     half = 0.5 * SCENE.eyes.interocular_m * np.array([np.cos(yaw_rad), 0.0, np.sin(yaw_rad)])
     return np.array([centre - half, centre + half])
 
@@ -94,7 +96,7 @@ def test_the_filter_reduces_noise_at_rest_and_follows_a_motion() -> None:
 
 
 class FakeCapture:
-    """Camera that delivers an image each time the test permits it."""
+    """A fake camera that delivers an image when the test permits it."""
 
     def __init__(self, shape: tuple[int, int] = SIZE) -> None:
         self.image = np.zeros(shape, np.uint8)
@@ -119,7 +121,7 @@ class FakeCapture:
 
 
 class Harness:
-    """Head camera with a fake device and detector, and the messages that it has published."""
+    """A head camera node with a fake camera, and the messages that the node has published."""
 
     def __init__(self, capture: FakeCapture) -> None:
         self.capture, self.clock = capture, VirtualClock()
@@ -141,7 +143,7 @@ class Harness:
         return self.pixels
 
     async def next_eye(self, step_ns: int = 100_000_000) -> Eye:
-        """Deliver an image after a time step; return the eye that the node publishes."""
+        """Deliver an image after a time step, and return the published eye message."""
         count = len(self.sent)
         self.clock.move_to(self.clock.now_ns() + step_ns)
         self.capture.deliver()
@@ -249,7 +251,7 @@ async def test_an_image_that_waited_during_a_slow_search_is_not_searched(
 async def test_a_failed_camera_is_reported_and_opened_again(
     monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]
 ) -> None:
-    """A camera fails that delivers no image, or one of the wrong size."""
+    """The camera fails if it delivers no image, or an image of the wrong size."""
     broken = FakeCapture(shape)
     broken.fails = shape == SIZE
     async with running(monkeypatch, broken) as harness:
@@ -284,7 +286,7 @@ PUPILS_PX = np.array([[306.3, 186.7], [223.0, 189.7]])
 
 @pytest.mark.parametrize("search_width_px", [480, 1000])
 def test_the_real_detector_finds_the_pupils_of_a_photograph(search_width_px: int) -> None:
-    """The tolerance is 8 % of the interocular distance, 5 mm of a head."""
+    """The tolerance is 8 % of the distance between the eyes, about 5 mm."""
     pytest.importorskip("dlib", reason="pip install 'flexsheet[head]'")
     from matplotlib.cbook import get_sample_data
 

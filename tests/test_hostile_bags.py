@@ -1,4 +1,4 @@
-"""Test that every command that reads a bag rejects a damaged or hostile one with an error text."""
+"""Test that all commands that read a bag reject damaged and hostile bags with an error text."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def flipped(seed: int) -> Callable[[bytes], bytes]:
 
 
 def records(data: bytes, opcode: int) -> list[int]:
-    """Return the positions of the lengths of a kind of record."""
+    """Return the byte positions of the length fields of all records of one kind."""
     found, offset = [], 8
     while offset + 9 < len(data):
         kind, length = struct.unpack_from("<BQ", data, offset)
@@ -73,7 +73,7 @@ def longer(opcode: int, length: int) -> Callable[[bytes], bytes]:
 
 
 def bomb(data: bytes) -> bytes:
-    """Insert a chunk of 0.5 GB of zeros, compressed to some ten KB, after the first header."""
+    """Insert a chunk of 0.5 GB of zeros, compressed to about 10 KB, after the first header."""
     packer = zstandard.ZstdCompressor(level=1).compressobj()
     packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(512)) + packer.flush()
     body = struct.pack("<QQQI", 0, 1, 512 << 20, 0) + struct.pack("<I", 4) + b"zstd"
@@ -82,7 +82,7 @@ def bomb(data: bytes) -> bytes:
 
 
 def lying_bomb(data: bytes) -> bytes:
-    """Insert the same chunk with a small declared size."""
+    """Insert a chunk of 0.5 GB of zeros with a small stated size."""
     packer = zstandard.ZstdCompressor(level=1).compressobj()
     packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(512)) + packer.flush()
     body = struct.pack("<QQQI", 0, 1, 1000, 0) + struct.pack("<I", 4) + b"zstd"
@@ -96,7 +96,7 @@ def _behind_header(data: bytes, record: bytes) -> bytes:
 
 
 def made(write: Callable[[Writer], None]) -> Callable[[bytes], bytes]:
-    """Write a well-formed bag."""
+    """Write a valid bag."""
 
     def make(_: bytes) -> bytes:
         from io import BytesIO
@@ -190,6 +190,6 @@ def test_a_hostile_bag_is_rejected_or_read_in_part(
 
 
 def test_the_whole_bag_is_read(whole: bytes, tmp_path: Path) -> None:
-    """The inputs above are rejected for their damage only."""
+    """Without damage, the bag of the other tests is valid."""
     (tmp_path / "a.mcap").write_bytes(whole)
     assert BagReader(tmp_path / "a.mcap").complete

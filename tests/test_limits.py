@@ -1,4 +1,4 @@
-"""Test that every number of a scene, a launch file and a node's parameters has limits."""
+"""Test that every number in scenes, launch files and node parameters has limits."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ Key = tuple[Any, ...]
 
 
 def numbers_in(value: Any, key: Key = ()) -> Iterator[Key]:
-    """Return the keys of all numbers in plain values."""
+    """Return the keys of all numbers in nested lists and dictionaries."""
     match value:
         case dict():
             for name, one in value.items():
@@ -111,7 +111,7 @@ def test_an_absurd_parameter_is_rejected(where: tuple[str, str], value: float) -
     value=st.floats(min_value=-1e-12, max_value=1e-12, exclude_min=True, exclude_max=True),
 )
 def test_a_tiny_number_is_rejected_or_is_a_coordinate(where: tuple[str, Key], value: float) -> None:
-    """A value that must be positive is not accepted below a device's resolution."""
+    """A positive number below the resolution of devices is rejected."""
     name, key = where
     if name == "organ":
         return
@@ -169,7 +169,6 @@ def models_below(base: type[BaseModel]) -> Iterator[type[BaseModel]]:
 
 
 def test_what_files_hold_is_limited() -> None:
-    """The test lists the top-level models; nested ones derive from the same class."""
     limited = set(models_below(LimitedModel))
     assert {LaunchFile, StereoCalibration, *PARAMETERS.values()} <= limited
     for name, field in Scene.model_fields.items():

@@ -25,7 +25,7 @@ FINGERTIP = TOPICS["fingertip"]
 
 
 class Reader:
-    """Subscriber of the process's own writer, or of any endpoint, that records its messages."""
+    """A subscriber that records its messages, from its own process or from any endpoint."""
 
     def __init__(self, topic: Topic, source: str | Source, local: LocalBus | None, **more: Any):
         self.messages: list[tuple[Any, Header]] = []
@@ -59,7 +59,7 @@ def open_publisher(topic: Topic, folder: Path) -> Iterator[tuple[Publisher, Loca
 
 
 async def turn() -> None:
-    """Let the callbacks run that are scheduled now."""
+    """Run the callbacks that are scheduled now."""
     await asyncio.sleep(0)
     await asyncio.sleep(0)
 

@@ -1,4 +1,4 @@
-"""Test that a node's log does not repeat a warning endlessly."""
+"""Test that the log of a node does not repeat a warning without limit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flexsheet.nodes.log_limit import MAX_DISTINCT, REPORT_PERIOD_S, RepeatLimit
 
 
 class Log:
-    """Logger behind a limiter with a clock set by the test."""
+    """A logger with a limiter, and a clock that the test sets."""
 
     def __init__(self) -> None:
         self.now_s = 0.0

@@ -1,4 +1,4 @@
-"""Test the calibration of the marker's position on the finger, and its use by the triangulator."""
+"""Test the calibration of the marker's position on the finger."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_touches_of_a_point_give_the_offset() -> None:
 
 
 def test_errors_of_points_and_orientations_determine_the_covariance() -> None:
-    """The errors are drawn from the model, so that their squared normalized length has mean 3."""
+    """For errors from the model, the mean of the squared normalized error is 3."""
     lengths, stated_m = [], []
     for seed, error_m in enumerate([5e-5] * 8 + [3e-4] * 8):
         random = np.random.default_rng(seed)
@@ -97,7 +97,7 @@ def test_errors_of_points_and_orientations_determine_the_covariance() -> None:
 
 
 def test_touches_of_the_sheet_give_the_offset() -> None:
-    """The pad may be anywhere on a plane: its position along the plane has no influence."""
+    """The position of the pad along the sheet is arbitrary."""
     random = np.random.default_rng(6)
     normal = np.array([0.0, 0.0, 1.0])
     touches = []
@@ -128,7 +128,7 @@ def test_too_few_orientations_are_refused(
 
 
 def test_orientations_that_leave_a_component_free_are_refused() -> None:
-    """A sheet whose normal is the rotation axis does not see the offset across it."""
+    """Rotations about the sheet's normal do not determine the offset across the normal."""
     random = np.random.default_rng(8)
     finger = world_from_finger(SCENE.finger.direction_world)
     touches = []
@@ -223,7 +223,7 @@ async def test_the_calibrated_fingertip_is_the_pad(tmp_path: Path) -> None:
 
 
 def test_the_scenes_offset_is_used_without_a_calibration() -> None:
-    """z of the level finger is up and towards the user."""
+    """The z axis of the horizontal finger points up and towards the user."""
     turned = world_from_finger((0.0, -0.5, 0.866)) @ np.array([0.0, 0.002, 0.01])
     assert turned == pytest.approx([0.002, 0.00866, 0.005], abs=1e-5)
 
@@ -253,7 +253,7 @@ def test_exactly_one_source_is_required(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_a_marker_on_the_nail_is_found_in_the_orientations_of_touches() -> None:
-    """Drawn in front of a round finger, it was found in 6 of 24 orientations."""
+    """With a round finger in front of the marker, only 6 of 24 orientations were detected."""
     drawn = sample_apparatus(SCENE, 1)
     true = drawn.model_copy(update={"camera": CameraTruth()})
     touches = simulate_touches(SCENE, true, calibration=None, seed=1)

@@ -1,4 +1,6 @@
-"""Test the true sheet against published FE results, theory, equilibrium and hard cases."""
+"""Test the simulated sheet against published FE results, theory, equilibrium and difficult
+cases.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ def test_edge_force_of_the_flat_sheet(stretch: float, force_n: float) -> None:
 
 
 class Patch:
-    """Rigid disc of 10 mm radius that is bonded to its nodes: the load of the FE table."""
+    """A rigid disc with a radius of 10 mm that is bonded to the sheet, as in the published FE
+    results.
+    """
 
     def __init__(self, rest: np.ndarray, start: np.ndarray, depth_m: float) -> None:
         self.on = np.hypot(*(rest.reshape(-1, 2) - 0.12).T) < 0.010
@@ -272,7 +276,9 @@ def test_friction_stays_within_coulombs_limit(coefficient: float) -> None:
 
 
 def test_alternating_friction_forces_converge() -> None:
-    """With changes halved only once, the nodes at the limit alternate between stick and slip."""
+    """If changes are halved only once, nodes at the friction limit alternate between stick and
+    slip.
+    """
     tip = np.array([-0.0023, 0.0701, -0.033])
     pushed = solve(RUBBER, *edges(1.05), finger_tip=tip, friction_coefficient=0.85, cells=16)
     total = pushed.finger_force_n + pushed.left_force_n + pushed.right_force_n

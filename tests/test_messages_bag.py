@@ -1,4 +1,4 @@
-"""Test bags: recorded messages are read back, and after a crash none is lost or misread."""
+"""Test bags: writing, reading, truncation and damage."""
 
 from __future__ import annotations
 
@@ -63,7 +63,10 @@ STEP_NS = 10_000_000
 
 
 def fill(writer: BagWriter, count: int, *, flush_every: int = 0) -> None:
-    """Write `count` fingers, an image every ten, an e-stop first; log time 1 s + 10 ms each."""
+    """Write `count` finger messages, 10 ms apart from 1 s.
+
+    The first message is an e-stop. Every tenth finger message is followed by an image.
+    """
     writer.write(TOPICS["estop"], EStop(engaged=False, reason="start"), header(1), 10**9)
     for number in range(count):
         log_ns = 10**9 + number * STEP_NS
@@ -213,7 +216,7 @@ def test_foreign_data_is_rejected_as_frames(data: bytes) -> None:
 
 
 def entries_by_boundary(path: Path) -> list[tuple[int, int]]:
-    """Return (byte after each complete chunk, messages up to it), by mcap's reader."""
+    """Return pairs: the end of a complete chunk in bytes, and the number of messages before it."""
     found: list[tuple[int, int]] = []
     count = 0
     with path.open("rb") as file:
@@ -284,7 +287,7 @@ def test_bag_truncated_at_any_byte(
 def test_bag_damaged_at_any_byte(
     sample: tuple[bytes, list[Any], Path], draw: st.DataObject
 ) -> None:
-    """Every message that is read from overwritten bytes was recorded, or BagError is raised."""
+    """Reading a damaged bag returns only recorded messages, or raises BagError."""
     data, _, folder = sample
     damaged = bytearray(data)
     at = draw.draw(st.integers(0, len(data) - 1))

@@ -59,7 +59,7 @@ def pictures(value: int) -> StereoPair:
 
 
 class RecordingSubscriber:
-    """Subscriber that records its messages."""
+    """A subscriber that records its messages."""
 
     def __init__(self, topic: Topic, endpoints: list[str]) -> None:
         self.inbox: list[tuple[Any, Header]] = []
@@ -81,7 +81,7 @@ class RecordingSubscriber:
 
 
 class ForeignPublisher:
-    """Sender of any frames to all connections."""
+    """A publisher that sends arbitrary frames to all connections."""
 
     def __init__(self, endpoint: str) -> None:
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PUB)
@@ -95,7 +95,7 @@ class ForeignPublisher:
 
 
 class Connections:
-    """Factory of publishers and subscribers that closes them."""
+    """A factory of publishers and subscribers, which closes them after the test."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -115,7 +115,7 @@ class Connections:
         return receiver
 
     def raw(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
-        """Open a socket without flexsheet's protocol."""
+        """Open a ZeroMQ socket that does not use the flexsheet protocol."""
         opened: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
         opened.setsockopt(zmq.LINGER, 0)
         opened.bind(endpoint)
@@ -488,7 +488,7 @@ def arms() -> TwinArms:
 async def test_bursts_never_leave_a_message_lying(
     connections: Connections, delivery: Delivery
 ) -> None:
-    """With edge-triggered wake-ups no message waits for the next one at any rate."""
+    """Every message of a burst is delivered, although the sockets are edge-triggered."""
     topic = replace(TOPICS["twin/arms"], delivery=delivery)
     publisher = connections.sender(topic)
     receiver = connections.receiver(topic)
@@ -546,7 +546,9 @@ async def test_unopened_frames_of_every_message_for_the_recorder(
 def make_ending_subscriber(
     connections: Connections, endpoint: str, local: LocalBus | None = None
 ) -> tuple[list[str], Counts]:
-    """Return the list to which a subscriber adds each e-stop's reason, and "end" for each end."""
+    """Return a list to which a subscriber adds the reason of each e-stop, and "end" at each end of
+    a connection.
+    """
     seen: list[str] = []
     counts = Counts()
     subscriber = Subscriber(

@@ -120,7 +120,7 @@ def scene() -> Scene:
 
 
 def same(a: object, b: object) -> bool:
-    """Compare values bit by bit, including arrays."""
+    """Return whether two values are equal bit by bit, including arrays."""
     if isinstance(a, BaseModel):
         return type(a) is type(b) and same(a.__dict__, b.__dict__)
     if isinstance(a, dict) and isinstance(b, dict):
@@ -218,7 +218,7 @@ def test_foreign_msgpack(value: object, more: list[bytes]) -> None:
 
 @given(st.data())
 def test_right_header_with_foreign_parts(data: st.DataObject) -> None:
-    """Any one element of a valid header or any one field is replaced."""
+    """One element of a valid header, or one field, is replaced by an arbitrary value."""
     message = data.draw(fingertips)
     codec = get_codec(Fingertip)
     fields: dict[str, object] = {
@@ -237,7 +237,7 @@ def test_right_header_with_foreign_parts(data: st.DataObject) -> None:
 @examples(150)
 @given(messages, st.data())
 def test_mutated_messages_are_rejected_or_valid(message: Message, data: st.DataObject) -> None:
-    """Bytes are flipped, cut, added, exchanged or dropped: WireError, or a valid message."""
+    """Decoding a mutated message raises WireError or returns a valid message."""
     frames = [bytearray(frame) for frame in encode(message, HEADER, inline_bytes=64)]
     which = data.draw(st.integers(0, len(frames) - 1))
     frame = frames[which]

@@ -1,4 +1,4 @@
-"""Test that bags of earlier versions can be read by the current types."""
+"""Test that the current message types can read bags of earlier versions."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class Before(Message):
 
 
 class WithDefaults(Message):
-    """Type that Before can become without a migration."""
+    """A later version of `Before` that needs no migration."""
 
     mode: Literal["on", "off", "auto"]
     size_mm: float
@@ -175,7 +175,7 @@ def row(message_type: type[Message]) -> Topic:
 
 @pytest.fixture
 def changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Write a bag with a size in millimetres, opened when sizes are in metres."""
+    """Write a bag with a size in millimetres, and change the message type to metres."""
     path = tmp_path / "before.mcap"
     with BagWriter(path) as writer:
         writer.write(row(Before), Before(mode="off", size_mm=2.5), HEADER, 10)

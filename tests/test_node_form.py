@@ -36,7 +36,7 @@ class EchoParameters(NodeParameters):
 
 
 class Echo(Node):
-    """Node that forwards each stop, or fails on request."""
+    """A node that forwards e-stops, or fails on request."""
 
     parameters: EchoParameters
     estop: Input[EStop]

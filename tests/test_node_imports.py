@@ -1,4 +1,4 @@
-"""Nodes do not import slow packages that they do not need, which would delay their restart."""
+"""Test that nodes do not import slow packages that they do not need."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Test that nodes publish the same bytes in one process as in several, from the same bag."""
+"""Test that nodes publish the same bytes in one process as in several processes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FIRST_SEQUENCE, STEP_NS, STEPS = 1000, 16_000_000, 30
 
 
 class TargetReport(Node):
-    """Publish the centre of each target, with the target's source stamp."""
+    """A node that publishes the centre and the source timestamp of each target."""
 
     parameters: NodeParameters
     sheet_target: Input[SheetTarget]
@@ -67,7 +67,7 @@ def write_bag(path: Path) -> None:
 
 
 class Chain:
-    """Planner and report with their connections, and a recorder outside of their process."""
+    """Planner and report with their connections, and a recorder in another process."""
 
     def __init__(self, folder: Path, *, in_one_process: bool) -> None:
         self._folder = folder
@@ -132,7 +132,7 @@ class Chain:
             connection.close()
 
     def is_idle(self) -> bool:
-        """Return whether every message has reached the recorder."""
+        """Return whether all messages have reached the recorder."""
         return self.newest == {
             "planner": self.planner.sheet_target.counts.messages,
             "report": self.report.estop.counts.messages,
@@ -140,7 +140,9 @@ class Chain:
 
 
 async def run_chain(folder: Path, bag: Path, *, in_one_process: bool) -> list[list[bytes]]:
-    """Return the messages that a recorder outside gets from planner and report, as bytes."""
+    """Return the messages of planner and report that a recorder in another process receives, as
+    bytes.
+    """
     messages = list(BagReader(bag))
     [scene] = [(message, header) for topic, message, header, _ in messages if topic == "scene"]
     fingers = [(message, header) for topic, message, header, _ in messages if topic == "fingertip"]
@@ -184,7 +186,7 @@ async def test_the_same_bag_gives_the_same_bytes_in_one_process_and_in_many(tmp_
 
 
 async def test_the_end_of_the_images_is_passed_on_to_the_arms(tmp_path: Path) -> None:
-    """Camera in its own process, triangulator and planner in another one, no process that ends."""
+    """The camera runs in one process, and triangulator and planner run in another."""
     topics = ("twin/stereo", "stereo", "fingertip", "sheet_target")
     ends = {one: f"ipc://{tmp_path}/{number}" for number, one in enumerate(topics)}
 

@@ -1,4 +1,4 @@
-"""Test parameters marked by type: devices, device addresses and calibration files."""
+"""Test marks of parameters: devices, device addresses and calibration files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class OwnParameters(NodeParameters):
 
 
 class OwnBridge(Node):
-    """Bridge with other parameter names."""
+    """An arm bridge with different parameter names."""
 
     parameters: OwnParameters
     arm: Output[ArmState]

@@ -1,4 +1,4 @@
-"""Test the allowed priorities, and the report if they are not allowed."""
+"""Test the process priorities, and the report if they are not permitted."""
 
 from __future__ import annotations
 

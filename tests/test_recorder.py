@@ -1,4 +1,4 @@
-"""Test the recorder: complete bags, counted losses, and little loss in a crash."""
+"""Test the recorder: complete bags, counted losses, full disks and killed processes."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ async def test_it_never_writes_over_a_bag(tmp_path: Path) -> None:
 async def test_a_bag_is_split_and_no_message_is_lost(
     tmp_path: Path, limit: dict[str, float]
 ) -> None:
-    """The next bag begins with the latched messages, so that each bag can be played alone."""
+    """Each further bag begins with the latched messages, so that it can be replayed alone."""
     clock = VirtualClock(clock_id="clock")
     node = recorder(clock, bag=tmp_path / "a.mcap", **limit)
     await node.setup()
@@ -192,7 +192,7 @@ async def test_a_failing_disk_is_reported_and_losses_are_counted(
 
 @pytest.fixture
 def small_disk() -> Iterator[Path]:
-    """Create a separate disk of 48 MiB."""
+    """Mount a separate disk of 48 MiB."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     mounted = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", str(folder)],
@@ -211,7 +211,7 @@ def small_disk() -> Iterator[Path]:
 async def test_on_a_full_disk_the_bag_ends_readable_and_another_follows(
     small_disk: Path, keep_free_bytes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ended in time, the bag has an index; on a disk that is full suddenly, it has none."""
+    """A bag that is closed in time has an index. A bag on a suddenly full disk has none."""
     # Chunks are cut by their size alone, however long the test takes.
     monkeypatch.setattr(bag, "FLUSH_PERIOD_S", DEADLINE_S)
     clock = VirtualClock()
@@ -264,7 +264,9 @@ def read_headers(reader: BagReader) -> Iterator[tuple[str, list[Any], Header]]:
 
 
 async def recorded(bag: Path, since_ns: float) -> int:
-    """Wait until a growing bag has a finger of that time or later; return its sequence."""
+    """Wait until a growing bag contains a finger message of a given time or later. Return its
+    sequence number.
+    """
     async with asyncio.timeout(DEADLINE_S):
         while True:
             with suppress(FileNotFoundError, BagError):
@@ -275,7 +277,7 @@ async def recorded(bag: Path, since_ns: float) -> int:
 
 
 async def test_killed_it_loses_at_most_what_came_since_the_last_flush(tmp_path: Path) -> None:
-    """This is at most one second; what a reader found before is still there."""
+    """At most one second of messages is lost."""
     assert FLUSH_PERIOD_S <= 1.0
     nodes = {
         "beacon": {"type": "tests.launch_nodes:Beacon", "parameters": {"rate_hz": 100}},
@@ -340,7 +342,9 @@ asyncio.run(main())
 
 @pytest.mark.alone
 def test_a_reader_that_is_behind_outlives_its_writer(runs_root: Path) -> None:
-    """libzmq's heartbeat once aborted the recorder when the camera ended before it."""
+    """In an earlier version, a heartbeat of libzmq aborted the recorder after the end of the
+    camera.
+    """
     done = subprocess.run(
         [sys.executable, "-c", "import sys\n" + FLOODED, str(runs_root / "s")],
         cwd=ROOT, capture_output=True, text=True, check=False,

@@ -1,5 +1,6 @@
-"""Test old names of public keys and fields: bags are read, files give an error with the new
-name."""
+"""Test renamed keys and fields. Old bags are read, and old files cause an error with the new
+name.
+"""
 
 from __future__ import annotations
 
@@ -165,11 +166,14 @@ def test_the_old_bag_is_read_with_todays_names() -> None:
 
 
 class Moment(Bookmark):
-    """Bookmark as bags recorded it, under its old name."""
+    """The message type `Bookmark` under its former name."""
 
 
 def with_old_names(message_type: type[Message], names: dict[str, str]) -> type[Message]:
-    """Make the type as it was recorded; names: old names of fields by new ones."""
+    """Return a message type with former field names.
+
+    names: former names of fields, by current name.
+    """
     hints = get_type_hints(message_type, include_extras=True)
     fields: dict[str, Any] = {
         names.get(name, name): (hints[name], field)

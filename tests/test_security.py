@@ -45,7 +45,7 @@ def free_port() -> int:
 
 @dataclass
 class RecordingSubscriber:
-    """Record of a subscriber."""
+    """A subscriber that records its messages and problems."""
 
     inbox: list[tuple[Any, Header]] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -61,7 +61,7 @@ class RecordingSubscriber:
 
 
 class SecuredPublisher:
-    """Publisher of main at a tcp endpoint; other processes try to subscribe or to replace it."""
+    """A publisher of the host `main` at a tcp endpoint, which other processes attack."""
 
     def __init__(self, known: Hosts) -> None:
         self.known = known
@@ -96,7 +96,7 @@ class SecuredPublisher:
         return receiver
 
     async def publish_until(self, publisher: Publisher, until_: Callable[[], object]) -> None:
-        """Publish numbered e-stops until a condition holds."""
+        """Publish numbered e-stops until a condition is true."""
         while not until_():
             self.sent += 1
             header = replace(HEADER, sequence=self.sent)
@@ -133,7 +133,9 @@ async def test_an_unknown_key_receives_nothing_and_is_reported(secured: SecuredP
 async def test_only_the_host_of_the_plan_is_accepted(
     secured: SecuredPublisher, impostor: str
 ) -> None:
-    """Another host, even one of the plan, uses main's endpoint: it lacks main's key."""
+    """Another host, even one in the launch file, uses the endpoint of `main` without the key of
+    `main`.
+    """
     if impostor == "without":
         sender: Publisher = Publisher(ESTOP, [f"tcp://127.0.0.1:{secured.port}"])
         secured.cleanups.append(sender.close)
@@ -213,7 +215,7 @@ async def test_a_flood_from_strangers_does_not_keep_the_friend_from_hearing(
 
 
 class TamperingProxy(TcpRelay):
-    """Proxy between two hosts that stores data, and can change, repeat or replay them."""
+    """A proxy between two hosts that can store, change, repeat and replay data."""
 
     def __init__(self, target_port: int) -> None:
         super().__init__(target_port)
@@ -271,8 +273,7 @@ async def test_changed_repeated_or_replayed_data_are_rejected(
 
 
 async def test_a_recorded_connection_cannot_be_replayed(secured: SecuredPublisher) -> None:
-    """All bytes that a subscriber sent open no connection again: both ends create the session's
-    keys."""
+    """Both ends create new session keys, so that recorded bytes cannot open another connection."""
     sender = secured.sender()
     sent: list[bytes] = []
 
@@ -311,7 +312,7 @@ async def test_a_recorded_connection_cannot_be_replayed(secured: SecuredPublishe
 async def test_messages_of_250_mib_are_counted_and_others_continue(
     secured: SecuredPublisher,
 ) -> None:
-    """Each topic has its limit; longer messages are rejected, and their memory is freed."""
+    """Each topic has a size limit. Larger messages are rejected, and their memory is freed."""
     foreign = ForeignPublisher(f"tcp://127.0.0.1:{secured.port}")
     secured.cleanups.append(foreign.close)
     receiver = RecordingSubscriber()
@@ -384,7 +385,9 @@ def plain(frames: list[Any]) -> list[bytes]:
 
 
 def forgeries(message: Message, chance: random.Random) -> Iterator[tuple[str, list[bytes]]]:
-    """Yield different messages endlessly that a receiver of HEADER's message must reject."""
+    """Yield an infinite sequence of forged messages that a receiver of the message with HEADER must
+    reject.
+    """
     other: Message = stop("x") if not isinstance(message, EStop) else finger(1.0)
     good = plain(encode(message, HEADER))
     head = msgpack.unpackb(good[0], strict_map_key=False)

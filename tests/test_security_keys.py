@@ -1,4 +1,4 @@
-"""Test key pairs: their files, the command, the launch file, and graphs with keys."""
+"""Test key pairs: files, command, launch file, and graphs with keys."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ nodes:
 
 @pytest.fixture(autouse=True)
 def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Create a directory of runs for the test, with a short path."""
+    """Create a directory for runs, with a short path."""
     with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as folder:
         monkeypatch.setenv(runs.ROOT_VARIABLE, folder)
         yield
@@ -113,7 +113,7 @@ def test_an_invalid_key_is_reported(keys: Path, text: str) -> None:
 
 @pytest.mark.parametrize("first", ".-:+=^!/*?&<>()[]{}@%0")
 def test_any_key_can_stand_in_a_launch_file(tmp_path: Path, first: str) -> None:
-    """Some characters of keys have a meaning in YAML, depending on the position."""
+    """Keys can contain characters with a special meaning in YAML."""
     file = tmp_path / "graph.yaml"
     file.write_text(
         'nodes: {beacon: {type: "tests.launch_nodes:Beacon"}}\n'
@@ -249,7 +249,7 @@ def test_the_command_makes_shows_and_installs(command: Command, keys: Path, tmp_
 
 
 async def inbox(plan: ResolvedGraph, graph: RunningGraph) -> None:
-    """Wait until a tool on main has received the beacon on left."""
+    """Wait until a tool on the host `main` has received a message from the host `left`."""
     fingers: list[TwinFinger] = []
     printed: list[str] = []
     subscriber = make_subscriber(

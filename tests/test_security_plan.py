@@ -1,4 +1,4 @@
-"""Test the permissions of each key, from the launch file to the node."""
+"""Test the permissions of each host, as set in the launch file and enforced by the nodes."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ BRIDGE = "arm_right_bridge"
 
 
 class Hand(Node):
-    """Console of another class, on an arm's computer."""
+    """A console of another class, on the computer of an arm."""
 
     parameters: NodeParameters
     estop: Output[EStop]
@@ -52,7 +52,7 @@ class Hand(Node):
 
 @pytest.fixture(autouse=True)
 def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Make a folder for the test's runs and keys, with a short path."""
+    """Make a folder for runs and keys, with a short path."""
     with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as name:
         monkeypatch.setenv(runs.ROOT_VARIABLE, f"{name}/runs")
         monkeypatch.setenv(KEYS_VARIABLE, f"{name}/keys")
@@ -80,7 +80,9 @@ def test_the_plans_that_come_with_it_believe_each_host_its_own_writers_only(name
 
 
 def lab(folder: Path, **left: Any) -> ResolvedGraph:
-    """Load launch/three.yaml on loopback with keys, and a console on the left arm's computer."""
+    """Load launch/three.yaml with keys and loopback addresses, and a console on the left arm's
+    computer.
+    """
     spec = YAML(typ="safe").load(LAUNCH / "three.yaml")
     spec["scene"] = str(LAUNCH / spec["scene"])
     calibration = LAUNCH / "calibrations" / "twin-bumblebee.yaml"
@@ -98,7 +100,7 @@ def lab(folder: Path, **left: Any) -> ResolvedGraph:
 
 
 class SecuredBridge:
-    """The right arm's bridge with its runner's connections, and its peers."""
+    """The bridge of the right arm with its connections, and publishers of other hosts."""
 
     def __init__(self, plan: ResolvedGraph) -> None:
         self.plan, run = plan, runs.create_run()
@@ -125,8 +127,7 @@ class SecuredBridge:
 
     @contextmanager
     def sender(self, topic: str, *, at: tuple[str, str], key: str) -> Iterator[Publisher]:
-        """Open a publisher of `topic` at the endpoint `at` (topic, writer), with the key of a
-        host."""
+        """Open a publisher at the endpoint of a node and topic, with the key of a host."""
         writer = self.plan.writer(*at)
         assert writer is not None
         assert writer.tcp is not None
@@ -139,7 +140,7 @@ class SecuredBridge:
     async def say(
         self, sender: Publisher, writer: str, message: Message, enough: Callable[[], object]
     ) -> None:
-        """Publish repeatedly until a condition holds."""
+        """Publish a message repeatedly until a condition is true."""
 
         def printed() -> bool:
             self.sequence += 1
@@ -177,7 +178,7 @@ def make_secured(plan: ResolvedGraph, monkeypatch: pytest.MonkeyPatch) -> Iterat
 async def test_an_arm_s_computer_cannot_command_the_other_arm(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The compromised left host has its key, its address, and any free address."""
+    """The attacker has the key and the address of the host `left`, and any free address."""
     mine, main_s = ("arm_left", "arm_left_bridge"), ("sheet_target", "planner")
     left, forged = arm_state("left"), target()
     with make_secured(lab(folder), monkeypatch) as secured:
@@ -200,7 +201,9 @@ async def test_an_arm_s_computer_cannot_command_the_other_arm(
 async def test_who_may_reset_a_stop_and_let_the_arms_move(
     folder: Path, monkeypatch: pytest.MonkeyPatch, may: bool | None
 ) -> None:
-    """The console on left can always stop; other permissions depend on the launch file."""
+    """A console on the host `left` can always stop the arms. The launch file defines all other
+    permissions.
+    """
     with make_secured(lab(folder, may_reset_estop=may), monkeypatch) as secured:
         words: tuple[tuple[str, Message, Message], ...] = (
             ("estop", EStop(engaged=True, reason="a hand"), EStop(engaged=False, reason="gone")),

@@ -1,4 +1,4 @@
-"""Test that a peer can neither fill a publisher's memory nor prevent its publishing."""
+"""Test that a peer cannot fill the memory of a publisher, or prevent the publisher from sending."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def zmtp_frame(flags: int, body: bytes) -> bytes:
 
 
 class AttackedPublisher:
-    """Publisher in a separate process, for its peak memory."""
+    """A publisher in a separate process, whose peak memory is measured."""
 
     def __init__(self, topic: str, *ring: str) -> None:
         self._process = subprocess.Popen(
@@ -140,7 +140,7 @@ def subscribed(
 
 
 def receive_exactly(opened: socket.socket, count: int) -> bytes:
-    """Receive `count` bytes; raises ConnectionResetError if the peer closes before."""
+    """Receive `count` bytes. Raises ConnectionResetError if the peer closes the connection."""
     received = b""
     while len(received) < count:
         part = opened.recv(count - len(received))
@@ -152,7 +152,7 @@ def receive_exactly(opened: socket.socket, count: int) -> bytes:
 
 @contextmanager
 def connected_plainly(endpoint: str) -> Iterator[socket.socket]:
-    """Open a connection with a plain ZMTP handshake, without ZeroMQ."""
+    """Open a connection with a plain ZMTP handshake on a TCP socket, without ZeroMQ."""
     address, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     with socket.create_connection((address, int(port)), timeout=DEADLINE_S) as opened:
         opened.sendall(GREETING + zmtp_frame(COMMAND, READY))

@@ -1,4 +1,4 @@
-"""Test the estimate of an arm's lag on simulated servos, and its bounds for bad measurements."""
+"""Test the estimate of an arm's lag with simulated servos and invalid measurements."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TEST_SEEDS = (100, 101)
 
 
 def motion(seed: int) -> Callable[[float], Floats]:
-    """Return joints over time like those of a stroke: sums of slow sines of 0.2 to 1.5 Hz."""
+    """Return joint angles over time: sums of sines of 0.2 to 1.5 Hz, as in a stroke."""
     random = np.random.default_rng((seed, 18))
     pace = 2.0 * np.pi * random.uniform(0.2, 1.5, (3, 6))
     phase, size = random.uniform(0.0, 2.0 * np.pi, (3, 6)), random.uniform(0.005, 0.03, (3, 6))
@@ -47,7 +47,7 @@ def play(
     late_s: float = 0.0,
     change: Callable[[Floats], Floats] = lambda joints: joints,
 ) -> None:
-    """Play commands and measurements of a servo with a lag, with jitter of the cycle."""
+    """Add the commands and measurements of a servo with a lag and jitter to an estimator."""
     random, path = np.random.default_rng((seed, 19)), motion(seed)
     now_s = start_s
     servo = Servo(path(now_s).copy(), max(lag_s - late_s, 1e-3), 3e-5)
@@ -132,7 +132,6 @@ def test_noise_at_standstill_keeps_the_lag() -> None:
 
 @pytest.mark.parametrize("seed", [200, 201])
 def test_random_input_never_moves_the_lag_out_of_its_bounds(seed: int) -> None:
-    """Any order of any numbers leaves a finite lag within the bounds."""
     random, estimator = np.random.default_rng(seed), ServoLagEstimator(0.5, BOUNDS)
     assert estimator.lag_s == BOUNDS.max_s
     now_s, path = 0.0, motion(seed)
@@ -156,7 +155,7 @@ def test_the_tracking_error_of_a_servo_is_the_expected_one() -> None:
 
 
 def feed(delay: ActuationDelayEstimator, sent_ms: float, *, is_measured: bool = True) -> None:
-    """Pass 600 fingertips of age 10 ms, and the reports of an arm with a lag of 60 ms."""
+    """Add 600 fingertips of age 10 ms, and the states of an arm with a lag of 60 ms."""
     lag, latency, last = ServoLagEstimator(0.06, BOUNDS), LatencyMean(), LastExchange()
     lag.estimate = LagEstimate(0.06, 0.001, 0.0, 0.0, 0.0, 0.0) if is_measured else None
     for number in range(1, 601):
@@ -189,7 +188,7 @@ def test_an_implausible_actuation_delay_is_not_used(sent_ms: float, is_measured:
 
 @pytest.mark.parametrize("lag_s", [BOUNDS.min_s, 0.03, BOUNDS.max_s])
 def test_no_lag_extrapolates_a_target_beyond_its_limit(lag_s: float) -> None:
-    """The limiter checks the command that follows from the goal; the goal is bounded before."""
+    """The target is limited before the limiter checks the resulting command."""
     speed_m_per_s, max_extrapolation_s = 0.2, 0.06
     target = SheetTarget(
         phase="contact",

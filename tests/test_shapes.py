@@ -1,4 +1,4 @@
-"""Test shapes with a formula: nearest points, distances, and defined results in singular cases."""
+"""Test shapes with a formula: nearest points, distances and singular cases."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test scenes of every shape: meshes are read, repaired or rejected."""
+"""Test scenes with objects of every shape, and the repair or rejection of meshes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test meshes as smooth shapes: errors against known surfaces, continuity, rejected meshes."""
+"""Test smooth meshes: errors against exact surfaces, continuity, and rejected meshes."""
 
 from __future__ import annotations
 
@@ -168,7 +168,9 @@ def test_gradient_and_curvature_by_differences(shape: object) -> None:
 
 
 def walk(shape: SmoothMeshShape, start: Floats, step_m: float, steps: int) -> tuple[Floats, Floats]:
-    """Return normals (steps, 3) on a geodesic over the surface, and whether they are on an edge."""
+    """Return normals (steps, 3) along a geodesic of the surface, and whether each point is on an
+    edge.
+    """
     here = shape.closest(start)
     point, normal = here.point, here.normal
     heading = np.cross(normal, [0.36, 0.48, 0.8])
@@ -183,7 +185,7 @@ def walk(shape: SmoothMeshShape, start: Floats, step_m: float, steps: int) -> tu
 
 
 def worst_turn(normals: Floats, edges: Floats, step_m: float) -> float:
-    """Return the largest second derivative of the normal by arc length (1/m^2), without edges."""
+    """Return the maximum second derivative (1/m^2) of the normal by arc length, without edges."""
     second = np.linalg.norm(np.diff(normals, 2, axis=0), axis=1) / step_m**2
     off = ~(edges[2:] | edges[1:-1] | edges[:-2])
     return float(second[off].max())
@@ -306,7 +308,7 @@ def test_one_is_as_many() -> None:
 
 @pytest.mark.parametrize("make", [lambda: smooth_ellipsoid(AXES, 3), smooth_cube, liver])
 def test_single_and_batch_queries_agree(make: Callable[[], SmoothMeshShape]) -> None:
-    """Single and batch queries give the same point, also from far off, over edges and inside."""
+    """The queries include distant points, points near edges and points inside the mesh."""
     shape = make()
     rng = np.random.default_rng(4)
     begun = shape.closest(rng.uniform(-0.05, 0.05, (120, 3)))

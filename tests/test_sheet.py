@@ -1,4 +1,4 @@
-"""Test the sheet's force rule and geometry."""
+"""Test the edge force and the geometry of the sheet."""
 
 from __future__ import annotations
 

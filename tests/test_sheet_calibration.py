@@ -1,4 +1,4 @@
-"""Test `flexsheet calibrate sheet`: estimated values, invalid rows, and its file."""
+"""Test the command `flexsheet calibrate sheet`: estimates, invalid rows and files."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def pushes_of(
     edges: bool = False,
     seed: int = 1,
 ) -> list[MeasuredPush]:
-    """Simulate a gauge's measurements of a sheet with this force model."""
+    """Simulate the measurements of a gauge on a sheet with a given force model."""
     rng = np.random.default_rng(seed)
     pushes = []
     for stretch in stretches:
@@ -129,7 +129,7 @@ def make_sheet_model(modulus: float = 1000.0, width: float = 0.24) -> ScaledShee
 
 @pytest.mark.parametrize(("modulus", "width"), [(1000.0, 0.24), (500.0, 0.24), (1000.0, 0.243)])
 def test_a_correct_sheet_with_small_forces_is_not_doubted(modulus: float, width: float) -> None:
-    """The relative residual of a soft sheet is large, because noise dominates at small forces."""
+    """At small forces, noise causes a large relative residual."""
     law = make_sheet_model(modulus, width)
     rows = pushes_of(law, depths=FAULT_DEPTHS, noise_n=0.01, edges=True)
     fit = fit_sheet_model(rows, NOMINAL)
@@ -141,7 +141,7 @@ def test_a_correct_sheet_with_small_forces_is_not_doubted(modulus: float, width:
 
 
 def slip(rows: list[MeasuredPush]) -> list[MeasuredPush]:
-    """Replace the last rows by those of a sheet of which a clamp has released 4 mm."""
+    """Replace the last rows by those of a sheet that has slipped by 4 mm in a clamp."""
     loose = pushes_of(make_sheet_model(width=0.244), depths=FAULT_DEPTHS, noise_n=0.005, edges=True)
     kept = round(0.85 * len(rows))
     return rows[:kept] + loose[kept:]
@@ -160,7 +160,7 @@ def slip(rows: list[MeasuredPush]) -> list[MeasuredPush]:
     ids=["slipping clamp", "other force law", "gain", "zero of the gauge", "depth", "edges"],
 )
 def test_a_wrong_sheet_or_gauge_is_doubted(fault: Any) -> None:
-    """The gain is detected only because another sensor measures the edge forces."""
+    """The gain error is detected only because another sensor measures the edge forces."""
     good = pushes_of(make_sheet_model(), depths=FAULT_DEPTHS, noise_n=0.005, edges=True)
     assert fit_sheet_model(good, NOMINAL).rms_sigmas < 0.5 * MAX_RMS_SIGMAS
     assert fit_sheet_model(fault(good), NOMINAL).rms_sigmas > 1.1 * MAX_RMS_SIGMAS

@@ -1,5 +1,4 @@
-"""Test the sheet's force models: scaling, slopes, ranges, and the simulated membrane as
-reference."""
+"""Test the force models of the sheet against the simulator's membrane."""
 
 from __future__ import annotations
 
@@ -56,7 +55,7 @@ def force(
 
 
 def true_push(stretch: float, depth: float, place: SheetPosition = CENTRE) -> tuple[float, float]:
-    """Return force and edge force by the simulator, on a mesh with an error of 1.5 %."""
+    """Return force and edge force in the simulator, with a discretization error of 1.5 %."""
     return simulate_push(SHEET, stretch, depth, place, RADIUS, cells=24)
 
 

@@ -1,4 +1,4 @@
-"""Test indentation shapes: solved ones, interpolated ones, and the range."""
+"""Test the reduced-order model of the pushed sheet: accuracy, interpolation and range."""
 
 from __future__ import annotations
 

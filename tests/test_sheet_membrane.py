@@ -1,4 +1,4 @@
-"""Test the sheet's finite elements: theory, the simulator's elements, and hard cases."""
+"""Test the membrane elements against theory, the simulator's elements, and difficult cases."""
 
 from __future__ import annotations
 

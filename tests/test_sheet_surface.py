@@ -1,4 +1,4 @@
-"""Test the surface of the unpushed sheet that experiments evaluate."""
+"""Test the surface of the untouched sheet in the evaluation of experiments."""
 
 from __future__ import annotations
 
@@ -61,7 +61,9 @@ def test_the_surface_is_that_of_the_membrane(stretch: float, lean_rad: float) ->
 
 
 def errors_of(scene: Scene, *, compensated: bool, true: SheetSurface) -> np.ndarray:
-    """Return delta d of edges in the tangent plane, or behind it by the planner's sag."""
+    """Return the surface errors of edges in the tangent plane, or behind the plane by the planned
+    sag.
+    """
     normals = np.column_stack([np.zeros_like(ANGLES), np.sin(ANGLES), np.cos(ANGLES)])
     along = np.column_stack([np.zeros_like(ANGLES), np.cos(ANGLES), -np.sin(ANGLES)])
     contact = RADIUS * normals - [0.0, 0.0, RADIUS]

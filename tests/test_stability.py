@@ -1,4 +1,4 @@
-"""Test the loop of hand and sheet: predicted bounds, simulation, filter and watchdog."""
+"""Test the control loop of hand and sheet: predicted bounds, simulation, filter and watchdog."""
 
 from __future__ import annotations
 
@@ -197,7 +197,9 @@ def test_jitter_delays_measurements_and_drops_those_that_are_overtaken() -> None
 def run_coupled(
     slope: float, *, hand: Hand, bandwidth: float, seconds: float, delay_s: float = 0.05
 ) -> tuple[StabilizedOffset, list[float], list[float]]:
-    """Couple a hand with `StabilizedOffset`; return it with depths and watchdog weights."""
+    """Simulate a hand with `StabilizedOffset`, and return hand, depths and weights of the
+    watchdog.
+    """
     controller = StabilizedOffset()
     stiffness, rest_m = 100.0, 0.02
     steps = 64

@@ -1,4 +1,4 @@
-"""Wait for conditions that other tasks, threads or processes bring about."""
+"""Wait for conditions that other tasks, threads or processes fulfil."""
 
 from __future__ import annotations
 

@@ -340,7 +340,7 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
     centre (n, 3), radius (n,): spheres, m.
 
     Spheres of similar size are searched together, because the search radius must be that of the
-        largest sphere.
+    largest sphere.
     """
     from scipy.spatial import cKDTree
 
