@@ -19,11 +19,7 @@ from flexsheet.messages.security import (
 
 
 class Hosts:
-    """Key pairs of named hosts.
-
-    ring: key ring of each host.
-    stranger: key that is not in any ring.
-    """
+    """A set of hosts with key pairs. One further key pair, `stranger`, belongs to no host."""
 
     def __init__(self, folder: Path, *names: str) -> None:
         self.folder, self.names = folder, names
