@@ -19,8 +19,11 @@ from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import FingertipReason, SheetTarget, SoftBody
 from flexsheet.nodes.models.rigid import inverse, moved, transform, transform_from_rpy
 from flexsheet.nodes.models.shapes import CylinderShape
-from flexsheet.nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
-from flexsheet.nodes.models.sheet.tension import compute_sag_m
+from flexsheet.nodes.models.sheet.tension import (
+    compute_sag_m,
+    edge_force_n,
+    push_stiffness_n_per_m,
+)
 from flexsheet.nodes.planner.compliance import (
     USABLE_FRACTION,
     choose_stretch,

@@ -9,18 +9,15 @@ from hypothesis import strategies as st
 
 from flexsheet.nodes.arm_bridge.limiter import SheetLimits
 from flexsheet.nodes.models.rigid import is_rigid, rotation_from_rpy, transform, transform_from_rpy
-from flexsheet.nodes.models.sheet import (
-    corners,
-    edge_force_for_stiffness,
-    edge_force_n,
-    edge_poses,
-    flange_pose,
-    push_stiffness_n_per_m,
-    sheet_from_edges,
-    stretch_for_edge_force,
-)
+from flexsheet.nodes.models.sheet import corners, edge_poses, flange_pose, sheet_from_edges
 from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetPush
 from flexsheet.nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.tension import (
+    edge_force_for_stiffness,
+    edge_force_n,
+    push_stiffness_n_per_m,
+    stretch_for_edge_force,
+)
 
 PAPER = Rubber(0.24, 0.24, 0.001, 1e6)
 

@@ -35,7 +35,7 @@ from flexsheet.nodes.models.rigid import (
     rpy_from_rotation,
     transform,
 )
-from flexsheet.nodes.models.sheet import edge_force_n
+from flexsheet.nodes.models.sheet.tension import edge_force_n
 
 Floats = NDArray[np.float64]
 

@@ -47,7 +47,7 @@ from flexsheet.messages.calibration import Board, load_calibration, save_calibra
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.nodes.models.rigid import pose_matrix, rpy_from_rotation
-from flexsheet.nodes.models.sheet import edge_force_n
+from flexsheet.nodes.models.sheet.tension import edge_force_n
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import ArmSpec, Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
-from flexsheet.nodes.models.sheet import edge_force_n
+from flexsheet.nodes.models.sheet.tension import edge_force_n
 from flexsheet.nodes.twin.arms import ArmMechanics
 from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.truth import apply_apparatus

@@ -37,7 +37,7 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.shapes import Nearest, make_shape
-from flexsheet.nodes.models.sheet import stretch_for_edge_force
+from flexsheet.nodes.models.sheet.tension import stretch_for_edge_force
 from flexsheet.nodes.planner.rolling import (
     SheetContact,
     compute_rolling_twist,

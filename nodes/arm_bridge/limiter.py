@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.notes import NodeNote
 from flexsheet.nodes.models.motion import BRAKE_FRACTION, closing_speed
 from flexsheet.nodes.models.rigid import angle_between
-from flexsheet.nodes.models.sheet import edge_force_n
+from flexsheet.nodes.models.sheet.tension import edge_force_n
 
 Floats = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from flexsheet.nodes.models.rigid import (
     transform,
     vector_from_rotation,
 )
-from flexsheet.nodes.models.sheet import edge_force_n
+from flexsheet.nodes.models.sheet.tension import edge_force_n
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -14,7 +14,7 @@ from flexsheet.messages.scene import Geometry, Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import rotation_from_rpy
 from flexsheet.nodes.models.shapes import GEOMETRIES
-from flexsheet.nodes.models.sheet import stretch_for_edge_force
+from flexsheet.nodes.models.sheet.tension import stretch_for_edge_force
 
 MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 """The minimum value and the step of the slider for the sheet's tension, as stretch ratios."""

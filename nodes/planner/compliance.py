@@ -31,12 +31,6 @@ from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.hand_loop import OffsetBounds
 from flexsheet.nodes.models.interpolation import smoothstep
-from flexsheet.nodes.models.sheet import (
-    edge_force_for_stiffness,
-    edge_force_n,
-    push_stiffness_n_per_m,
-    stretch_for_edge_force,
-)
 from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,
     SheetForceModel,
@@ -44,6 +38,12 @@ from flexsheet.nodes.models.sheet.force_models import (
     SheetPush,
     depth_for_force,
     interpolate_inverse,
+)
+from flexsheet.nodes.models.sheet.tension import (
+    edge_force_for_stiffness,
+    edge_force_n,
+    push_stiffness_n_per_m,
+    stretch_for_edge_force,
 )
 
 USABLE_FRACTION = 0.85
