@@ -7,7 +7,7 @@ import socket
 import sys
 from asyncio.subprocess import PIPE
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,14 +25,8 @@ from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import EStop, StereoPair, TwinArms, TwinFinger
 from flexsheet.messages.wire import WireError, encode
+from flexsheet.nodes.node import PortCounts
 from tests.waiting import until
-
-
-@dataclass
-class Counts:
-    dropped: int = 0
-    gaps: int = 0
-    rejected: int = 0
 
 
 def header(sequence: int, writer: str = "writer", epoch: int = 1) -> Header:
@@ -64,7 +58,7 @@ class RecordingSubscriber:
     def __init__(self, topic: Topic, endpoints: list[str]) -> None:
         self.inbox: list[tuple[Any, Header]] = []
         self.problems: list[str] = []
-        self.counts = Counts()
+        self.counts = PortCounts()
         self.extra: Callable[[Message], None] = lambda message: None
         self.subscriber = Subscriber(
             topic, endpoints, self.receive, self.counts, on_problem=self.problems.append
@@ -158,7 +152,7 @@ async def test_every_delivers_all_in_order(connections: Connections, transport: 
     await until(lambda: len(receiver.inbox) == 700)
     assert receiver.sequences == list(range(start, start + 700))
     assert receiver.inbox[3][0].path_time_s == start + 3
-    assert receiver.counts == Counts()
+    assert receiver.counts == PortCounts()
     assert receiver.problems == []
 
 
@@ -257,7 +251,7 @@ async def test_latched_reaches_late_subscribers_once(connections: Connections) -
     publisher.send(stop("third"), header(3))
     await until(lambda: early.sequences[-1] == 3 and late.sequences[-1] == 3)
     assert early.sequences == late.sequences == [2, 3]
-    assert early.counts == late.counts == Counts()
+    assert early.counts == late.counts == PortCounts()
     assert early.problems == late.problems == []
 
 
@@ -282,7 +276,7 @@ async def test_subscriber_before_publisher_and_restart_is_no_gap(connections: Co
     second.send(stop("b"), header(1, epoch=2))
     await until(lambda: len(receiver.inbox) == 2)
     assert [message.reason for message, _ in receiver.inbox] == ["a", "b"]
-    assert receiver.counts == Counts()
+    assert receiver.counts == PortCounts()
 
 
 async def test_many_restarts_in_a_row(connections: Connections) -> None:
@@ -294,7 +288,7 @@ async def test_many_restarts_in_a_row(connections: Connections) -> None:
         await until(partial(has_epoch, receiver, epoch), f"start {epoch}")
         publisher.close()
     assert len(receiver.inbox) == 15
-    assert receiver.counts == Counts()
+    assert receiver.counts == PortCounts()
 
 
 def has_epoch(receiver: RecordingSubscriber, epoch: int) -> bool:
@@ -522,7 +516,7 @@ async def test_unopened_frames_of_every_message_for_the_recorder(
 
     problems: list[str] = []
     receiver = Subscriber(
-        topic, [connections.endpoint()], record, Counts(), on_problem=problems.append, raw=True
+        topic, [connections.endpoint()], record, PortCounts(), on_problem=problems.append, raw=True
     )
     receiver.start()
     connections.cleanups.append(receiver.close)
@@ -545,12 +539,12 @@ async def test_unopened_frames_of_every_message_for_the_recorder(
 
 def make_ending_subscriber(
     connections: Connections, endpoint: str, local: LocalBus | None = None
-) -> tuple[list[str], Counts]:
+) -> tuple[list[str], PortCounts]:
     """Return a list to which a subscriber adds the reason of each e-stop, and "end" at each end of
     a connection.
     """
     seen: list[str] = []
-    counts = Counts()
+    counts = PortCounts()
     subscriber = Subscriber(
         TOPICS["estop"],
         [endpoint],
@@ -597,7 +591,7 @@ async def test_the_end_of_a_killed_writer_is_reported_after_its_last_message(
     restarted.send(stop("b"), header(1, epoch=2))
     await until(lambda: "b" in seen)
     assert seen == ["a", "end", "b"]
-    assert counts == Counts()
+    assert counts == PortCounts()
 
 
 @pytest.mark.parametrize("transport", ["ipc", "tcp", "local"])
@@ -618,4 +612,4 @@ async def test_an_interrupted_publisher_disconnects_its_readers_and_goes_on(
     messages = [one for one in seen if one != "end"]
     assert messages == ["stop 1", "stop 2", "stop 3"]
     assert seen.index("end") == 1
-    assert counts == Counts()
+    assert counts == PortCounts()

@@ -40,8 +40,11 @@ def test_a_bag_from_before_any_migration_is_read_whole() -> None:
     assert scene.name == "cylinder"
     assert isinstance(frame, Frame)
     assert frame.light_ns == 0, "a field that came later has its default"
+    assert frame.occluded_fraction >= 0.0
     assert isinstance(finger, Fingertip)
     assert np.isfinite(finger.position_world_m).all()
+    assert len(finger.predicted_path_world_m) > 1
+    assert finger.prediction_step_s > 0.0
 
 
 def recorded_schema(name: str) -> dict[str, Any]:
@@ -70,13 +73,6 @@ def test_a_recorded_scene_is_read_with_todays_methods_and_without_removed_ones(
     assert not hasattr(methods, "kinematics")
     assert not hasattr(methods, "triangulation")
     assert (methods.marker, methods.tracking) == ("moments", "adaptive")
-
-
-def test_renamed_fields_of_a_recorded_fingertip_are_read() -> None:
-    finger = next(message for name, message, *_ in BagReader(OLD_BAG) if name == "fingertip")
-    assert isinstance(finger, Fingertip)
-    assert len(finger.predicted_path_world_m) > 1
-    assert finger.prediction_step_s > 0.0
 
 
 @pytest.mark.parametrize(("label", "seconds"), [("stroke 2.5 s", 2.5), ("push 30 mm", None)])

@@ -24,7 +24,6 @@ from flexsheet.messages.topics import TOPICS, Delivery, Topic, UnknownTopicError
 from flexsheet.messages.types import (
     Bookmark,
     Display,
-    Frame,
     HostStatus,
     SheetReason,
     SheetTarget,
@@ -34,7 +33,6 @@ from flexsheet.nodes import node_class
 from flexsheet.nodes.node import find_parameters_type
 from tests.scenes import load_values
 
-OLD_BAG = Path(__file__).parent / "recorded" / "before-migrations.mcap"
 TYPES: dict[str, type[Message]] = {
     topic.message.__name__: topic.message for topic in TOPICS.values()
 }
@@ -157,12 +155,6 @@ def test_a_value_that_never_was_is_not_read() -> None:
     recorded: dict[str, Any] = Display.model_json_schema()
     recorded["properties"]["pattern"]["enum"].append("stripes")
     assert migrations.find_migration(Display, "0" * 16, recorded) is None
-
-
-def test_the_old_bag_is_read_with_todays_names() -> None:
-    frames = [message for name, message, *_ in BagReader(OLD_BAG) if name == "frame"]
-    assert frames
-    assert all(isinstance(one, Frame) and one.occluded_fraction >= 0.0 for one in frames)
 
 
 class Moment(Bookmark):

@@ -295,17 +295,6 @@ def test_far_near_and_bad_queries() -> None:
     assert np.allclose(lost.point, shape.closest(np.array([0.06, 0.0, 0.0])).point, atol=1e-6)
 
 
-def test_one_is_as_many() -> None:
-    shape = smooth_ellipsoid(AXES, 3)
-    queries = around(AXES, 12)
-    many = shape.closest(queries)
-    for i, query in enumerate(queries):
-        one = shape.closest(query)
-        assert one.height_m.shape == ()
-        assert np.allclose(one.point, many.point[i], atol=1e-9)
-        assert np.allclose(one.shape_operator, many.shape_operator[i], atol=1e-5)
-
-
 @pytest.mark.parametrize("make", [lambda: smooth_ellipsoid(AXES, 3), smooth_cube, liver])
 def test_single_and_batch_queries_agree(make: Callable[[], SmoothMeshShape]) -> None:
     """The queries include distant points, points near edges and points inside the mesh."""

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.simulated_sheet import simulate_push
-from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.sheet import membrane
 from flexsheet.nodes.models.sheet.force_models import MembraneSheetModel, SheetPush
 from flexsheet.nodes.models.sheet.membrane import (
@@ -22,20 +21,9 @@ from flexsheet.nodes.models.sheet.membrane import (
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from tests.examples import examples
+from tests.test_sheet_force_models import RADIUS, RUBBER, SHEET
 
 Floats = NDArray[np.float64]
-
-RUBBER = Rubber(0.24, 0.24, 0.001, 1e6)
-SHEET = SheetSpec(
-    width_m=0.24,
-    height_m=0.24,
-    thickness_m=0.001,
-    young_modulus_pa=1e6,
-    max_stretch_ratio=1.12,
-    max_edge_force_n=40.0,
-    usable_half_height_m=0.09,
-)
-RADIUS = 0.007
 
 
 @pytest.mark.long

@@ -5,11 +5,11 @@ pushes.
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 CLAMP_FACTOR, CLAMP_FACTOR_PER_ASPECT = 1.004, 0.0735
@@ -47,8 +47,24 @@ def strain_measure(stretch_ratio: float, mooney_ratio: float = 0.0) -> float:
     return (s - s**-2) / 3.0 * (1.0 - mooney_ratio + mooney_ratio / s)
 
 
-SlackSheet = SheetSpec | Rubber
-"""The dimensions and the modulus of an unstretched sheet."""
+class SlackSheet(Protocol):
+    """The interface of objects with the dimensions and the modulus of an unstretched sheet.
+
+    width_m: distance between the clamped edges.
+    height_m: length of an edge.
+    """
+
+    @property
+    def width_m(self) -> float: ...
+
+    @property
+    def height_m(self) -> float: ...
+
+    @property
+    def thickness_m(self) -> float: ...
+
+    @property
+    def young_modulus_pa(self) -> float: ...
 
 
 def edge_force_n(stretch_ratio: float, sheet: SlackSheet, *, mooney_ratio: float = 0.0) -> float:
