@@ -36,8 +36,7 @@ def describe_busy_remedy(*, nice_denied: bool) -> str:
 
 
 def describe_busy(host: HostStatus) -> str:
-    """Return the reason why a computer is overloaded as a sentence, or "" for any other
-    computer.
+    """Return a sentence with the reason why a computer is overloaded, or "".
     """
     if not is_busy(host):
         return ""

@@ -36,8 +36,7 @@ class ClockTable:
         self.offsets = {one.clock_id: one for one in clocks.offsets}
 
     def find_problem(self, clock_id: str, now_ns: int) -> str:
-        """Return the reason why the offset of a clock is not accurate enough, or "" for an accurate
-        one.
+        """Return the reason why the offset of a clock is too inaccurate, or "".
 
         now_ns: current time on the local clock.
         """

@@ -574,17 +574,8 @@ SuspectedCause = Literal[
 ]
 """The suspected cause of a deviation between a measured and an expected value.
 
-camera_moved: the pose of the stereo camera differs from the scene.
-cameras_misaligned: one camera has moved relative to the other.
-marker_offset: the marker is not at the assumed position on the finger.
-servo_lag: an arm's lag differs from the configured lag.
-arm_not_following: an arm does not execute the commanded motion.
-sheet_stiffness: the measured stiffness of the sheet differs from the scene.
-projector_moved: the pose of the projector differs from the scene.
-arm_base_moved: the pose of an arm's base or clamp differs from the scene.
-display_latency: projected images appear later than assumed.
-
-With a value that contains "or", the data cannot distinguish the two causes.
+`flexsheet.messages.notes` describes each cause. With a value that contains "or", the data cannot
+distinguish the two causes.
 """
 
 

@@ -39,9 +39,10 @@ class NodeRole(StrEnum):
 class OmissionReason(StrEnum):
     """The reason why a node of a launch file is not started.
 
-    rigid_object: the scene's object has no material. no_image: the scene has no projector.
-    no_reader: no node reads the node's topics. no_writer: the nodes that write the node's inputs
-    are omitted.
+    rigid_object: the scene's object has no material.
+    no_image: the scene has no projector.
+    no_reader: no node reads the node's topics.
+    no_writer: the nodes that write the node's inputs are omitted.
     """
 
     RIGID_OBJECT = "rigid_object"

@@ -482,7 +482,7 @@ class Node:
         """Store a message in its input, call its handler, and wait until it is finished.
 
         header: header with timestamps of this host's clock.
-        clock_problem: reason why they are not reliable, or "".
+        clock_problem: reason why the timestamps are not reliable, or "".
         """
         self.inputs[port].accept(message, header, clock_problem)
         handler = self._handler(port)

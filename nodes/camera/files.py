@@ -78,7 +78,7 @@ class VideoFile:
 
 
 class FileReader:
-    """A base class of readers of files, whose `read` method never waits."""
+    """A base class of readers of image files. The method `read` never waits."""
 
     paced = True
     rate_hz: float | None = None

@@ -84,7 +84,7 @@ LIMITING_HANDS = tuple(hand for name, hand in HANDS.items() if "low damping" in 
 
 @dataclass(frozen=True, slots=True)
 class SampledLoop:
-    """The timing and the filter in the computation of the sheet's offset from the finger's depth.
+    """The timing and the depth filter of the control loop from finger depth to sheet offset.
 
     period_s: time between two measurements.
     delay_s: time from a measurement until the sheet reaches the position computed from it.
@@ -183,7 +183,7 @@ def compute_critical_slope(
     towards_finger: bool,
     max_slope: float = MAX_SLOPE,
 ) -> float:
-    """Return the smallest magnitude of a slope with an unstable control loop, at most `max_slope`.
+    """Return the smallest slope magnitude at which the loop is unstable, at most `max_slope`.
 
     towards_finger: whether the slopes are negative. With a negative slope, the sheet moves towards
         the finger.
@@ -280,9 +280,8 @@ def compute_offset_bounds(period_s: float, *, advance_limit: float) -> OffsetBou
 
     advance_limit: upper limit of the slopes towards the finger.
 
-    For an advance, the gain margin divides the critical slope. For a retreat, it multiplies the
-    sheet's stiffness instead, because a retreat slope cannot exceed 1. The sheet never retreats by
-    more than the finger moves.
+    For an advance, the critical slope is divided by the gain margin. For a retreat, the sheet's
+    stiffness is multiplied by the gain margin instead, because a retreat slope cannot exceed 1.
     """
     shape = len(DELAYS_S), len(BANDWIDTHS_RAD_PER_S), len(SHEET_STIFFNESSES_N_PER_M)
     advances, retreats = np.empty(shape), np.empty(shape)

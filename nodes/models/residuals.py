@@ -60,7 +60,9 @@ class ResidualMonitor:
         return float(np.linalg.norm(self.mean))
 
     def add(self, residual: Floats, at_ns: int) -> None:
-        """Add a residual (components,) at the time `at_ns`. Ignore it if it is not finite."""
+        """Add a residual (components,) at the time `at_ns`. Residuals that are not finite are
+        ignored.
+        """
         if not np.isfinite(residual).all():
             return
         step_s = 0.0 if self._last_ns is None else (at_ns - self._last_ns) * 1e-9

@@ -34,7 +34,7 @@ class CuboidMap:
     """A map from the surface of the cube [-1, 1]^3 to the surface of a solid, used for meshing.
 
     half_m: half extents (3,) of the solid.
-    inner_m: half extents (3,) that the mesh's lattice has before it is distorted.
+    inner_m: half extents (3,) of the undistorted lattice of the mesh.
     surface: function that maps points (n, 3) on the cube to points (n, 3), in m, on the solid.
     is_round: whether the whole surface is curved, as on an ellipsoid; false if it has flat faces.
     """
@@ -51,7 +51,7 @@ class GeometryDescription:
 
     make_shape: function that makes the shape; the dimensions are its keyword arguments.
     bounds_m: function that returns the lower and upper corner (3,) of the bounding box of the
-        solid. For a half-space, it is the bounding box of the rectangle that can be touched.
+        solid. For a half-space, the box contains only the touchable rectangle.
     extent_m: function that returns the extent of the touchable surface from the origin along a unit
         vector, m.
     scale: function that returns the dimensions of the geometry after scaling by a ratio.

@@ -128,7 +128,7 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
 
 
 class SmoothMeshShape:
-    """The shape of a closed mesh whose edges are smoothed over the length `smoothing_m`."""
+    """A closed mesh with edges that are rounded over the length `smoothing_m`."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
         """Fit the local quadratics (jets) that define the smooth surface of a closed mesh.
@@ -469,8 +469,7 @@ class SmoothMeshShape:
 
 
 class _LevelNear:
-    """A function (`LevelAt`) that evaluates the level set f of a `SmoothMeshShape` along the path
-    of one projection.
+    """A function that evaluates the level set f of a mesh for the projection of one query.
 
     To save time, the list of nearby jets is updated only when the point has moved by
     `MEMBERS_KNOWN` times `rho`.

@@ -144,7 +144,7 @@ class EllipsoidShape(Convex):
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """Find the surface points nearest to `points` (n, 3) or (3,), as `Shape.closest` specifies.
 
-        The method `_undecided` detects ambiguous nearest points.
+        The nearest point is ambiguous in a part of the plane perpendicular to the shortest axis.
         """
         queries = check_points(points)
         before = check_previous(previous, queries)
@@ -321,9 +321,9 @@ class RoundedBoxShape(Convex):
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
         """Return the face of the core that is nearest to each query (n, 3) inside the core.
 
-        before: previous nearest points (n, 3), or None. If they are given, only faces at these
-            points are considered. Otherwise, among equally near faces, the first in the order z, y,
-            x, -z, -y, -x is chosen.
+        before: previous nearest points (n, 3), or None. Only faces at these points are considered.
+            Without previous points, the first of equally near faces in the order z, y, x, -z, -y,
+            -x is chosen.
 
         Return the axis (n,) and the sign (n,) of the face's normal, the distance from the face
         (n,), m, and whether the choice is ambiguous (n,).

@@ -150,7 +150,7 @@ def projection_jacobian(found: Nearest) -> Floats:
 
 
 def check_points(points: ArrayLike, name: str = "points") -> Floats:
-    """Convert points to a float array (3,) or (n, 3). Raises ValueError if they are invalid.
+    """Convert points to a float array (3,) or (n, 3). Raises ValueError for invalid points.
 
     name: name of the argument in error texts.
     """
@@ -169,7 +169,7 @@ def check_points(points: ArrayLike, name: str = "points") -> Floats:
 def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
     """Convert the previous nearest points to a float array; return None for None.
 
-    Raises ValueError if their shape differs from that of `points`.
+    Raises ValueError for a shape other than that of `points`.
     """
     if previous is None:
         return None
