@@ -17,7 +17,8 @@ from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import EStop, StereoPair
 from flexsheet.messages.wire import INLINE_BYTES, WireError, encode
-from tests.test_messages_bus import Counts, finger, header, pictures, stop
+from flexsheet.nodes.node import PortCounts
+from tests.test_messages_bus import finger, header, pictures, stop
 from tests.waiting import until
 
 FINGER, ESTOP, STEREO = TOPICS["twin/finger"], TOPICS["estop"], TOPICS["stereo"]
@@ -30,7 +31,7 @@ class Reader:
     def __init__(self, topic: Topic, source: str | Source, local: LocalBus | None, **more: Any):
         self.messages: list[tuple[Any, Header]] = []
         self.problems: list[str] = []
-        self.counts = Counts()
+        self.counts = PortCounts()
         self.subscriber = Subscriber(
             topic,
             [source],

@@ -19,7 +19,7 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.local_bus import LocalBus
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import EStop, SheetTarget
-from flexsheet.nodes.node import Input, Node, NodeParameters, Output
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output, PortCounts
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.runner import (
@@ -32,7 +32,6 @@ from flexsheet.nodes.runner import (
 )
 from tests.fingertips import fingertip
 from tests.plans import ROOT
-from tests.test_messages_bus import Counts
 from tests.waiting import until
 
 FIRST_SEQUENCE, STEP_NS, STEPS = 1000, 16_000_000, 30
@@ -96,7 +95,9 @@ class Chain:
         self.recorded: list[list[bytes]] = []
         self.newest: dict[str, int] = {}
         self.recorders = [
-            Subscriber(TOPICS[topic], [f"ipc://{folder}/{topic}"], self._record, Counts(), raw=True)
+            Subscriber(
+                TOPICS[topic], [f"ipc://{folder}/{topic}"], self._record, PortCounts(), raw=True
+            )
             for topic in ("sheet_target", "estop")
         ]
 
@@ -212,7 +213,7 @@ async def test_the_end_of_the_images_is_passed_on_to_the_arms(tmp_path: Path) ->
         TOPICS["sheet_target"],
         [ends["sheet_target"]],
         lambda *_: None,
-        Counts(),
+        PortCounts(),
         on_disconnected=ended.set,
     )
     running = [
