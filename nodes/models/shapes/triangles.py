@@ -174,25 +174,21 @@ def unify_winding(triangles: Indices) -> Indices:
     shared = first[uses == 2]
     one, other = order[shared], order[shared + 1]
     against = (run[one] == run[other]).all(axis=1)
-    beside: list[list[tuple[int, bool]]] = [[] for _ in range(count)]
-    for a, b, reverse in zip(
-        (one % count).tolist(), (other % count).tolist(), against.tolist(), strict=True
-    ):
-        beside[a].append((b, reverse))
-        beside[b].append((a, reverse))
-    flipped = np.zeros(count, dtype=bool)
-    seen = np.zeros(count, dtype=bool)
-    for start in range(count):
-        if seen[start]:
-            continue
-        seen[start], part = True, [start]
-        for triangle in part:
-            for near, reverse in beside[triangle]:
-                if not seen[near]:
-                    seen[near], flipped[near] = True, flipped[triangle] ^ reverse
-                    part.append(near)
-        if flipped[part].sum() > 0.5 * len(part):
-            flipped[part] = ~flipped[part]
+    # Build a graph with two nodes for each triangle t: t as given, and t + count reversed. Nodes
+    # with the same winding are connected, so that each part of the mesh has two components.
+    a, b = one % count, other % count
+    from scipy.sparse import coo_array  # imported late: scipy is slow to import
+    from scipy.sparse.csgraph import connected_components
+
+    ends = (
+        np.concatenate([a, a + count]),
+        np.concatenate([b + count * against, b + count * ~against]),
+    )
+    joined = coo_array((np.ones(len(ends[0])), ends), shape=(2 * count, 2 * count))
+    label = connected_components(joined, directed=False)[1].reshape(2, count)
+    flipped, part = label[0] > label[1], label.min(axis=0)
+    mostly_flipped = np.bincount(part, flipped) > 0.5 * np.bincount(part)
+    flipped ^= mostly_flipped[part]
     return np.where(flipped[:, None], triangles[:, ::-1], triangles)
 
 
