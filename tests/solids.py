@@ -1,4 +1,4 @@
-"""Make simple meshes of 10-node tetrahedra."""
+"""Simple solids of 10-node tetrahedra for tests."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ Ints = NDArray[np.int64]
 
 
 def bricks(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> tuple[Floats, Ints]:
-    """Return nodes and elements of a box that is divided at given coordinates.
-
-    Each brick consists of six tetrahedra (Kuhn).
-    """
+    """Return nodes and elements of a box cut at the given coordinates, with six tetrahedra per
+    brick (Kuhn)."""
     shape = (len(x), len(y), len(z))
     grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     corner = np.array(list(itertools.product(*(range(n - 1) for n in shape))))
@@ -37,13 +35,13 @@ def bricks(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> tuple[
 
 
 def box(divisions: tuple[int, int, int], sides: tuple[float, float, float]) -> tuple[Floats, Ints]:
-    """Return a box that is divided into equal bricks."""
+    """Return a box cut into equal bricks."""
     x, y, z = (np.linspace(0, s, n + 1) for s, n in zip(sides, divisions, strict=True))
     return bricks(x, y, z)
 
 
 def quadratic(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
-    """Add edge midpoints to 4-node tetrahedra."""
+    """Add the edge midpoints to four-node tetrahedra."""
     pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
     nodes = np.concatenate([corners, corners[unique].mean(axis=1)])
@@ -51,7 +49,7 @@ def quadratic(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
 
 
 def distorted(nodes: Floats, elements: Ints) -> tuple[Floats, Ints]:
-    """Displace the inner corners of a unit box. The edges remain straight."""
+    """Displace the inner corners of the unit box, with straight edges."""
     corners = np.unique(elements[:, :4])
     size = np.linalg.norm(nodes[elements[:, 0]] - nodes[elements[:, 1]], axis=1).min()
     moved = nodes.copy()

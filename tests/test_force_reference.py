@@ -1,4 +1,4 @@
-"""Test the independent force reference, without the optional package felupe."""
+"""Test the independent force reference, except for felupe, which is not installed here."""
 
 from __future__ import annotations
 
@@ -56,9 +56,7 @@ def make_mesh(along: float, angle_rad: float, scale: float = 4.0) -> HexMesh:
 
 
 def volume(mesh: HexMesh) -> float:
-    """Return the sum of the hexahedra's volumes. Raises AssertionError if a hexahedron is
-    inverted.
-    """
+    """Integrate the Jacobian over all hexahedra; raises AssertionError if one is inverted."""
     points, weights = np.polynomial.legendre.leggauss(3)
     local = np.stack(np.meshgrid(points, points, points, indexing="ij"), axis=-1).reshape(-1, 3)
     total = np.einsum("i,j,k->ijk", weights, weights, weights).ravel()
@@ -125,7 +123,7 @@ def test_curves_are_extrapolated_and_transferred_to_positions_with_one_mesh() ->
 
 @pytest.mark.long
 def test_corrected_pushes_of_the_demos_table_are_within_three_percent() -> None:
-    """The positions and depths are those of the reference."""
+    """Solve the pushes as a table does, at the positions and up to depths of the reference."""
     scene, depths = load_scene(SCENE_FILE), (0.0015, 0.003, 0.005, 0.010, 0.015)
     assert scene.object.material is not None
     modulus, radius = scene.object.material.young_modulus_pa, scene.object.geometry.radius_m
@@ -168,7 +166,7 @@ def test_corrected_pushes_of_the_demos_table_are_within_three_percent() -> None:
 def test_the_stated_errors_hold_at_the_references_positions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The table uses the precomputed pushes of the demo."""
+    """The quick table uses the shipped pushes of the demo."""
     monkeypatch.setattr(
         precompute_table, "local_processes", lambda count: nullcontext(InlineExecutor())
     )

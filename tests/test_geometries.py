@@ -1,6 +1,4 @@
-"""Test that each kind of geometry has one description, and that a new kind needs only a
-description.
-"""
+"""Every kind of geometry is described once, and a new one needs no more than its description."""
 
 from __future__ import annotations
 
@@ -68,7 +66,7 @@ class CapsuleShape(Convex):
 
 
 class Capsule(Part):
-    """A solid capsule along the x axis, centred on the origin of the object frame."""
+    """Solid capsule about the object frame's origin, its axis along x."""
 
     shape: Literal["capsule"] = "capsule"
     half_length_m: Positive
@@ -96,7 +94,7 @@ CAPSULE = GeometryDescription(
 
 @pytest.fixture
 def capsule_scene(monkeypatch: pytest.MonkeyPatch) -> Scene:
-    """Return a scene with a kind of geometry that is only known by its description."""
+    """A scene with a kind of geometry that only its description makes known."""
     monkeypatch.setitem(GEOMETRIES, "capsule", CAPSULE)
     body = SCENE.object.model_copy(
         update={
@@ -153,7 +151,7 @@ def test_every_geometry_of_a_scene_is_described_with_its_dimensions() -> None:
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_bounds_and_extents_are_those_of_the_shape(name: str) -> None:
-    """The reference is the nearest surface points of distant points."""
+    """Compared with nearest points of queries far outside, which lie on the touchable surface."""
     kind = next(kind for kind in KINDS if kind.model_fields["shape"].default == name)
     solid = kind.model_validate(geometry(name))
     random = np.random.default_rng(0).normal(size=(2000, 3))

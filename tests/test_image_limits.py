@@ -1,4 +1,4 @@
-"""Test invalid sheet poses: the image is dark, or uses the last valid plane."""
+"""Test the limits of the image: dark, or the last valid plane, but never wrong."""
 
 from __future__ import annotations
 
@@ -63,9 +63,8 @@ def sheet_at(pose: Floats, tip: Floats | None = None) -> SheetPose:
 
 
 def plane_through(point: Floats) -> Floats:
-    """Return world_from_sheet at the world's origin, rotated about x so that the plane contains a
-    point.
-    """
+    """Return world_from_sheet at the world's origin, rotated about x until it contains the
+    point."""
     angle = float(np.arctan2(point[1], point[2])) - 0.5 * np.pi
     return transform(rotation_from_vector([-angle, 0.0, 0.0]), np.zeros(3))
 
@@ -145,7 +144,8 @@ def test_a_push_out_of_range_is_drawn_and_reported(
 def test_a_fold_that_keeps_the_light_away_is_dark_and_the_rest_is_right(
     stage: SceneRenderer,
 ) -> None:
-    """The indentation of a sheet that faces down shades a part of the sheet."""
+    """The indentation of a downward sheet blocks the light: the lit part is correct, the rest is
+    dark."""
     place = np.array([0.0, 0.05, 0.0])
     pose = roll_sheet(SCENE, np.radians(40.0), (0.0, 0.05))
     tip = pose[:3, 3] + pose[:3, :3] @ (place - [0.0, 0.0, DEEPEST_M])
