@@ -1,9 +1,9 @@
-"""Check code and documentation for words that the glossary replaces: `make lint`.
+"""Check code and documentation for words that the glossary replaces (`make lint`).
 
-    python -m tests.check_words [FILE ...]
+python -m tests.check_words [FILE ...]
 
-Prints file, line, the banned words and the remedy; exit code 1 if there are any.  Without
-arguments it checks all files that git tracks.
+The program prints file, line, word and remedy of each violation. The exit code is 1 if there are
+violations. Without arguments, all files that git tracks are checked.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PATTERNS = {re.compile(pattern): remedy for pattern, remedy in BANNED.items()}
 
 
 def violations(path: Path) -> Iterator[str]:
-    """Yield a line of text for each banned word in the file."""
+    """Yield a line of text for each banned word in a file."""
     for number, line in enumerate(path.read_text().splitlines(), start=1):
         for pattern, remedy in PATTERNS.items():
             if found := pattern.search(line):
@@ -37,7 +37,7 @@ def violations(path: Path) -> Iterator[str]:
 
 
 def tracked_files() -> list[Path]:
-    """List the tracked Python and Markdown files that are not exempt, nor this one."""
+    """List the tracked Python and Markdown files, except this file and exempt files."""
     listing = subprocess.run(
         ["git", "ls-files", "-z", "*.py", "*.md"], cwd=ROOT, check=True, capture_output=True
     )

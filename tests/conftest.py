@@ -53,7 +53,7 @@ SKIPPED_FILE = "SKIPPED_FILE"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Create the folder that the processes of this run share, for `tests/shared.py`."""
+    """Create the folder that all processes of a test run share (`tests/shared.py`)."""
     if FOLDER_VARIABLE not in os.environ:
         os.environ[FOLDER_VARIABLE] = tempfile.mkdtemp(prefix="flexsheet-tests-")
         config.add_cleanup(remove_shared_folder)
@@ -64,12 +64,12 @@ def remove_shared_folder() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files of LONGEST first; the others stay in their order."""
+    """Move the test files in LONGEST to the start. The order of other files does not change."""
     items.sort(key=lambda item: item.path.stem not in LONGEST)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Append "FILE: REASON" for each skipped test to the file that SKIPPED_FILE names."""
+    """Append "FILE: REASON" for each skipped test to the file in the variable SKIPPED_FILE."""
     path = os.environ.get(SKIPPED_FILE)
     if path is None or hasattr(terminalreporter.config, "workerinput"):
         return

@@ -1,4 +1,4 @@
-"""Number of examples of a property test, and long examples of a parametrized test."""
+"""Set the numbers of examples of property tests, and mark long examples."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ USUAL = 50
 
 
 def examples(count: int) -> settings:
-    """Draw `count` examples in `make test`, and as many times more as the profile draws.
+    """Return settings with `count` examples, multiplied by the factor of the active profile.
 
-    `make test-long` uses the profile "long" of `tests/conftest.py`.
+    The command `make test-long` uses the profile "long" of `tests/conftest.py`.
     """
     return settings(max_examples=count * settings.default.max_examples // USUAL)
 
 
 def long_except(values: Iterable[Any], *short: Any) -> list[Any]:
-    """List parameters of a test, and mark all as long except `short`.
+    """Return the parameters of a test, and mark all except `short` as long.
 
     values: parameters, or tuples of parameters.
     """

@@ -1,4 +1,4 @@
-"""Search for nearest points on flat facets, to compare with smooth shapes."""
+"""Find the nearest points on flat triangles, as a reference for smooth shapes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Indices = NDArray[np.int64]
 
 
 class Facets:
-    """Search for the nearest points on the facets of a mesh."""
+    """A search for the nearest points on the triangles of a mesh."""
 
     def __init__(self, vertices: Floats, triangles: Indices) -> None:
-        """Build the search tree; raise MeshError for a mesh without triangles."""
+        """Build the search tree. Raises MeshError for a mesh without triangles."""
         if not len(triangles):
             raise MeshError("the mesh has no triangles")
         self.corners = vertices[triangles]
@@ -25,7 +25,9 @@ class Facets:
         self._tree = cKDTree(self._centre)
 
     def nearest(self, points: Floats) -> tuple[Indices, Floats]:
-        """Return the triangles (n,) nearest to points (n, 3) and barycentric coordinates (n, 3)."""
+        """Return the triangles (n,) nearest to points (n, 3), and the barycentric coordinates (n,
+        3).
+        """
         reach = self._tree.query(points)[0] + self._reach
         lists = self._tree.query_ball_point(points, reach * (1.0 + 1e-12))
         chosen, weights = np.empty(len(points), dtype=np.int64), np.empty((len(points), 3))

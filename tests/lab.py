@@ -57,7 +57,7 @@ STROKE_POINTS_HZ = 25
 
 
 def missing() -> str | None:
-    """Return the reason why such a lab cannot run here, or None."""
+    """Return the reason why the simulated lab cannot run on this computer, or None."""
     name = f"fs{os.getpid()}-try"
     try:
         _ip("netns", "add", name)
@@ -69,10 +69,9 @@ def missing() -> str | None:
 
 
 class Network:
-    """Network namespaces named after computers, at a switch with configurable cables; a context
-    manager.
+    """A set of network namespaces at a simulated switch, as a context manager.
 
-    addresses: of each computer, in one /24.
+    addresses: address of each computer, all in one /24 network.
     """
 
     def __init__(self, tag: str, addresses: Mapping[str, str]) -> None:
@@ -127,8 +126,9 @@ class Network:
 
 
 def strokes_path(scene: Scene, *, count: int = 40) -> FingerPath:
-    """Make strokes around the scene's cylinder, back and forth without a rest, ending at the
-    top."""
+    """Return a path of strokes around the cylinder, back and forth without a pause, that ends at
+    the top.
+    """
     times = np.linspace(0.0, count * STROKE_S, round(count * STROKE_S * STROKE_POINTS_HZ) + 1)
     angles = 0.5 * STROKE_ANGLE_RAD * (1.0 - np.cos(np.pi * times / STROKE_S))
     radius = require_cylinder(scene).radius_m
@@ -144,9 +144,13 @@ def strokes_path(scene: Scene, *, count: int = 40) -> FingerPath:
 
 
 class Lab:
-    """Lab of three computers; an async context manager that skips the test if it cannot run.
+    """A simulated lab of three computers, as an async context manager.
 
-    without: nodes to omit. arming, bridge: parameters of both bridges. watchdog_s: of both arms.
+    Tests are skipped if the lab cannot run.
+
+    without: nodes to omit.
+    arming, bridge: parameters of both bridges.
+    watchdog_s: watchdog time of both arms.
     """
 
     def __init__(
@@ -239,7 +243,7 @@ class Lab:
         return ["ip", "netns", "exec", self.network.space(host), *flexsheet, *arguments]
 
     def start(self, *hosts: str, launch_file: Path | None = None) -> None:
-        """Run `flexsheet launch` on those hosts, by default with the lab's launch file."""
+        """Run `flexsheet launch` on some hosts, by default with the launch file of the lab."""
         for host in hosts:
             log = (self.folder / f"{host}.log").open("ab")
             self.launchers[host] = subprocess.Popen(
@@ -249,7 +253,7 @@ class Lab:
             log.close()
 
     async def run(self, host: str, *arguments: str) -> tuple[int, str]:
-        """Run a command on a host; return its exit code and output."""
+        """Run a command on a host, and return its exit code and output."""
         process = await asyncio.create_subprocess_exec(
             *self.command(host, *arguments), env=self._environment(host), cwd=self.folder,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -263,7 +267,7 @@ class Lab:
         await self.network.cable(host, **values)
 
     def run_directory(self, host: str) -> Path | None:
-        """Return the directory of the newest launcher there that has written its plan."""
+        """Return the directory of the newest launcher on a host that has written its plan."""
         found = sorted(
             (self.folder / host / "r").glob("*/plan.json"), key=lambda path: path.stat().st_mtime_ns
         )
@@ -273,7 +277,7 @@ class Lab:
         return load_graph(self.launch_file)
 
     async def watch(self, host: str, *topics: str) -> None:
-        """Subscribe to a host's writers of these topics, as soon as its launcher runs."""
+        """Subscribe to topics of a host as soon as its launcher runs."""
         process = self.launchers[host]
         known = self._subscribers.pop(host, [])
         for subscriber in known:
@@ -329,13 +333,14 @@ class Lab:
         await self.watch(host, "host", *arm)
 
     def stroke(self) -> None:
-        """Make the finger stroke continuously from now on, also after restarts."""
+        """Start continuous strokes of the finger, which also continue after restarts."""
         self._stroking = asyncio.create_task(self._stroke(), name="strokes")
 
     async def _stroke(self) -> None:
-        """Send the path in each run of the main computer, and after each end.
+        """Send the path at the start of each run of the main computer, and after each end of the
+        path.
 
-        A simulator that is restarted within a run receives the latched path again.
+        A simulator that restarts within a run receives the latched path again.
         """
         plan = self.plan()
         scene = plan.scene_message()
@@ -363,7 +368,7 @@ class Lab:
                 writer.close()
 
     def strokes(self) -> bool:
-        """Return whether the true finger moves."""
+        """Return whether the simulated finger moves."""
         finger = self.newest.get("twin/finger")
         return (
             isinstance(finger, TwinFinger)
@@ -377,7 +382,7 @@ class Lab:
         return found if isinstance(found, HostStatus) else None
 
     def pid_of(self, host: str, node: str) -> int:
-        """Return the ID of a node's process, by its configuration's path in the command line."""
+        """Return the process ID of a node, found by the configuration file in the command line."""
         directory = self.run_directory(host)
         assert directory is not None
         wanted = str(directory / f"{self.plan().nodes[node].process}.json").encode()
@@ -430,8 +435,7 @@ def _only_data(folder: str, names: list[str]) -> list[str]:
 
 
 async def _ends(process: subprocess.Popen[bytes]) -> bool:
-    """Wait for a process to end; return False if it was killed, with its nodes, after
-    DEADLINE_S."""
+    """Wait until a process has ended. Return False if the process was killed after DEADLINE_S."""
     try:
         await asyncio.to_thread(process.wait, DEADLINE_S)
     except subprocess.TimeoutExpired:

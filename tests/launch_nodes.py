@@ -1,4 +1,4 @@
-"""Define small nodes for the tests of launcher and command line, "tests.launch_nodes:Class"."""
+"""Define small nodes for the tests of launcher and command line."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class BeaconParameters(NodeParameters):
 
 
 class FingertipSource(Node):
-    """Publish a fingertip at rest at 50 Hz."""
+    """A node that publishes a fingertip at rest at 50 Hz."""
 
     parameters: BeaconParameters
     fingertip: Output[Fingertip]
@@ -43,7 +43,7 @@ class FingertipSource(Node):
 
 
 class Beacon(Node):
-    """Publish a numbered finger; parameters select a misbehaviour."""
+    """A node that publishes numbered fingers. Parameters select a fault."""
 
     parameters: BeaconParameters
     twin__finger: Output[TwinFinger]
@@ -85,7 +85,9 @@ class RelayParameters(NodeParameters):
 
 
 class Relay(Node):
-    """Publish the age of the newest finger at a rate, and optionally random values."""
+    """A node that publishes the age of the newest finger periodically, and optionally random
+    values.
+    """
 
     parameters: RelayParameters
     twin__finger: Input[TwinFinger]
@@ -103,7 +105,7 @@ class ListenerParameters(NodeParameters):
 
 
 class Listener(Node):
-    """Publish one e-stop when the finger has reached a distance."""
+    """A node that publishes one e-stop when the finger has reached a given distance."""
 
     live_parameters: ClassVar[frozenset[str]] = frozenset({"patience_s"})
     parameters: ListenerParameters
@@ -126,7 +128,9 @@ class StandInBridgeParameters(NodeParameters):
 
 
 class StandInBridge(Node):
-    """Publish an arm that follows until it is stopped; hang while a file exists."""
+    """A node that publishes an arm which follows until it is stopped. The node hangs while a file
+    exists.
+    """
 
     opens_devices: ClassVar[bool] = True
     parameters: StandInBridgeParameters
@@ -157,7 +161,7 @@ class SlowRecorderParameters(RecorderParameters):
 
 
 class SlowRecorder(Recorder):
-    """Record topics, and close the bag when a file exists."""
+    """A recorder that closes the bag when a file exists."""
 
     parameters: SlowRecorderParameters
 
@@ -173,7 +177,7 @@ class CrashParameters(NodeParameters):
 
 
 class Crash(Node):
-    """Log a line, and fail on request: a task of the runner ends with an error."""
+    """A node that logs a line, and fails on request."""
 
     parameters: CrashParameters
     twin__finger: Input[TwinFinger]

@@ -13,21 +13,21 @@ CYLINDER_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "
 
 
 def load_values(path: Path = CYLINDER_FILE) -> dict[str, Any]:
-    """Return the values of a scene file, which is parsed once; each call returns a new copy."""
+    """Return a new copy of the values in a scene file. The file is parsed only once."""
     return read_document(path).values
 
 
 def load_cylinder() -> Scene:
-    """Return the paper's scene."""
+    """Return the scene of the paper."""
     return Scene.model_validate(load_values())
 
 
 def set_density(scene: Scene, density_kg_per_m3: float) -> Scene:
-    """Return the scene with a sheet of that density."""
+    """Return the scene with a different density of the sheet."""
     sheet = scene.sheet.model_copy(update={"density_kg_per_m3": density_kg_per_m3})
     return scene.model_copy(update={"sheet": sheet})
 
 
 def make_weightless(scene: Scene) -> Scene:
-    """Return the scene with a sheet without weight, which is flat when nothing pushes it."""
+    """Return the scene with a sheet without weight, which is flat if nothing touches it."""
     return set_density(scene, 0.0)

@@ -1,4 +1,4 @@
-"""Write a short session as a bag for the tests of reports: a stroke with several events."""
+"""Write a bag of a short session for the tests of reports: a stroke with several events."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def target(pose: Floats, phase: Any = "contact", valid_at_ns: int = 0) -> SheetT
 
 
 def sheet_at(angle_rad: float) -> Floats:
-    """Return the tangent plane at that angle around the cylinder, with the error."""
+    """Return the tangent plane of the cylinder at an angle, displaced by an error."""
     solid = SCENE.object
     pose = solid.world_from_object
     turn = rotation_from_vector(np.array([-angle_rad - TURNED_RAD, 0.0, 0.0]))
@@ -95,20 +95,20 @@ def finger_at(angle_rad: float) -> Floats:
 
 
 class MessageWriter:
-    """Writer of messages with their headers."""
+    """A writer of messages with their headers."""
 
     def __init__(self, writer: BagWriter, leave_out: Collection[str]) -> None:
         self._writer, self._leave_out = writer, leave_out
         self._sequences: dict[str, int] = {}
 
     def skip(self, topic: str) -> None:
-        """Skip the sequence number of a message that never reached the recorder."""
+        """Skip a sequence number, as if the message was lost before the recorder."""
         self._sequences[topic] = self._sequences.get(topic, 0) + 1
 
     def write(
         self, topic: str, message: Message, seconds: float, *, age_s: float = 0.0, writer: str = "n"
     ) -> None:
-        """Write a message at `seconds`, with a source stamp `age_s` before."""
+        """Write a message at the time `seconds`, with a source timestamp `age_s` earlier."""
         self.skip(topic)
         if topic in self._leave_out:
             return
@@ -120,7 +120,8 @@ class MessageWriter:
 
 def write_session(path: Path, *, leave_out: Collection[str] = ()) -> Path:
     """Write three seconds: a stroke of one second, then a fault, an e-stop, a bookmark and a
-    gap."""
+    gap.
+    """
     begin_s, finish_s = stroke_window_s(STROKE_S)
     recording = {"clock_id": "clock", "started": "2026-11-22T10:00:00+00:00",
                  "started_ns": str(START_NS)}  # fmt: skip

@@ -27,10 +27,12 @@ FRAME_BYTES = 65_536
 
 @dataclass(frozen=True, slots=True)
 class Cable:
-    """Properties of a cable.
+    """The properties of a network cable.
 
-    delay_s: one way. jitter_s: standard deviation per frame, so that frames are reordered. loss:
-        fraction. cut: all frames are lost without notice.
+    delay_s: delay in one direction.
+    jitter_s: standard deviation of the delay. Jitter can reorder frames.
+    loss: fraction of lost frames.
+    cut: whether all frames are lost.
     """
 
     delay_s: float = 0.0
@@ -39,14 +41,14 @@ class Cable:
     cut: bool = False
 
     def passes(self, chance: random.Random) -> float | None:
-        """Return the delay of a frame, s; None for a lost one."""
+        """Return the delay (s) of a frame, or None for a lost frame."""
         if self.cut or chance.random() < self.loss:
             return None
         return max(0.0, chance.gauss(self.delay_s, self.jitter_s))
 
 
 def open_tap(namespace: str) -> int:
-    """Open a TAP device "eth" in a network namespace, which this process enters."""
+    """Open a TAP device "eth" in a network namespace. This process enters the namespace."""
     space = os.open(f"/run/netns/{namespace}", os.O_RDONLY)
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.setns(space, CLONE_NEWNET) != 0:
@@ -58,7 +60,7 @@ def open_tap(namespace: str) -> int:
 
 
 class Switch:
-    """Forwarder of frames between TAP devices after their delays."""
+    """A switch that forwards frames between TAP devices after the delays of the cables."""
 
     def __init__(self, taps: dict[str, int]) -> None:
         self._taps = taps
@@ -88,7 +90,7 @@ class Switch:
         heapq.heappush(self._waiting, (due_s, self._number, tap, frame))
 
     def hand_out(self) -> float | None:
-        """Deliver due frames; return the time until the next one, s, or None."""
+        """Deliver the frames that are due. Return the time (s) until the next frame, or None."""
         while self._waiting:
             ahead_s = self._waiting[0][0] - time.monotonic()
             if ahead_s > 0.0:

@@ -32,7 +32,7 @@ def modules(floor: str) -> Iterator[Path]:
 
 @cache
 def imports_of(path: Path) -> set[str]:
-    """Return the dotted names of everything that a file imports, at any depth."""
+    """Return the dotted names of all imports in a file, including those inside functions."""
     names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -44,7 +44,9 @@ def imports_of(path: Path) -> set[str]:
 
 
 def floor_of(name: str) -> str:
-    """Return the top-level folder of a module of the project; the first part of any other name."""
+    """Return the top-level package of a module of the project; otherwise the first part of the
+    name.
+    """
     return name.removeprefix("flexsheet.").split(".", maxsplit=1)[0]
 
 

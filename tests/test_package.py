@@ -54,7 +54,7 @@ def test_a_former_name_is_a_deprecated_alias(former: str, name: str) -> None:
 
 
 def test_static_and_lazy_names_agree() -> None:
-    """Type checkers read the imports, Python reads the table."""
+    """Type checkers read the imports. Python reads the table."""
     tree = ast.parse((ROOT / "flexsheet" / "__init__.py").read_text())
     imported = {
         alias.name: node.module
@@ -74,7 +74,7 @@ def test_importing_the_package_imports_no_library(tmp_path: Path) -> None:
 
 
 def test_no_module_is_imported_under_two_names(tmp_path: Path) -> None:
-    """The checkout and foreign packages of the same names are on the path."""
+    """The checkout, and other packages with the same names, are on the path."""
     for name in FOLDERS:
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('foreign package')\n")
@@ -119,7 +119,7 @@ def test_every_module_has_one_file() -> None:
 
 
 def test_the_launcher_loads_no_numerical_library_of_the_nodes() -> None:
-    """SciPy would take half of the time in which a graph starts; nodes load the parts they use."""
+    """The import of SciPy would take half of the start time of a graph."""
     code = (
         "import sys; from flexsheet.nodes import NODES, node_class\n"
         "for name in NODES: node_class(name)\n"
