@@ -1,8 +1,8 @@
 """Define limits for numbers in scenes, launch files, parameters and calibrations.
 
 The limit of a number depends on the unit at the end of its field's name, such as `_m`. A few field
-names have their own limits. The limits are wide. Their purpose is to prevent numerical errors in
-the nodes, such as overflow, by numbers that no real hardware has.
+names have their own limits. The limits are wide. They only exclude unrealistic numbers that could
+cause numerical errors in the nodes, such as overflow.
 """
 
 from __future__ import annotations

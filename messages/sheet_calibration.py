@@ -57,7 +57,7 @@ class SheetTable(Part):
 class SheetCalibration(Part):
     """The calibration of a rubber sheet.
 
-    It contains the fitted parameters of the sheet's force model, and the range of the measurements.
+    The file contains the fitted parameters of the force model, and the range of the measurements.
     """
 
     version: Literal[1] = 1

@@ -1,10 +1,10 @@
 """Estimate the offset of another clock from pings, with guaranteed bounds.
 
-A ping has four timestamps. It is sent at t1 on the own clock and received at t2 on the other clock.
-The reply is sent at t3 on the other clock and received at t4 on the own clock. A message always
-arrives after it was sent. The other clock minus the own clock is therefore at most t2 - t1 at time
-t1, and at least t3 - t4 at time t4. Between both times, the offset changes at most by the maximum
-drift. No assumption about the network's delays is necessary.
+A ping has four timestamps. The ping is sent at t1 on the own clock and received at t2 on the other
+clock. The reply is sent at t3 on the other clock and received at t4 on the own clock. A message
+always arrives after it was sent. The other clock minus the own clock is therefore at most t2 - t1
+at time t1, and at least t3 - t4 at time t4. Between both times, the offset changes at most by the
+maximum drift. No assumption about the network's delays is necessary.
 
 Source: Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on the intersection of
     intervals.

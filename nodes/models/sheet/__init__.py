@@ -1,8 +1,8 @@
 """Provide models of the rubber sheet: poses of its edges, shape and forces.
 
 The sheet frame has its origin at the centre. The x axis points from the left to the right clamped
-edge, y points along the edges, and z points towards the user. This module computes the poses of the
-sheet, of its edges and of the arms' flanges from one another.
+edge, y points along the edges, and z points towards the user. The functions compute the poses of
+the sheet, the edges and the arms' flanges from each other.
 """
 
 from __future__ import annotations
