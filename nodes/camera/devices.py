@@ -68,11 +68,11 @@ class ReaderThread(threading.Thread):
         name: str,
         now: Now,
         retry_s: float,
-        deliver: Callable[[ImagePair, int], None],
-        fail: Callable[[DeviceError], None],
-        report: Callable[[str], None],
-        warn: Callable[[str], None],
-        finish: Callable[[int], None],
+        deliver: Callable[[ImagePair, int], object],
+        fail: Callable[[DeviceError], object],
+        report: Callable[[str], object],
+        warn: Callable[[str], object],
+        finish: Callable[[int], object],
     ) -> None:
         super().__init__(name=name, daemon=True)
         self._open, self._camera, self._regions = open_source, camera, regions

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Annotated, ClassVar
 
 import cv2
@@ -106,12 +107,10 @@ class HeadCamera(Node):
         self._valid_ns: int | None = None
         self._published_ns: int | None = None
         self._problem = ""
-        loop = asyncio.get_running_loop()
-
-        def later(call: Callable[..., None]) -> Callable[..., object]:
-            return lambda *arguments: loop.call_soon_threadsafe(call, *arguments)
-
-        self.reader = FaceReader(p, self.clock.now_ns, later(self._receive), later(self._report))
+        later = asyncio.get_running_loop().call_soon_threadsafe
+        self.reader = FaceReader(
+            p, self.clock.now_ns, partial(later, self._receive), partial(later, self._report)
+        )
         self.reader.start()
 
     async def close(self) -> None:

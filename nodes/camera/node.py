@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
@@ -98,10 +98,7 @@ class Camera(Node):
         camera = self.camera = scene.camera
         if self.parameters.source.kind == "twin":
             return
-        loop = asyncio.get_running_loop()
-
-        def later(call: Callable[..., None], *arguments: object) -> None:
-            loop.call_soon_threadsafe(call, *arguments)
+        later = asyncio.get_running_loop().call_soon_threadsafe
 
         def deliver(images: ImagePair, lost: int) -> None:
             if self.newest is not None:
@@ -117,9 +114,9 @@ class Camera(Node):
             now=self.clock.now_ns,
             retry_s=self.parameters.retry_s,
             deliver=deliver,
-            fail=lambda error: later(self._report_failure, error),
-            report=lambda text: later(self._report_opened, text),
-            warn=lambda text: later(self._report_warning, text),
+            fail=partial(later, self._report_failure),
+            report=partial(later, self._report_opened),
+            warn=partial(later, self._report_warning),
             finish=lambda pairs: later(setattr, self, "note", f"ended after {pairs} pairs"),
         )
         self.reader.start()
