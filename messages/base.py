@@ -56,8 +56,8 @@ class Header:
     publish_ns: time when the message was passed to the socket, on the same clock.
     clock_id: clock of both timestamps. Timestamps of different clocks must not be subtracted.
     writer: name of the node that published the message.
-    epoch: time when the writer started, in ns, on the same clock. A receiver thereby distinguishes
-        a restart from a loss of messages, and rejects messages from before a restart.
+    epoch: time when the writer started, in ns, on the same clock. A receiver uses the epoch to
+        distinguish a restart from a loss of messages, and to reject messages from before a restart.
     plan: hash of the resolved launch file of the writer; empty in bags of the first wire protocol.
     """
 
