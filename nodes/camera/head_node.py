@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable
-from functools import partial
 from typing import Annotated, ClassVar
 
 import cv2
@@ -109,7 +108,10 @@ class HeadCamera(Node):
         self._problem = ""
         later = asyncio.get_running_loop().call_soon_threadsafe
         self.reader = FaceReader(
-            p, self.clock.now_ns, partial(later, self._receive), partial(later, self._report)
+            p,
+            self.clock.now_ns,
+            deliver=lambda at_ns, pixels: later(self._receive, at_ns, pixels),
+            fail=lambda error: later(self._report, error),
         )
         self.reader.start()
 

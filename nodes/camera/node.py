@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
@@ -114,9 +113,9 @@ class Camera(Node):
             now=self.clock.now_ns,
             retry_s=self.parameters.retry_s,
             deliver=deliver,
-            fail=partial(later, self._report_failure),
-            report=partial(later, self._report_opened),
-            warn=partial(later, self._report_warning),
+            fail=lambda error: later(self._report_failure, error),
+            report=lambda text: later(self._report_opened, text),
+            warn=lambda text: later(self._report_warning, text),
             finish=lambda pairs: later(setattr, self, "note", f"ended after {pairs} pairs"),
         )
         self.reader.start()
