@@ -12,13 +12,12 @@ from math import acos, atan2, copysign, cos, degrees, hypot, inf, pi, remainder,
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from flexsheet.messages.scene import ClosedFormArm
 from flexsheet.nodes.arm_bridge.joint_chain import SerialChain
 from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 WRIST_SINGULAR = 1e-7
 """The value of |sin J5| below which the axes of J4 and J6 are treated as parallel. J4 then stays

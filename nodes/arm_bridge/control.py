@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
 from flexsheet.messages.notes import NodeNote
@@ -61,6 +60,7 @@ from flexsheet.nodes.arm_bridge.state_machine import (
     Event,
     State,
 )
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import (
     EdgeBound,
     SheetMotion,
@@ -68,8 +68,6 @@ from flexsheet.nodes.models.motion import (
     follow_sheet,
 )
 from flexsheet.nodes.models.rigid import is_rigid
-
-Floats = NDArray[np.float64]
 
 MAX_REST_RAD_PER_S = 1e-6
 """The joint speed up to which an arm is considered to be at rest."""

@@ -6,7 +6,6 @@ from functools import lru_cache
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import ArmModel, ClosedFormArm, JointChain, Scene
 from flexsheet.messages.types import Side
@@ -14,11 +13,10 @@ from flexsheet.nodes.arm_bridge.closed_form import ClosedFormKinematics
 from flexsheet.nodes.arm_bridge.joint_chain import NumericKinematics, SerialChain
 from flexsheet.nodes.arm_bridge.kinematics import ArmKinematics
 from flexsheet.nodes.arm_bridge.limiter import TOOL_SPEED_FRACTION, JointLimits, SheetLimits
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import EdgeBound, SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.models.sheet import flange_pose, sheet_from_edges
-
-Floats = NDArray[np.float64]
 
 RANGE_MARGIN_RAD = np.radians(2.0)
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.types import SheetTarget, SheetTrajectory
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import (
     SheetBounds,
     SheetMotion,
@@ -20,8 +20,6 @@ from flexsheet.nodes.models.motion import (
     measure_length,
 )
 from flexsheet.nodes.models.rigid import transform, vector_from_rotation
-
-Floats = NDArray[np.float64]
 
 # The joints can follow these accelerations (J6 22 rad/s^2, J2 9.4 rad/s^2).  With larger
 # accelerations, each arm would overshoot a target that reverses by a different distance.

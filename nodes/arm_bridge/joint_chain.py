@@ -13,13 +13,11 @@ from math import degrees, pi
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import JointChain
 from flexsheet.nodes.arm_bridge.kinematics import SeedBranch, UnreachableError
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import pose_matrix
-
-Floats = NDArray[np.float64]
 
 MAX_STEPS = 12
 """The maximum number of Newton steps from known joint angles. A control cycle needs 2 or 3."""

@@ -8,13 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import ArmModel
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 
 class UnreachableError(FlexsheetError, ValueError):

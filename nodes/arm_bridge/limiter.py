@@ -14,14 +14,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.notes import NodeNote
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import BRAKE_FRACTION, closing_speed
 from flexsheet.nodes.models.rigid import angle_between
 from flexsheet.nodes.models.sheet import edge_force_n
-
-Floats = NDArray[np.float64]
 
 TOOL_SPEED_FRACTION = 0.82
 """The fraction of the maximum tool speed that commands may use. A margin is necessary because the

@@ -18,7 +18,6 @@ import asyncio
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.nodes.arm_bridge.link import (
     JOINTS,
@@ -29,8 +28,7 @@ from flexsheet.nodes.arm_bridge.link import (
     ConnectedLink,
     validate_joints,
 )
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 MAX_LINE_BYTES = 512
 

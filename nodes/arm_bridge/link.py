@@ -9,12 +9,8 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum, auto
 from typing import ClassVar, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from flexsheet.messages.errors import FlexsheetError
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 JOINTS = 6
 

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerSocket
@@ -32,8 +31,7 @@ from flexsheet.nodes.arm_bridge.link import (
     ConnectedLink,
     validate_joints,
 )
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 MAGIC = 0x4653
 VERSION = 1

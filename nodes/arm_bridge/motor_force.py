@@ -11,14 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Finite, Positive
 from flexsheet.messages.types import Force, Side
+from flexsheet.nodes.arrays import Floats
 
-Floats = NDArray[np.float64]
 SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 

@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.nodes.arm_bridge.link import (
     JOINTS,
@@ -30,8 +29,7 @@ from flexsheet.nodes.arm_bridge.link import (
     propagate_cancellation,
     validate_joints,
 )
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 CONTROLLER_CYCLE_S = 0.0071
 PACKET_BYTES = 196

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmMode, ArmState
 from flexsheet.nodes.arm_bridge.goal import MAX_PREDICTION_S, MAX_TRAJECTORY_S
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import is_rigid
-
-Floats = NDArray[np.float64]
 
 MAX_FUTURE_S = 0.02
 """The maximum time by which the timestamp of a state may lie in the future. The errors of the

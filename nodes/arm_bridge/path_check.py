@@ -12,7 +12,6 @@ import asyncio
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.notes import NodeNote
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
@@ -29,11 +28,10 @@ from flexsheet.nodes.arm_bridge.reach import (
     plan_path_through,
     solve_step,
 )
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, follow_sheet
 from flexsheet.nodes.models.rigid import is_rigid, vector_from_rotation
-
-Floats = NDArray[np.float64]
 
 # Slow bounds (a quarter of the tool speed) for the motion from rest to the target, because the user
 # may touch the sheet.

@@ -20,6 +20,7 @@ from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import (
     inverse,
@@ -28,9 +29,6 @@ from flexsheet.nodes.models.rigid import (
     vector_from_rotation,
 )
 from flexsheet.nodes.models.sheet import edge_force_n
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 RANGES = tuple(f"J{joint} range" for joint in range(1, 7))
 SPEEDS = tuple(f"J{joint} speed" for joint in range(1, 7))

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.nodes.arm_bridge.link import Freshness
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 STANDSTILL_COUNT = 5
 """The number of consecutive unchanged measurements after which an arm at its last command is at
