@@ -317,8 +317,6 @@ class SimulatedArm:
             self._velocity,
             goal_rad,
             (goal_rad - self._goal_rad) / step_s,
-            tool_points=geometry.tool_points,
-            max_tool_speed=geometry.max_tool_speed,
             limits=geometry.joint_limits,
             step_s=step_s,
         )

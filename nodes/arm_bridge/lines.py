@@ -73,7 +73,6 @@ class LineLink(ConnectedLink):
 
     @property
     def connected(self) -> bool:
-        """Return whether the connection is open."""
         return self._streams is not None and not self._streams[1].is_closing()
 
     async def _connect(self) -> None:

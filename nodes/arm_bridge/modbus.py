@@ -1,9 +1,9 @@
 """Exchange commands with an arm by Modbus TCP.
 
-Each cycle sends one request (function code 23) with magic number, version, sequence number and CRC.
-`COMMAND` and `STATUS` define the register map. `website.registers_page` writes the tables of
-docs/modbus.md from this map. Numbers of 32 bits occupy two registers, the high register first. The
-CRC-32 (as in zlib) covers all preceding registers of its block, high byte first.
+Each control cycle sends one request (function code 23). `COMMAND` and `STATUS` define the register
+map, from which `website.registers_page` generates the tables of docs/modbus.md. Numbers of 32 bits
+occupy two registers, the high register first. The CRC-32 (as in zlib) covers all preceding
+registers of its block, high byte first.
 """
 
 from __future__ import annotations
@@ -166,8 +166,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
 class _Framer(FramerSocket):
     """A Modbus framer that fails the pending request if an answer cannot be decoded.
 
-    The framer of pymodbus raises the error in the event loop instead, and the request waits until
-    its time-out.
+    With the framer of pymodbus, the request would wait until its time-out.
     """
 
     def __init__(self, client: AsyncModbusTcpClient) -> None:
@@ -194,8 +193,8 @@ class ModbusLink(ConnectedLink):
     """A driver for one arm that uses one Modbus TCP connection.
 
     After a failure, the connection is closed if an answer may still arrive. Otherwise pymodbus
-    3.16.1 could return the late answer to the next request. Other wrong answers are detected by
-    their sequence number and CRC.
+    3.16.1 could return the late answer to the next request. The sequence number and the CRC detect
+    other wrong answers.
     """
 
     def __init__(self, host: str, port: int, *, timeout_s: float = 0.03) -> None:

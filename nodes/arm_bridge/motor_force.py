@@ -2,8 +2,8 @@
 
 The difference between the motor currents with and without the sheet is proportional to the joint
 torques. Static friction of the gears adds an unknown torque of about a tenth of the rated torque.
-The estimate therefore detects errors of several newtons in the sheet's tension, but it is not
-precise enough to calibrate the sheet.
+The estimate detects errors of several newtons in the sheet's tension, but cannot calibrate the
+sheet.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 STEP_RAD = 1e-5
 MAX_SPEED_RAD_PER_S = 0.02
-"""The maximum joint speed at which the estimate is valid. At higher speeds, the currents also
-depend on sliding friction and acceleration."""
+"""The maximum joint speed at which the estimate is valid. At higher speeds, sliding friction and
+acceleration change the currents."""
 
 PERIOD_NS = 50_000_000
 
