@@ -384,7 +384,7 @@ class SimulatedLoop:
     ) -> None:
         self._truth, self._compliance = apparatus, compliance
         parameters = PlannerParameters.model_validate(dict(settings.planner))
-        self.planner = SheetTrajectoryPlanner(scene, parameters.trajectory_settings())
+        self.planner = SheetTrajectoryPlanner(scene, parameters)
         self.sheet = SimulatedSheet(scene, apparatus, self.planner.motion, settings)
         track = FilmedFinger if settings.with_images else MeasuredFinger
         self._tracked = track(scene, apparatus, settings)
