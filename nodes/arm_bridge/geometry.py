@@ -29,7 +29,7 @@ RANGE_MARGIN_RAD = np.radians(2.0)
 
 RELAXED_M, RELAXED_RAD = 0.002, 0.01
 """The margins (m and rad) by which a limit is widened if it is exceeded at the start of a motion.
-They are necessary because servos ripple and measurements are noisy."""
+Servos ripple and measurements are noisy."""
 
 EDGE_SPEED_FRACTION = 0.95
 """The fraction of the maximum tool speed that the sheet's edges may use."""

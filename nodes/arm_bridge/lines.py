@@ -62,7 +62,7 @@ def decode_line(line: bytes, sequence: int) -> tuple[ArmStatus, tuple[int, ...]]
 
 
 class LineLink(ConnectedLink):
-    """A driver for one arm whose controller program exchanges lines of text over TCP."""
+    """A driver for a controller program that exchanges lines of text over TCP."""
 
     period_s = 0.008
 

@@ -99,7 +99,7 @@ _STATUS_REGISTERS = count_registers(STATUS)
 
 @dataclass(frozen=True, slots=True)
 class ModbusStatus(ArmStatus):
-    """The contents of a status block, whose fields are described in `STATUS`."""
+    """The contents of a status block; see `STATUS` for a description of the fields."""
 
     accepted: int
     cycle: int

@@ -17,7 +17,7 @@ MAX_FUTURE_S = 0.02
 """The tolerance for timestamps in the future, because of clock errors."""
 
 MAX_TARGET_DIFFERENCE_NS = round(1e9 * MAX_TRAJECTORY_S)
-"""The maximum time between the camera exposures of two targets whose trajectories overlap."""
+"""The maximum time between the camera exposures of two targets with overlapping trajectories."""
 
 MAX_TRAJECTORY_END_NS = round(1e9 * (MAX_PREDICTION_S + MAX_TRAJECTORY_S))
 """The maximum time from the camera exposure of a target to the end of its trajectory."""

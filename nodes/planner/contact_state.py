@@ -89,7 +89,7 @@ class ContactCommand:
 
 
 class UnpresentableError(FlexsheetError, ValueError):
-    """An error for an object whose surface the sheet cannot render."""
+    """An error for an object that the sheet cannot render."""
 
     code = "unpresentable"
     remedy = "Make the object larger or smoother, or the sheet wider."

@@ -323,10 +323,10 @@ class BankEstimate(Estimate):
     past_ns, past: earlier times and states, oldest first, for the longest scored horizon.
     error_covariance: covariance (scored horizons, 3, models, models), m, of the models' prediction
         errors by axis, divided by the square root of the errors' magnitude.
-    weights: weights (scored horizons, 3, models), whose sum over the models is 1.
+    weights: weights (scored horizons, 3, models) with the sum 1 over the models.
     recent: recent mean square errors (scored horizons, 3, models + 1), m^2, of each model and of
         the weighted sum.
-    scored_ages_ms: ages of the states whose predictions were compared with the newest point.
+    scored_ages_ms: ages of the predictions that were compared with the newest point.
     innovation: mean square (3,), m^2, of the combined innovation.
     position, variance: filtered position (3,) m along the axes, and its error variance (3,) m^2.
     velocity_variance: error variance (3,), m^2/s^2, of the velocity along the axes.

@@ -74,7 +74,7 @@ INFEASIBLE_COST = 1e9
 """The cost of assigning a marker to a track to which the marker cannot belong."""
 
 AMBIGUITY_MARGIN = 9.0
-"""The cost difference below which two assignments are ambiguous. It is the square of three standard
+"""The cost difference below which two assignments are ambiguous: the square of three standard
 deviations."""
 
 MAX_APPEARANCE_DIST_SQ = 16.0

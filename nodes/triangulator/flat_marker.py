@@ -50,7 +50,7 @@ class FlatPose:
 
 
 def estimate_flat_pose(views: Sequence[DiscView], radius_m: float) -> FlatPose:
-    """Find the orientation of a disc whose computed images best fit the ellipses of two views."""
+    """Find the orientation of a disc that best explains the ellipses in two views."""
     found = [list(_possible_normals(view, radius_m)) for view in views]
     normals = [normal for normals in found for normal in normals]
     for one in found[0]:
