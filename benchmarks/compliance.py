@@ -98,7 +98,7 @@ def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
         shown = compute_compliance(scene, law, curve, max_depth_m=float(depths[-1]))
         error = errors(scene, shown.stretch_ratio, shown.indentation_m(depths), wanted)
         stiffness = float(curve.force_n(np.array([LINEAR_DEPTH_M]))[0]) / LINEAR_DEPTH_M
-        old = choose_stretch(stiffness, scene.sheet).stretch_ratio
+        old = choose_stretch(stiffness, scene.sheet)[0]
         before = errors(scene, old, depths, wanted)
         print(
             f"{1e-3 * modulus:g} kPa, {stiffness:.0f} N/m: stretch {shown.stretch_ratio:.3f}, "

@@ -386,8 +386,6 @@ def joint_goals(
                     lane.velocity,
                     goal,
                     along,
-                    tool_points=geometry.tool_points,
-                    max_tool_speed=geometry.max_tool_speed,
                     limits=limits,
                     step_s=step_s,
                 )
@@ -473,7 +471,6 @@ def search_sequences(scene: Scene) -> list[list[Floats]]:
         for goal in goals:
             velocity = limit_velocity(
                 joints, velocity, goal, STILL,
-                tool_points=geometry.tool_points, max_tool_speed=geometry.max_tool_speed,
                 limits=limits, step_s=2.0 * PERIOD_S,
             )  # fmt: skip
             joints = joints + velocity * 2.0 * PERIOD_S
@@ -601,9 +598,7 @@ class SecondMaster:
             self.velocity,
             goal,
             along,
-            tool_points=geometry.tool_points,
-            max_tool_speed=0.5 * geometry.max_tool_speed,
-            limits=geometry.joint_limits,
+            limits=replace(geometry.joint_limits, max_tool_speed=0.5 * geometry.max_tool_speed),
             step_s=step_s,
         )
         self.joints_rad = self.joints_rad + self.velocity * step_s
@@ -840,8 +835,6 @@ def stroke_passes(scene: Scene) -> list[int]:
             velocity,
             goal,
             (goal - before) / PERIOD_S,
-            tool_points=geometry.tool_points,
-            max_tool_speed=geometry.max_tool_speed,
             limits=geometry.joint_limits,
             step_s=PERIOD_S,
         )

@@ -81,9 +81,7 @@ def make_planner(scene: Scene, geometry: Mapping[str, Any]) -> SheetTrajectoryPl
     body = scene.object.model_validate(
         {**dict(scene.object), "geometry": dict(geometry), "world_from_object": here}
     )
-    return SheetTrajectoryPlanner(
-        scene.model_copy(update={"object": body}), PlannerParameters().trajectory_settings()
-    )
+    return SheetTrajectoryPlanner(scene.model_copy(update={"object": body}), PlannerParameters())
 
 
 def make_compliance(scene: Scene) -> ComplianceController:

@@ -8,7 +8,10 @@ import numpy as np
 
 from flexsheet.messages.types import ArmState
 from flexsheet.nodes.arm_bridge.control import ArmControl
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.state_machine import Event
+from flexsheet.nodes.arrays import Floats
 
 
 def arm_state(side: str, **changes: Any) -> ArmState:
@@ -29,6 +32,22 @@ def arm_state(side: str, **changes: Any) -> ArmState:
         "cycle_s": 0.001,
     }
     return ArmState(**values | changes)
+
+
+def as_other_arm(
+    control: ArmControl, geometry: ArmGeometry, joints_rad: Floats, age_s: float = 0.005
+) -> OtherArm:
+    """Return the state of an arm as the other arm's bridge receives it."""
+    return OtherArm(
+        joints_rad,
+        geometry.world_from_flange(joints_rad),
+        geometry.world_from_flange(control.commanded_rad),
+        control.mode,
+        control.all_faults,
+        age_s,
+        control.ready,
+        control.estop_reason is not None,
+    )
 
 
 def connect_control(control: ArmControl) -> None:

@@ -44,7 +44,7 @@ class PlannerHarness:
 
     def __init__(self, scene: Scene, **parameters: float) -> None:
         self.given = PlannerParameters(**parameters)
-        self.plan = SheetTrajectoryPlanner(scene, self.given.trajectory_settings())
+        self.plan = SheetTrajectoryPlanner(scene, self.given)
         self.compliance = ComplianceController(scene, make_force_model(scene.sheet), "force_curve")
         pose = scene.object.world_from_object
         self.world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)

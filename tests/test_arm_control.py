@@ -23,7 +23,7 @@ from flexsheet.nodes.arm_bridge.standstill import STANDSTILL_COUNT
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy, vector_from_rotation
 from flexsheet.nodes.models.sheet import edge_poses
-from tests.arm_states import connect_control
+from tests.arm_states import as_other_arm, connect_control
 from tests.examples import examples
 from tests.rv_1a import (
     forward,
@@ -75,16 +75,7 @@ class Arm:
         self.control.on_measurement(self.joints, ())
 
     def as_other(self, age_s: float = 0.005) -> OtherArm:
-        return OtherArm(
-            self.joints,
-            self.geometry.world_from_flange(self.joints),
-            self.geometry.world_from_flange(self.control.commanded_rad),
-            self.control.mode,
-            self.control.all_faults,
-            age_s,
-            self.control.ready,
-            self.control.estop_reason is not None,
-        )
+        return as_other_arm(self.control, self.geometry, self.joints, age_s)
 
     @property
     def edge(self) -> Floats:
@@ -630,7 +621,7 @@ def test_measured_flanges_outside_the_workspace_or_too_near_are_faults() -> None
         moved = geometry.world_from_flange(arms[0].joints)
         moved[:3, 3] += shift
         geometry.world_from_flange = lambda joints, moved=moved: moved
-        control._check_measurement(geometry, arms[1].as_other(), arms[0].joints)
+        control._check_measurement(arms[1].as_other(), arms[0].joints)
         assert control.faults
         assert control.faults[0].startswith("measured: ")
         assert words in control.faults[0]

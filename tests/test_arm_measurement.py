@@ -30,7 +30,7 @@ from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.twin.arms import (
     Servo,
 )
-from tests.arm_states import connect_control
+from tests.arm_states import as_other_arm, connect_control
 from tests.examples import examples, long_except
 from tests.rv_1a import (
     JOINT_SPEED_RAD_PER_S,
@@ -110,16 +110,7 @@ class ServoArm:
     def as_other(self) -> OtherArm:
         measured = self.control.measured_rad
         assert measured is not None
-        return OtherArm(
-            measured,
-            self.geometry.world_from_flange(measured),
-            self.geometry.world_from_flange(self.control.commanded_rad),
-            self.control.mode,
-            self.control.all_faults,
-            0.005,
-            self.control.ready,
-            self.control.estop_reason is not None,
-        )
+        return as_other_arm(self.control, self.geometry, measured)
 
 
 Arms = tuple[ServoArm, ServoArm]
@@ -417,8 +408,6 @@ def test_a_bounded_step_keeps_joint_speeds_and_tool_speed(
     found = bound_step(
         joints,
         np.array(wanted),
-        tool_points=GEOMETRY.tool_points,
-        max_tool_speed=GEOMETRY.max_tool_speed,
         limits=LIMITS,
         step_s=step_s,
     )
@@ -436,8 +425,7 @@ def test_no_decision_commands_a_leap(leap: float, monkeypatch: pytest.MonkeyPatc
     control, geometry = arms[0].control, arms[0].geometry
     monkeypatch.setattr(control, "_limit_velocity", lambda *_: np.full(6, leap / STEP_S))
     monkeypatch.setattr(geometry, "sheet_limits", replace(geometry.sheet_limits))
-    monkeypatch.setattr("flexsheet.nodes.arm_bridge.control.check_flange", lambda *_, **__: None)
-    monkeypatch.setattr("flexsheet.nodes.arm_bridge.control.check_sheet", lambda *_, **__: None)
+    monkeypatch.setattr(geometry, "check_limits", lambda *_, **__: None)
     before = arms[0].command.joints_rad
     arms[0].cycle(stroke_goal(time_s), arms[1].as_other())
     assert control.faults == ("commanded: a step beyond the joint or tool speed",)

@@ -19,8 +19,7 @@ from flexsheet.messages.scene import RV_1A, RV_2FR, JointChain, Scene
 from flexsheet.messages.types import FingerPath
 from flexsheet.nodes.arm_bridge.closed_form import ClosedFormKinematics
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.joint_chain import NumericKinematics
-from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
+from flexsheet.nodes.arm_bridge.joint_chain import NumericKinematics, UnreachableError
 from flexsheet.nodes.arm_bridge.path_check import Alignment, PathCheckRequest, check_path
 from flexsheet.nodes.arm_bridge.reach import SheetPoses, find_best_reach, plan_path
 from flexsheet.nodes.models.motion import SheetMotion
@@ -119,7 +118,7 @@ def test_closed_form_chain_and_simulator_agree(model: Any) -> None:
         pose = closed.forward(joints)
         assert numeric.forward(joints) == pytest.approx(pose, abs=1e-12)
         assert mechanics.forward(joints) == pytest.approx(pose, abs=1e-12)
-        for solution in closed.solve_all(pose):
+        for solution in closed.branches(pose, model.start_rad):
             assert closed.forward(solution) == pytest.approx(pose, abs=1e-7)
     start = np.array(model.start_rad)
     for step in random.uniform(-0.05, 0.05, (20, 6)):
@@ -223,8 +222,8 @@ def test_a_path_is_checked_as_for_other_arms(scene: Scene) -> None:
     start, goal = sheet([0.0, 0.0, 0.0], stretch=1.02), sheet([0.0, 0.06, 0.02], 0.5, 1.05)
     joints = [arm.joints_for_sheet(start, arm.start_rad) for arm in (left, right)]
     assert isinstance(check_path(left, right, PathCheckRequest(start, goal, *joints)), Alignment)
-    path = plan_path(left, right, start, goal, left_rad=joints[0], right_rad=joints[1])
-    assert path.via_m is None
+    path = plan_path(left, right, [start, goal], left_rad=joints[0], right_rad=joints[1])
+    assert path[-1].sheet.world_from_sheet == pytest.approx(goal.world_from_sheet)
     far = sheet([0.0, 0.9, 0.0])
     blocked = check_path(left, right, PathCheckRequest(start, far, *joints))
     assert isinstance(blocked, str)

@@ -201,7 +201,7 @@ def test_the_slack_sheet_presents_what_it_can() -> None:
 
 
 def test_an_object_that_is_not_there_is_not_felt() -> None:
-    shown = compliance(ObjectCurve.linear(0.0, 0.05))
+    shown = compliance(ObjectCurve(np.array([0.0, 0.05]), np.zeros(2)))
     depths = np.linspace(0.0, 0.05, 20)
     assert shown.rendered_force_n(depths) == pytest.approx(0.0, abs=1e-12)
     assert shown.normal_offset_m(depths) == pytest.approx(depths)

@@ -65,7 +65,7 @@ def expose(lit: NDArray[np.bool_] | Floats, seed: int = 0) -> Image:
 
 def flat_markers_in(image: Image) -> list[Marker]:
     blobs = detect_blobs(image, FILTER)
-    return fit_flat_markers([image] * len(blobs), blobs, FILTER, SENSOR)
+    return fit_flat_markers([image] * len(blobs), blobs, SENSOR)
 
 
 def valid_flat_markers_in(image: Image) -> list[Marker]:

@@ -130,7 +130,7 @@ def test_a_new_geometry_is_simulated(capsule_scene: Scene) -> None:
 
 
 def test_a_new_geometry_is_presented(capsule_scene: Scene) -> None:
-    settings = PlannerParameters().trajectory_settings()
+    settings = PlannerParameters()
     planner = SheetTrajectoryPlanner(capsule_scene, settings)
     assert planner.motion.world_from_sheet[:3, 3] == pytest.approx([0.0, 0.0, RADIUS_M])
 

@@ -369,7 +369,7 @@ class NodeLoop:
             Triangulator, TriangulatorParameters(calibration=calibration), self.clock
         )
         self.planner = NodeHarness(Planner, PlannerParameters(), self.clock)
-        home = SheetTrajectoryPlanner(SCENE, PlannerParameters().trajectory_settings()).motion
+        home = SheetTrajectoryPlanner(SCENE, PlannerParameters()).motion
         self.sheet = SimulatedSheet(SCENE, self.apparatus, home, LoopSettings())
         self.sheet.on_edges = self.publish_arms
         self.arms: list[TwinArms] = []

@@ -22,7 +22,7 @@ from flexsheet.nodes.arm_bridge.closed_form import (
     WRIST_NEAR_RAD,
     Branch,
 )
-from flexsheet.nodes.arm_bridge.kinematics import (
+from flexsheet.nodes.arm_bridge.joint_chain import (
     UnreachableError,
 )
 from flexsheet.nodes.models.rigid import rotation_from_rpy, rotation_from_vector, transform

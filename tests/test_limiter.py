@@ -33,9 +33,6 @@ from tests.rv_1a import (
 
 Floats = NDArray[np.float64]
 
-LIMITS = JointLimits(
-    JOINT_MIN_RAD + 0.03, JOINT_MAX_RAD - 0.03, JOINT_SPEED_RAD_PER_S, 6.0 * JOINT_SPEED_RAD_PER_S
-)
 TOOL_SPEED = 0.25
 STEP_S = 1.0 / 140.0
 
@@ -45,14 +42,22 @@ def tool_points(joints_rad: Floats) -> Floats:
     return np.array([pose[:3, 3], pose[:3, 3] + 0.12 * pose[:3, 1]])
 
 
+LIMITS = JointLimits(
+    JOINT_MIN_RAD + 0.03,
+    JOINT_MAX_RAD - 0.03,
+    JOINT_SPEED_RAD_PER_S,
+    6.0 * JOINT_SPEED_RAD_PER_S,
+    tool_points,
+    TOOL_SPEED,
+)
+
+
 def step(joints: Floats, velocity: Floats, goal: Floats, along: Floats, step_s: float) -> Floats:
     return limit_velocity(
         joints,
         velocity,
         goal,
         along,
-        tool_points=tool_points,
-        max_tool_speed=TOOL_SPEED,
         limits=LIMITS,
         step_s=step_s,
     )

@@ -54,7 +54,7 @@ def disc(
 
 def markers_in(image: Image, name: str = "subpixel_fit") -> list[Marker]:
     blobs = detect_blobs(image, LOOKS)
-    return MARKER_METHODS[name]([image] * len(blobs), blobs, LOOKS, SENSOR)
+    return MARKER_METHODS[name]([image] * len(blobs), blobs, SENSOR)
 
 
 def sound_marks_in(image: Image) -> list[Marker]:
@@ -81,7 +81,7 @@ def test_a_window_gives_the_same_marker_as_the_whole_image(name: str) -> None:
     window = window_around(np.array([65.0, 45.0]), image.shape, LOOKS.window_half_px)
     whole, near = detect_blobs(image, LOOKS), detect_blobs(image, LOOKS, window)
     refine = MARKER_METHODS[name]
-    a, b = (refine([image], blobs, LOOKS, SENSOR)[0] for blobs in (whole, near))
+    a, b = (refine([image], blobs, SENSOR)[0] for blobs in (whole, near))
     assert np.array_equal(a.centre, b.centre)
     assert np.array_equal(a.covariance, b.covariance)
 
@@ -296,9 +296,7 @@ def test_marker_methods_are_evaluated_with_the_nodes_noise(
     scene = load_cylinder()
     believed: list[PixelNoise] = []
 
-    def spy(
-        images: Sequence[Image], blobs: Sequence[Blob], appearance: BlobFilter, noise: PixelNoise
-    ) -> list[Marker]:
+    def spy(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
         believed.append(noise)
         return []
 

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.arm_bridge.control import ArmControl
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.kinematics import (
+from flexsheet.nodes.arm_bridge.joint_chain import (
     UnreachableError,
 )
 from flexsheet.nodes.arm_bridge.path_check import Alignment, PathCheckRequest, check_path, rehearse
-from flexsheet.nodes.arm_bridge.reach import PathError, plan_path_through
+from flexsheet.nodes.arm_bridge.reach import PathError, plan_path
 from flexsheet.nodes.arm_bridge.standstill import SETTLED_COUNT
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform_from_rpy
@@ -239,7 +239,7 @@ def test_some_of_these_starts_cannot_be_held_evenly() -> None:
         way = way_from(joints, HOME)
         try:
             corners = rehearse(way.start, HOME, LEFT.edge_bound)
-            plan_path_through(LEFT, RIGHT, corners, left_rad=joints[0], right_rad=joints[1])
+            plan_path(LEFT, RIGHT, corners, left_rad=joints[0], right_rad=joints[1])
         except PathError:
             failed += 1
     assert failed > 0

@@ -507,7 +507,7 @@ async def test_what_the_sheet_cannot_render_is_reported(stiffness: float, words:
 def test_the_arms_force_limits_the_stretch() -> None:
     weak = SCENE.sheet.model_copy(update={"max_edge_force_n": 8.0})
     _, largest = compute_stretch_range(weak)
-    force = edge_force_n(choose_stretch(1e4, weak).stretch_ratio, weak)
+    force = edge_force_n(choose_stretch(1e4, weak)[0], weak)
     assert largest < weak.max_stretch_ratio
     assert force == pytest.approx(USABLE_FRACTION * 8.0, rel=1e-9)
 

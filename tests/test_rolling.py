@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.models.rigid import angle_between, moved
 from flexsheet.nodes.models.shapes import (
-    Convex,
     CylinderShape,
     EllipsoidShape,
     PlaneShape,
@@ -21,10 +20,13 @@ from flexsheet.nodes.models.shapes import (
     Shape,
     SphereShape,
 )
-from flexsheet.nodes.planner.contact_state import ContactLimits, ContactStateMachine
+from flexsheet.nodes.planner.contact_state import (
+    RIM_RADIUS_M,
+    ContactLimits,
+    ContactStateMachine,
+)
 from flexsheet.nodes.planner.rolling import (
     SheetContact,
-    compute_rim_lift_m,
     compute_rolling_twist,
     compute_tangent_twist,
     limit_tilt,
@@ -226,21 +228,12 @@ def test_the_sheet_is_not_turned_too_far_and_is_free_again_after_a_lift() -> Non
 def test_a_convex_object_needs_no_lift() -> None:
     for shape in SHAPES:
         contact = make_tangent_contact(np.eye(3), shape.closest(np.array([0.0, 0.01, 0.2])), WIDE)
-        assert compute_rim_lift_m(shape, contact) < 1e-9
-
-
-class Bowl(Convex):
-    """Shape that is hollow all around, for `compute_rim_lift_m`."""
-
-    def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        return 0.002 * radius_m / 0.03
+        assert shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M) < 1e-9
 
 
 def test_over_a_concavity_the_sheet_is_offset_by_the_rim() -> None:
     bottom = np.array([0.0, 0.0, -0.06])
     contact = SheetContact(bottom, FRONT, -np.diag([1.0, 1.0, 0.0]) / 0.06, np.eye(3), np.zeros(2))
-    lift = compute_rim_lift_m(Bowl(), contact)  # type: ignore[arg-type]  # asked for its rise only
-    assert lift == pytest.approx(0.002)
-    lifted = replace(contact, lift_m=lift)
+    lifted = replace(contact, lift_m=0.002)
     assert lifted.object_from_sheet[:3, 3] == pytest.approx([0.0, 0.0, -0.058])
     assert lifted.height_m(bottom) == pytest.approx(-0.002)

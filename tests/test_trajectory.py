@@ -50,7 +50,7 @@ PERIOD_NS, CYCLE_NS = 16_666_667, 7_142_857
 HORIZON_NS = 70_000_000
 LEAN_RAD, STROKE_S = 1.0, 3.0
 SERVO_CYCLES = 4
-BOUNDS = PlannerParameters().trajectory_settings().bounds
+BOUNDS = PlannerParameters().bounds
 TIMING = GoalTiming(servo_lag_s=0.03, target_period_s=1.0 / 60.0, max_extrapolation_s=0.06)
 
 

@@ -282,7 +282,7 @@ def swing_sheet(
     frequency_hz: frequency of the motion.
     seconds: duration of the motion.
     """
-    start = SheetTrajectoryPlanner(scene, PlannerParameters().trajectory_settings()).motion
+    start = SheetTrajectoryPlanner(scene, PlannerParameters()).motion
     sheet = SimulatedSheet(scene, apparatus, start, LoopSettings())
     along, rate = start.world_from_sheet[:3, 1], 2.0 * math.pi * frequency_hz
     for now_s in np.arange(1, round((seconds + 1.0) / CYCLE_S)) * CYCLE_S:

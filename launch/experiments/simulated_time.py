@@ -317,8 +317,6 @@ class SimulatedArm:
             self._velocity,
             goal_rad,
             (goal_rad - self._goal_rad) / step_s,
-            tool_points=geometry.tool_points,
-            max_tool_speed=geometry.max_tool_speed,
             limits=geometry.joint_limits,
             step_s=step_s,
         )
@@ -386,7 +384,7 @@ class SimulatedLoop:
     ) -> None:
         self._truth, self._compliance = apparatus, compliance
         parameters = PlannerParameters.model_validate(dict(settings.planner))
-        self.planner = SheetTrajectoryPlanner(scene, parameters.trajectory_settings())
+        self.planner = SheetTrajectoryPlanner(scene, parameters)
         self.sheet = SimulatedSheet(scene, apparatus, self.planner.motion, settings)
         track = FilmedFinger if settings.with_images else MeasuredFinger
         self._tracked = track(scene, apparatus, settings)

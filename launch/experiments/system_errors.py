@@ -238,7 +238,7 @@ class ErrorEvaluator:
             self.apparatus, frozenset({Metric.FINGERTIP})
         )
         assert offset.fingertip_m is not None
-        planner = SheetTrajectoryPlanner(scene, PlannerParameters().trajectory_settings())
+        planner = SheetTrajectoryPlanner(scene, PlannerParameters())
         return RestingPush(planner, controller, offset.fingertip_m[0])
 
 

@@ -332,8 +332,7 @@ def _find_blocked_paths(layout: Layout, left: ArmGeometry, right: ArmGeometry) -
             plan_path(
                 left,
                 right,
-                motion(start),
-                motion(goal),
+                [motion(start), motion(goal)],
                 left_rad=layout.left.joints_rad[start],
                 right_rad=layout.right.joints_rad[start],
             )

@@ -18,7 +18,7 @@ from flexsheet.launch.ros2.mapping import list_joints
 from flexsheet.messages.scene import ClosedFormArm, Projector, Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
+from flexsheet.nodes.arm_bridge.joint_chain import UnreachableError
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.arms import BRACKET_WIDTH_M, CLAMP_SIZE_M, make_pieces
 from flexsheet.nodes.models.rigid import inverse, pose_matrix, rotation_from_vector, transform

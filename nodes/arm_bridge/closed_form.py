@@ -12,29 +12,26 @@ from math import acos, atan2, copysign, cos, degrees, hypot, inf, pi, remainder,
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from flexsheet.messages.scene import ClosedFormArm
-from flexsheet.nodes.arm_bridge.joint_chain import SerialChain
-from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arm_bridge.joint_chain import SerialChain, UnreachableError
+from flexsheet.nodes.arrays import Floats
 
 WRIST_SINGULAR = 1e-7
-"""The value of |sin J5| below which the axes of J4 and J6 are treated as parallel. J4 then stays
-constant."""
+"""The value of |sin J5| below which the axes of J4 and J6 are parallel, and J4 is fixed."""
 
 SHOULDER_SINGULAR_M = 1e-7
-"""The distance of the wrist centre from the axis of J1 below which J1 stays constant."""
+"""The distance of the wrist centre from the axis of J1 below which J1 is fixed."""
 
 WRIST_FIXED_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
 """The values of |J5| that bound the region of the wrist singularity. Below the first value, J4 may
-stay constant. Below the second value, J4 may differ from its exact value. Beyond, J4 is exact."""
+stay constant. Below the second value, J4 may deviate from its exact value."""
 
 SHOULDER_FIXED_M, SHOULDER_NEAR_M = 0.0007, 0.02
 """The distances between wrist centre and J1 axis that bound the region of the shoulder singularity.
-Below the first distance, J1 may stay constant. Below the second distance, J1 may differ from its
-exact value. Beyond, J1 is exact."""
+Below the first distance, J1 may stay constant. Below the second distance, J1 may deviate from its
+exact value."""
 
 MAX_FIXED_ERROR_RATIO = 1.4
 """The maximum pose error near a singularity, divided by WRIST_FIXED_RAD or SHOULDER_FIXED_M. The
@@ -42,7 +39,7 @@ maximum errors are 1.05 degrees and 1 mm."""
 
 MAX_FREE_ROTATION_RAD = 0.01
 """The maximum rotation of J4 or J1 in one step to reduce the pose error near a singularity. At 140
-steps per second, it corresponds to half the maximum speed of these joints."""
+steps per second, the rotation speed is half the maximum speed of these joints."""
 
 Shoulder = Literal["front", "back"]
 Elbow = Literal["up", "down"]
@@ -68,8 +65,7 @@ BRANCHES = tuple(
     for elbow in get_args(Elbow)
     for wrist in get_args(Wrist)
 )
-"""All eight branches, in the order in which `ClosedFormKinematics.branches` returns the
-solutions."""
+"""All eight branches, in the order of the solutions of `ClosedFormKinematics.branches`."""
 
 
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
@@ -82,13 +78,11 @@ def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
 
 
 def _limited_rotation(along: float, across: float, *, fixed: float, near: float) -> float:
-    """Return the angle (rad) by which an axis rotates until it is parallel to a vector.
+    """Return the angle (rad) by which an axis rotates to become parallel to a vector.
 
-    The axis rotates towards the vector or towards its opposite, whichever is nearer. Near a
-    singularity, the vector is short and the rotation is limited.
+    Near a singularity, the vector is short, and the axis may deviate from the vector.
     along, across: components of the vector parallel and perpendicular to the axis.
-    fixed, near: two lengths of the vector. Up to `fixed`, the axis may deviate from the vector by
-        90 degrees. From `fixed` to `near`, the permitted deviation decreases to zero. A permitted
+    fixed, near: lengths of the vector at which the permitted deviation is 90 degrees and zero. The
         deviation is reduced by at most MAX_FREE_ROTATION_RAD per step.
     """
     length = hypot(along, across)
@@ -122,10 +116,9 @@ def _wrap(angle: float) -> float:
 
 
 def _nearest_revolution(angle: float, near: float, low: float, high: float) -> float:
-    """Return the angle (rad) in [low, high] that is nearest to `near` and equivalent to `angle`.
+    """Return the angle (rad) nearest to `near` that equals `angle` plus -1, 0 or 1 revolutions.
 
-    Two angles are equivalent if they differ by one revolution. The result is infinite if no
-    equivalent angle is in the range.
+    The result is infinite if none of these angles is between `low` and `high`.
     """
     best = inf
     for rotated in (angle, angle - 2.0 * pi, angle + 2.0 * pi):
@@ -154,7 +147,7 @@ class ClosedFormKinematics:
         """The maximum distance (m) of the wrist centre from the shoulder within the range of J3."""
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the Jacobian (n, 6, 6) at joint angles (n, 6) rad.
+        """Return the Jacobian (n, 6, 6) in the base frame at joint angles (n, 6) rad.
 
         The Jacobian maps joint speeds to the linear and then the angular velocity of the flange.
         """
@@ -188,13 +181,6 @@ class ClosedFormKinematics:
         )
         return np.array(rows).T
 
-    def solve_all(self, base_from_flange: Floats) -> Sequence[Floats]:
-        """Return the joint angles (6,) rad of all solutions for a flange pose (4, 4).
-
-        The angles may exceed the joint ranges.
-        """
-        return [np.array(one) for one in self.branches(base_from_flange, self.model.start_rad)]
-
     def list_branches(self, base_from_flange: Floats) -> Sequence[Branch]:
         """Return all eight branches, for any flange pose."""
         return BRANCHES
@@ -202,7 +188,7 @@ class ClosedFormKinematics:
     def reach_margins_m(self, base_from_flange: Floats) -> Floats:
         """Return the distances (n,), m, of flange poses (n, 4, 4) from the arm's maximum reach.
 
-        A distance is positive if the wrist centre is within reach.
+        A distance is positive within reach.
         """
         wrist = base_from_flange[:, :3, 3] - self._flange_m * base_from_flange[:, :3, 2]
         away = np.linalg.norm(wrist - [0.0, 0.0, self._shoulder_m], axis=1)
@@ -211,10 +197,9 @@ class ClosedFormKinematics:
     def branches(self, base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
         """Return all solutions (rad) of the inverse kinematics for a flange pose (4, 4).
 
-        present_rad: present joint angles (6,). At a singularity, they replace the angles that are
-            undefined.
-        The solutions are in the order of `BRANCHES`. Their angles may exceed the joint ranges. The
-        list is empty if the wrist centre is out of reach.
+        present_rad: present joint angles (6,), which replace undefined angles at a singularity.
+        The solutions are in the order of `BRANCHES`, and may exceed the joint ranges. The list is
+        empty if the wrist centre is out of reach.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         rotation = base_from_flange[:3, :3]
@@ -250,9 +235,8 @@ class ClosedFormKinematics:
     def inverse_kinematics(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
         """Return the joint angles (6,) rad for a flange pose, nearest to the present angles (6,).
 
-        The nearest solution has the smallest maximum joint change. Joint ranges may exceed 360
-        degrees, so angles that differ by one revolution are also tried. Raises UnreachableError if
-        no solution is within the joint ranges.
+        The nearest solution has the smallest maximum joint change. Raises UnreachableError if no
+        solution is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         nearest, least = None, inf
@@ -274,13 +258,10 @@ class ClosedFormKinematics:
     def solve_next_joints(self, base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
         """Return the joint angles (6,) rad for the next step of a motion to a flange pose (4, 4).
 
-        The result is exact except near two singularities. Near J5 = 0, a small motion of the flange
-        would require a fast rotation of J4. J4 may therefore lag there, and J5 reduces the
-        remaining error. The orientation error of the flange is at most MAX_FIXED_ERROR_RATIO *
-        WRIST_FIXED_RAD. J1 may lag too if the wrist centre is near the J1 axis.
-
-        If the solution exceeds the joint ranges, another branch is selected. Raises
-        UnreachableError if no branch is within the joint ranges.
+        Near J5 = 0, a small motion of the flange would require a fast rotation of J4. J4 may lag
+        there, with a pose error of at most MAX_FIXED_ERROR_RATIO * WRIST_FIXED_RAD. J1 may lag too
+        if the wrist centre is near the J1 axis. If the solution exceeds the joint ranges, another
+        branch is selected. Raises UnreachableError if no branch is within the joint ranges.
         """
         present = np.asarray(present_rad, dtype=np.float64).tolist()
         rotation = base_from_flange[:3, :3]
@@ -322,8 +303,7 @@ class ClosedFormKinematics:
     def _bend(self, out: float, height: float) -> float | None:
         """Return the angle (0 to pi rad) between the upper arm and the line from elbow to wrist.
 
-        out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder, in
-            the plane of the arm.
+        out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder.
         Returns None if the wrist centre is out of reach.
         """
         cosine = (out * out + height * height - self._upper_m**2 - self._elbow_to_wrist_m**2) / (
@@ -336,8 +316,8 @@ class ClosedFormKinematics:
     def _solve_shoulder(self, out: float, height: float, q3: float) -> float:
         """Return the angle of J2 (rad) that places the wrist centre.
 
-        out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder, in
-            the plane of the arm. q3: angle of J3, rad.
+        out, height: horizontal and vertical distance (m) of the wrist centre from the shoulder.
+        q3: angle of J3, rad.
         """
         along = self._forearm_m * sin(q3) - self._shift_m * cos(q3)
         up = self._upper_m + self._shift_m * sin(q3) + self._forearm_m * cos(q3)
@@ -396,9 +376,8 @@ class ClosedFormKinematics:
     ) -> Floats:
         """Return joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
 
-        near_rad: joint angles (6,). Of equivalent angles within the joint range, an angle near
-            `near_rad` is selected.
-        Angles may exceed the joint ranges. They are NaN for poses that are out of reach.
+        near_rad: joint angles (6,) that select among angles that differ by whole revolutions.
+        Angles may exceed the joint ranges. Angles are NaN for poses out of reach.
         """
         poses = np.asarray(base_from_flange, dtype=np.float64)
         wrist = poses[:, :3, 3] - self._flange_m * poses[:, :3, 2]
@@ -439,10 +418,9 @@ class ClosedFormKinematics:
         return joints
 
     def singularity_margins(self, joints_rad: Floats) -> Mapping[str, Floats]:
-        """Return the margins (n,) of joint angles (n, 6) rad with respect to each singularity.
+        """Return the margins (n,) of joint angles (n, 6) rad for each kind of singularity.
 
-        A margin is the distance from the singularity minus the minimum distance. It is negative if
-        the arm is too near to the singularity.
+        A margin is the distance from the singularity minus the permitted minimum distance.
         """
         joints = np.asarray(joints_rad, dtype=np.float64)
         elbow = np.remainder(joints[..., 2] - self.elbow_rad + 0.5 * pi, pi) - 0.5 * pi
@@ -456,8 +434,7 @@ class ClosedFormKinematics:
     def _out(self, joints: Floats) -> Floats:
         """Return the horizontal distance (m) of the wrist centre from the axis of J1.
 
-        joints: joint angles (..., 6) rad. The distance is negative if the wrist centre is behind
-            the axis.
+        joints: joint angles (..., 6) rad. The distance is negative behind the axis.
         """
         q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
         return np.asarray(

@@ -1,7 +1,4 @@
-"""Determine when to send commands to an arm.
-
-A command is sent when a target arrives, and periodically between targets.
-"""
+"""Schedule the commands to an arm: when a target arrives, and periodically between targets."""
 
 from __future__ import annotations
 
@@ -13,10 +10,8 @@ class CommandScheduler:
     """A scheduler for the commands to one arm.
 
     period_s: time between periodic commands. target_period_s: time between targets.
-    idle_period_s: time between commands to an idle arm, which is short enough for the arm's
-        watchdog.
-    The argument `sent_ns` of all methods is the time of the last command, or 0 before the first
-    command.
+    idle_period_s: time between commands to an idle arm.
+    In all methods, `sent_ns` is the time of the last command, or 0 before the first command.
     """
 
     period_s: float
@@ -26,8 +21,7 @@ class CommandScheduler:
     def wait_s(self, now_ns: int, sent_ns: int) -> float:
         """Return the time (s) until the next command may be sent.
 
-        The minimum time between two commands is half a period. With a shorter time, the computed
-        speed of the arm would be too high.
+        The minimum time between two commands is half a period.
         """
         since_s = (now_ns - sent_ns) * 1e-9
         return max(0.0, 0.5 * self.period_s - since_s) if sent_ns else 0.0
@@ -41,8 +35,8 @@ class CommandScheduler:
         """Return whether a periodic command must be sent now.
 
         target_ns: arrival time of the newest target.
-        No periodic command is sent shortly before the next target is due. Otherwise the arm would
-        still be busy with the periodic command when the target arrives.
+        No periodic command is sent shortly before the next target is due, because the arm would
+        still be busy when the target arrives.
         """
         due_s = self.target_period_s - (now_ns - target_ns) * 1e-9
         return self.wait_s(now_ns, sent_ns) == 0.0 and abs(due_s) > 0.5 * self.period_s

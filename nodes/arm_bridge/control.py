@@ -1,10 +1,9 @@
-"""Compute the command of one arm in each cycle: follow the target, stop or slacken the sheet.
+"""Compute the command of one arm in each control cycle.
 
-Two arms hold an elastic sheet between them. Each arm is controlled by its own node, the bridge.
-This module uses no sockets and no clock. The node provides the inputs and the duration of the
-cycle, and sends the returned command. `state_machine` defines the states and their transitions.
-Both bridges apply the same speed bounds to the sheet, which synchronizes the two arms on long
-paths.
+Two arms hold an elastic sheet between them. Each arm has its own node, the bridge. The command
+moves the arm towards the target, stops the arm or slackens the sheet. This module uses no sockets
+and no clock. The module `state_machine` defines the states. Both bridges apply the same speed
+bounds to the sheet, so the arms stay synchronized on long paths.
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
 from flexsheet.messages.notes import NodeNote
@@ -24,18 +22,13 @@ from flexsheet.nodes.arm_bridge.goal import (
     compute_sync_factor,
     scale_speeds,
 )
-from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
+from flexsheet.nodes.arm_bridge.joint_chain import UnreachableError
 from flexsheet.nodes.arm_bridge.limiter import (
     SheetLimits,
     bound_step,
     check_flange,
-    check_sheet,
     check_tracking_error,
-    clamp_to_range,
-    decelerate,
-    limit_tool_speed,
     limit_velocity,
-    relax_limits,
 )
 from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS, ArmFault, Freshness
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
@@ -61,15 +54,13 @@ from flexsheet.nodes.arm_bridge.state_machine import (
     Event,
     State,
 )
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import (
-    EdgeBound,
     SheetMotion,
     coast_sheet,
     follow_sheet,
 )
 from flexsheet.nodes.models.rigid import is_rigid
-
-Floats = NDArray[np.float64]
 
 MAX_REST_RAD_PER_S = 1e-6
 """The joint speed up to which an arm is considered to be at rest."""
@@ -78,25 +69,26 @@ MAX_REST_RAD_PER_S = 1e-6
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
-"""The position (m), rotation (rad) and stretch deviations from the target that end the slow start.
-With smaller deviations, the sheet moves with the faster FOLLOW_BOUNDS instead of START_BOUNDS."""
+"""The deviations in position (m), rotation (rad) and stretch ratio below which the slow start ends.
+The sheet then moves within the faster FOLLOW_BOUNDS instead of START_BOUNDS."""
 
 MEASURED_SLACK_M = 0.002
-"""The distance by which a measured flange position may exceed a limit, because servos ripple."""
+"""The tolerance of position limits for measured flange positions, because servos ripple."""
 
 SLACK_STRETCH = 1.0005
 """The stretch ratio (length / rest length) up to which the sheet is considered slack. At this
 ratio, the tension is 0.1 N."""
 
 NO_MOTION = np.zeros(6)
+NO_GOAL = np.full(6, np.nan)
 
 IMPLAUSIBLE_LENGTH_RATIO = 1.1
 """The ratio of a measured sheet length to the maximum length above which the measurement is
 wrong."""
 
 MAX_JOINT_JUMP_RAD = 0.35
-"""The maximum change of the joint goal in one cycle. A larger change would switch to another branch
-of the inverse kinematics."""
+"""The maximum change of a joint's goal in one cycle. A larger change indicates a switch to another
+solution of the inverse kinematics."""
 
 RELAX_DELAY_S = 0.5
 """The time without a target or a permission to move after which the arms slacken the sheet."""
@@ -115,12 +107,11 @@ MAX_ARMING_AGE_S = 1.0
 longer intend it."""
 
 ALIGNED_RAD = 1e-4
-"""The maximum difference between the joint angles and the goal of an alignment (see `path_check`)
-at which the alignment is complete."""
+"""The maximum remaining joint motion at the end of an alignment (see `path_check`)."""
 
 MAX_BEYOND_RANGE_RAD = 0.02
-"""The maximum angle by which measured joint angles may be out of range. A larger angle is treated
-as a measurement error."""
+"""The tolerance of the joint ranges for measured joint angles. Angles beyond the tolerance are
+treated as measurement errors."""
 
 RECHECK_PERIOD_S = 0.5
 """The time after which a blocked path is checked again, because the target may have moved."""
@@ -128,10 +119,10 @@ RECHECK_PERIOD_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Timeouts:
-    """The maximum delays (s) of an input from the planner or the other arm.
+    """The maximum delays of messages from the planner and from the other arm.
 
-    hold_after_s: delay after which the arm decelerates. stop_after_s: delay after which the arm is
-        disarmed.
+    hold_after_s: delay, s, after which the arm decelerates.
+    stop_after_s: delay, s, after which the arm is disarmed.
     """
 
     hold_after_s: float
@@ -140,19 +131,22 @@ class Timeouts:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command for the arm's controller: a mode of `ArmLink`, and joint angles (6,) rad."""
+    """A command for the arm's controller.
+
+    mode: `move`, `hold`, `stop` or `idle`. joints_rad: joint angles (6,) for the mode `move`.
+    """
 
     mode: str
     joints_rad: Floats
 
 
 class ArmControl:
-    """A controller of one arm, which computes one command per cycle.
+    """A controller that computes the commands to one arm.
 
-    faults: texts of the faults, which are latched until `reset`.
-    reason: text for the operator that explains why the arm does not follow the target.
-    auto_arming: whether the arm is armed automatically whenever no interlock forbids motion.
-        Otherwise the operator must arm the arm, also after every interlock.
+    faults: texts of the latched faults; only `reset` clears the faults.
+    reason: text that tells the operator why the arm does not follow the target.
+    auto_arming: whether the arm is armed as soon as no interlock forbids motion. Otherwise the
+        operator must arm the arm after the start and after each interlock.
     pending_check: path that must be checked; the method `on_path_result` receives the result.
     """
 
@@ -178,7 +172,9 @@ class ArmControl:
         self._clear_path: tuple[PathCheckRequest, Alignment | None] | None = None
         self._alignment: Alignment | None = None
         self._aligned_s = 0.0
+        self._geometry: ArmGeometry
         self._relaxed_limits: SheetLimits
+        self._step_s: float
         self._blocked: tuple[str, float] | None = None
         self._together = False
         self._velocity = np.zeros(6)
@@ -209,9 +205,9 @@ class ArmControl:
 
     @property
     def all_faults(self) -> tuple[str, ...]:
-        """Return the texts of the faults, of the e-stop and of a lost connection.
+        """Return the texts that the bridge sends to the other arm.
 
-        The bridge sends them to the other arm.
+        The texts describe faults, an e-stop and a lost connection.
         """
         estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
         lost = (self.reason,) if self._state is State.DISCONNECTED else ()
@@ -229,10 +225,7 @@ class ArmControl:
 
     @property
     def is_idle(self) -> bool:
-        """Return whether the arm rests and waits for an operator's command.
-
-        An idle arm needs less frequent commands.
-        """
+        """Return whether the arm rests and waits for an operator's command."""
         return self._state is State.IDLE and self.at_rest
 
     def handle(self, event: Event) -> None:
@@ -246,11 +239,10 @@ class ArmControl:
         self._state = target
 
     def on_answer_missed(self, text: str) -> bool:
-        """Handle a command without an answer; return False if it is the second in succession.
+        """Record a command without an answer; return False if the previous answer is missing too.
 
-        After the first missing answer, the motion continues from the unanswered command. The arm's
-        own watchdog stops the arm if no commands arrive.
         text: reason that is shown to the operator.
+        After the first missing answer, the motion continues from the unanswered command.
         """
         if self._missed or self.measured_rad is None:
             return False
@@ -263,7 +255,7 @@ class ArmControl:
         return True
 
     def on_exchange_failed(self, text: str, *, silent: bool) -> bool:
-        """Handle a failed exchange; return True if the connection to the arm has just been lost.
+        """Record a failed exchange; return True if the connection to the arm has just been lost.
 
         text: reason that is shown to the operator. silent: whether the arm has not answered.
         """
@@ -291,9 +283,9 @@ class ArmControl:
         arm_faults: tuple[ArmFault, ...],
         freshness: Freshness = Freshness.FRESH,
     ) -> None:
-        """Store the faults and the measured joint angles (6,) rad that the arm has reported.
+        """Store the measured joint angles (6,) rad and the faults that the arm has reported.
 
-        The joint angles are ignored if their freshness does not permit their use.
+        Stale joint angles are ignored.
         """
         self._missed = False
         self._standstill.on_measurement(joints_rad, freshness)
@@ -318,10 +310,7 @@ class ArmControl:
         self._must_idle = True
 
     def on_scene_changed(self) -> None:
-        """Stop the arm after a change of the scene.
-
-        The path is checked again before the next motion.
-        """
+        """Stop the arm after a change of the scene, and discard all path checks."""
         self.pending_check = self._clear_path = self._blocked = None
         self.handle(Event.SCENE_CHANGED)
 
@@ -336,8 +325,8 @@ class ArmControl:
 
         stamp_ns: timestamp of the message.
         clock_problem: reason why the timestamp is uncertain; empty if the timestamp is certain.
-        Several nodes publish e-stops, and their messages may arrive in any order. A reset is
-        therefore refused if it is older than the last stop, or if its timestamp is in the future.
+        Messages of several nodes may arrive in any order. A reset is therefore refused if its
+        timestamp is before the last stop or in the future.
         """
         if estop.engaged:
             # With a timestamp in the future, the stop would block every reset until that time.
@@ -355,7 +344,7 @@ class ArmControl:
         return None
 
     def reset(self) -> bool:
-        """Clear the e-stop and all faults; return False if the arm moves, which forbids a reset."""
+        """Clear the e-stop and all faults if the arm is at rest; return whether this succeeded."""
         if not self.at_rest:
             return False
         self.estop_reason, self.faults = None, ()
@@ -366,10 +355,9 @@ class ArmControl:
         return True
 
     def on_arming(self, arming: Arming, age_s: float) -> str | None:
-        """Arm or disarm the arm on an operator's command.
+        """Arm or disarm the arm; return the reason if the command is refused, otherwise None.
 
-        age_s: age of the command.
-        Returns the reason if the command is refused, otherwise None.
+        age_s: age of the operator's command.
         """
         if not arming.ready:
             self._disarm_reason = f"disabled: {arming.reason}" if arming.reason else "disabled"
@@ -389,7 +377,7 @@ class ArmControl:
         self.handle(Event.ARM)
 
     def _inhibit(self, reason: str, event: Event = Event.INTERLOCK) -> None:
-        """Disarm the arm by the given event, and forbid arming for the given reason."""
+        """Disarm the arm, and forbid arming for the given reason."""
         self._interlock_reason = reason
         self._disarm(reason, event)
 
@@ -402,10 +390,7 @@ class ArmControl:
     def _check_interlocks(
         self, goal: Goal | None, other: OtherArm | None, clock_problem: str
     ) -> None:
-        """Disarm the arm if an interlock forbids motion.
-
-        If no interlock forbids motion and `auto_arming` is set, arm the arm.
-        """
+        """Disarm the arm if an interlock forbids motion; otherwise arm it with automatic arming."""
         silent = other is None or not other.age_s <= self._timeouts.stop_after_s
         stopped = self.estop_reason is not None or (other is not None and other.estopped)
         reason = self._find_interlock(goal, None if silent else other)
@@ -426,9 +411,9 @@ class ArmControl:
         self._settle()
 
     def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
-        """Return the text of the interlock that forbids motion, or None.
+        """Return the reason why motion is forbidden, or None.
 
-        other: state of the other arm; None if its messages are late.
+        other: state of the other arm; None if the other arm's messages are late.
         """
         if self.estop_reason is not None:
             return f"e-stop: {self.estop_reason}"
@@ -448,7 +433,7 @@ class ArmControl:
         return None
 
     def _settle(self) -> None:
-        """Update the state for a latched e-stop, for a latched fault, and for an arm at rest."""
+        """Change the state if an e-stop or a fault is latched, or if the arm is at rest."""
         for _ in range(2):
             if self.estop_reason is not None:
                 self.handle(Event.ESTOP)
@@ -465,17 +450,17 @@ class ArmControl:
         step_s: float,
         clock_problem: str = "",
     ) -> Command:
-        """Compute the command of this cycle, which covers `step_s` seconds.
+        """Compute the command for the next `step_s` seconds.
 
         goal: target of the sheet; None before the first target.
         other: state of the other arm; None before its first message.
-        clock_problem: reason why the ages of `goal` and `other` are unknown; empty if they are
-            known.
+        clock_problem: reason why the ages of messages are unknown; empty if the ages are known.
         """
+        self._geometry, self._step_s = geometry, step_s
         measured = self.measured_rad
         if measured is None or self._must_idle:
             self._must_idle = self._must_idle and measured is None
-            return self._send("idle", self.commanded_rad, geometry, step_s)
+            return self._send("idle", self.commanded_rad)
         self.handle(Event.CONNECTED)
         if other is None:
             self._silence = NodeNote.WAITING_FOR_OTHER_ARM.phrase
@@ -484,19 +469,19 @@ class ArmControl:
             self._silence = note.phrase
         if other is not None and (invalid := other.invalid_reason) is not None:
             self._silence, other = f"state of the other arm: {invalid}", None
-        self._check_measurement(geometry, other, measured)
+        self._check_measurement(other, measured)
         self._check_interlocks(goal, other, clock_problem)
         if (stop := self._find_stop(other, clock_problem)) is not None:
-            return self._decelerate(stop, geometry, step_s)
+            return self._decelerate(stop)
         if self.faults:
-            return self._slacken(self.faults[0], geometry, other, step_s)
+            return self._slacken(self.faults[0], other)
         if other is None or not other.age_s <= self._timeouts.stop_after_s:
-            return self._decelerate(self._silence, geometry, step_s)
+            return self._decelerate(self._silence)
         if other.interlock_reason is not None:
-            return self._slacken(other.interlock_reason, geometry, other, step_s)
+            return self._slacken(other.interlock_reason, other)
         if goal is None or not self.ready or not other.ready:
-            return self._wait_for_arming(geometry, other, step_s)
-        return self._move_to_target(geometry, goal, other, measured, step_s)
+            return self._wait_for_arming(other)
+        return self._move_to_target(goal, other, measured)
 
     def _find_stop(self, other: OtherArm | None, clock_problem: str) -> str | None:
         """Return the reason if the arm must stop without slackening the sheet, otherwise None."""
@@ -506,26 +491,23 @@ class ArmControl:
             return "other arm: e-stop"
         return clock_problem if clock_problem and not self.faults else None
 
-    def _wait_for_arming(self, geometry: ArmGeometry, other: OtherArm, step_s: float) -> Command:
-        """Return the command that stops the arm and then slackens the sheet.
-
-        This command is returned until both arms are armed.
-        """
-        self._waited_s += step_s
+    def _wait_for_arming(self, other: OtherArm) -> Command:
+        """Return the command while an arm is not armed: stop, and then slacken the sheet."""
+        self._waited_s += self._step_s
         if self.ready:
-            return self._wait_for_other(geometry, step_s)
+            return self._wait_for_other()
         reason = self._interlock_reason or self._disarm_reason
         if reason is None:
             since = self._last_interlock
             reason = f"not ready since: {since}" if since else "not ready"
         if self._waited_s > RELAX_DELAY_S:
-            return self._slacken(reason, geometry, other, step_s)
-        return self._decelerate(reason, geometry, step_s)
+            return self._slacken(reason, other)
+        return self._decelerate(reason)
 
-    def _wait_for_other(self, geometry: ArmGeometry, step_s: float) -> Command:
-        """Return the command that stops the arm because the other arm is not armed.
+    def _wait_for_other(self) -> Command:
+        """Return the command that stops this arm because the other arm is not armed.
 
-        With manual arming, this arm is disarmed too if it has already moved or has waited too long.
+        With manual arming, this arm is disarmed if it has moved or has waited too long.
         """
         reason = "the other arm is not ready"
         has_started = self._sheet is not None or not self.at_rest
@@ -533,39 +515,25 @@ class ArmControl:
             self._inhibit(reason)
         else:
             self.handle(Event.WAIT_FOR_OTHER)
-        return self._decelerate(reason, geometry, step_s)
+        return self._decelerate(reason)
 
-    def _move_to_target(
-        self,
-        geometry: ArmGeometry,
-        goal: Goal,
-        other: OtherArm,
-        measured: Floats,
-        step_s: float,
-    ) -> Command:
-        """Return the command that follows the target; check the path before a motion starts."""
+    def _move_to_target(self, goal: Goal, other: OtherArm, measured: Floats) -> Command:
+        """Return the command that follows the target, or that waits for the path check."""
         self._waited_s = 0.0
         if not _is_valid(goal.motion):
-            return self._latch_fault("sheet target is not a rigid pose", geometry, step_s)
+            return self._latch_fault("sheet target is not a rigid pose")
         if self._state in PAUSING_STATES:
-            return self._decelerate("decelerates before the next motion", geometry, step_s)
+            return self._decelerate("decelerates before the next motion")
         self.handle(Event.TARGET)
         if self._sheet is None:
-            return self._check_path(geometry, goal, other, measured, step_s)
-        return self._track_target(goal, self._sheet, geometry, other, step_s)
+            return self._check_path(goal, other, measured)
+        return self._track_target(goal, self._sheet, other)
 
-    def _track_target(
-        self,
-        goal: Goal,
-        sheet: SheetMotion,
-        geometry: ArmGeometry,
-        other: OtherArm,
-        step_s: float,
-    ) -> Command:
+    def _track_target(self, goal: Goal, sheet: SheetMotion, other: OtherArm) -> Command:
         """Return the command that moves the sheet towards its target.
 
-        The sheet decelerates if the target or the state of the other arm is late. It also
-        decelerates if the planner or the bridge of the other arm has ended.
+        The sheet decelerates if the target or the state of the other arm is late. The sheet also
+        decelerates if the planner or the other arm's bridge has ended.
         """
         late_s = max(goal.overdue_s, other.age_s - self._timeouts.hold_after_s)
         is_late = goal.planner_ended or other.ended or late_s > self._timeouts.hold_after_s
@@ -576,25 +544,21 @@ class ArmControl:
             self._together = self._together or other.mode == "follow"
             self.reason = "" if self._together else NodeNote.FOLLOWS_OTHER_ARM.phrase
         if self._alignment is not None:
-            return self._align(self._alignment, geometry, other, step_s)
+            return self._align(self._alignment, other)
         if is_late:
-            sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
+            sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=self._step_s)
         else:
             speed_factor = compute_sync_factor(
-                geometry.world_from_edge(self.commanded_rad),
-                other.world_from_flange_commanded @ geometry.other_flange_from_edge,
+                self._geometry.world_from_edge(self.commanded_rad),
+                other.world_from_flange_commanded @ self._geometry.other_flange_from_edge,
                 goal.motion.world_from_sheet,
-                left=geometry.left,
+                left=self._geometry.left,
             )
             speed_factor = speed_factor if self._together else 0.0
-            sheet = self._advance_sheet(
-                goal.motion, sheet, geometry.edge_bound, speed_factor, step_s
-            )
-        return self._command_sheet(sheet, geometry, other, step_s)
+            sheet = self._advance_sheet(goal.motion, sheet, speed_factor)
+        return self._command_sheet(sheet, other)
 
-    def _check_measurement(
-        self, geometry: ArmGeometry, other: OtherArm | None, measured: Floats
-    ) -> None:
+    def _check_measurement(self, other: OtherArm | None, measured: Floats) -> None:
         """Latch a fault if the measured angles (6,) lag behind the command or violate a limit."""
         if self.faults or self._state not in TRACKING:
             return
@@ -602,58 +566,45 @@ class ArmControl:
         if violation is not None:
             self.faults = (violation,)
         elif other is not None:
-            flange = geometry.world_from_flange(measured)
-            violation = check_flange(
-                flange, other.world_from_flange, self._limits(geometry), slack_m=MEASURED_SLACK_M
-            ) or check_sheet(
-                flange @ geometry.flange_from_edge,
-                other.world_from_flange @ geometry.other_flange_from_edge,
-                left=geometry.left,
-                limits=self._limits(geometry),
+            violation = self._geometry.check_limits(
+                self._geometry.world_from_flange(measured),
+                other.world_from_flange,
+                self._limits,
+                slack_m=MEASURED_SLACK_M,
             )
             if violation is not None:
                 self.faults = (f"measured: {violation}",)
 
-    def _check_path(
-        self,
-        geometry: ArmGeometry,
-        goal: Goal,
-        other: OtherArm,
-        measured: Floats,
-        step_s: float,
-    ) -> Command:
-        """Start the motion to the target if its path has been checked; otherwise request a check.
+    def _check_path(self, goal: Goal, other: OtherArm, measured: Floats) -> Command:
+        """Start the motion if the path to the target has been checked; otherwise request a check.
 
-        The other arm's bridge checks the same path. No arm moves before both checks have passed.
+        The other bridge checks the same path. No arm moves before both checks have passed.
         """
-        if not self._stands_still(measured, geometry):
-            return self._decelerate("waits for the arm to stand still", geometry, step_s)
-        if (refusal := self._restart_refusal(measured, geometry)) is not None:
-            return self._decelerate(refusal, geometry, step_s)
-        sheet = geometry.sheet_between(
-            geometry.world_from_edge(measured),
-            other.world_from_flange @ geometry.other_flange_from_edge,
-        )
+        if not self._stands_still(measured):
+            return self._decelerate("waits for the arm to stand still")
+        if (refusal := self._restart_refusal(measured)) is not None:
+            return self._decelerate(refusal)
+        sheet = self._geometry.measure_sheet(measured, other.world_from_flange)
         if self._clear_path is not None:
             request, alignment = self._clear_path
             if request.leads_to(goal.motion) and request.begins_at(measured, other.joints_rad):
-                self._restart_at(measured, geometry)
-                return self._start_motion(sheet, alignment, geometry, other, step_s)
+                self._restart_at(measured)
+                return self._start_motion(sheet, alignment, other)
         reason = "checks the path to the target"
         if self._blocked is not None:
             reason, since_s = self._blocked
-            self._blocked = reason, since_s + step_s
+            self._blocked = reason, since_s + self._step_s
         if self.pending_check is None and (
             self._blocked is None or self._blocked[1] > RECHECK_PERIOD_S
         ):
             self.pending_check = PathCheckRequest(sheet, goal.motion, measured, other.joints_rad)
-        return self._decelerate(reason, geometry, step_s)
+        return self._decelerate(reason)
 
     def on_path_result(self, request: PathCheckRequest, result: Alignment | str | None) -> None:
-        """Store the result of a path check, and ignore the result of an outdated request.
+        """Store the result of a path check, unless another request is pending.
 
-        result: alignment of the joints to the start of the path, or None if no alignment is
-            necessary. If the path is blocked, a text states the reason.
+        result: alignment to the start of the path, None if no alignment is necessary, or the reason
+            why the path is blocked.
         """
         if request is not self.pending_check:
             return
@@ -664,148 +615,116 @@ class ArmControl:
             self._clear_path, self._blocked = (request, result), None
 
     def _start_motion(
-        self,
-        sheet: SheetMotion,
-        alignment: Alignment | None,
-        geometry: ArmGeometry,
-        other: OtherArm,
-        step_s: float,
+        self, sheet: SheetMotion, alignment: Alignment | None, other: OtherArm
     ) -> Command:
         self.handle(Event.PATH_CLEAR)
         self._sheet = sheet if alignment is None else alignment.sheet
         self._alignment, self._aligned_s = alignment, 0.0
-        flange = geometry.world_from_flange(self.commanded_rad)
-        self._relaxed_limits = relax_limits(
-            geometry.sheet_limits,
-            flange,
-            flange @ geometry.flange_from_edge,
-            other.world_from_flange,
-            other.world_from_flange @ geometry.other_flange_from_edge,
-            left=geometry.left,
+        self._relaxed_limits = self._geometry.relax_limits(
+            self._geometry.world_from_flange(self.commanded_rad), other.world_from_flange
         )
         self.reason = NodeNote.FOLLOWS_OTHER_ARM.phrase
-        return self._send("move", self.commanded_rad, geometry, step_s)
+        return self._send("move", self.commanded_rad)
 
-    def _align(
-        self, alignment: Alignment, geometry: ArmGeometry, other: OtherArm, step_s: float
-    ) -> Command:
-        """Return the command for the next step of this arm's alignment to the path.
+    def _align(self, alignment: Alignment, other: OtherArm) -> Command:
+        """Return the command for the next step of the alignment to the path.
 
-        The alignment pauses while an input is late, or while this arm waits for the other arm.
+        The alignment pauses while a message is late, or while the other arm is not ready.
         """
         if self._state is State.FOLLOW and self._together:
-            self._aligned_s += step_s
+            self._aligned_s += self._step_s
         goal_rad = alignment.joints_at(self._aligned_s)
-        command = self._command_joints(goal_rad, geometry, other, step_s)
+        command = self._command_joints(goal_rad, other)
         left_rad = float(np.abs(self.commanded_rad - alignment.to_rad).max())
         if self._aligned_s >= alignment.duration_s and left_rad <= ALIGNED_RAD and self._together:
             self._alignment = None
         return command
 
     def _advance_sheet(
-        self,
-        target: SheetMotion,
-        sheet: SheetMotion,
-        edges: EdgeBound,
-        speed_factor: float,
-        step_s: float,
+        self, target: SheetMotion, sheet: SheetMotion, speed_factor: float
     ) -> SheetMotion:
-        """Return the sheet's motion after one step towards its target.
+        """Return the sheet's motion after one step towards the target.
 
-        After a start, the sheet moves slowly until it has first reached the target.
-        speed_factor: factor for the speed bounds; below 1 for the arm that is ahead of the other
-            arm.
+        speed_factor: factor for the speed bounds; below 1 if this arm is ahead of the other arm.
+        After a start, the sheet moves slowly until the sheet has reached the target.
         """
         if not self._settled:
             distance_m, angle_rad = measure_distance(sheet, target)
             stretch = abs(target.stretch_ratio - sheet.stretch_ratio)
             is_near = distance_m < SETTLED_M and angle_rad < SETTLED_RAD
             self._settled = is_near and stretch < SETTLED_STRETCH
-        bounds = FOLLOW_BOUNDS if self._settled else START_BOUNDS
-        bounds = scale_speeds(bounds, speed_factor)
-        return follow_sheet(sheet, target, bounds=bounds, edges=edges, step_s=step_s)
+        bounds = scale_speeds(FOLLOW_BOUNDS if self._settled else START_BOUNDS, speed_factor)
+        edges = self._geometry.edge_bound
+        return follow_sheet(sheet, target, bounds=bounds, edges=edges, step_s=self._step_s)
 
-    def _command_sheet(
-        self, sheet: SheetMotion, geometry: ArmGeometry, other: OtherArm, step_s: float
-    ) -> Command:
-        """Return the command that places this arm's edge for a pose of the sheet."""
+    def _command_sheet(self, sheet: SheetMotion, other: OtherArm) -> Command:
+        """Return the command that moves this arm's edge to the given pose of the sheet."""
         try:
-            goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
+            goal_rad = self._geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError as error:
-            return self._latch_fault(str(error), geometry, step_s)
+            return self._latch_fault(str(error))
         jump_rad = float(np.abs(goal_rad - self.commanded_rad).max())
         if jump_rad > MAX_JOINT_JUMP_RAD:
             text = f"the joint angles would jump by {np.degrees(jump_rad):.0f} degrees in one cycle"
-            return self._latch_fault(text, geometry, step_s)
+            return self._latch_fault(text)
         self._sheet = sheet
-        return self._command_joints(goal_rad, geometry, other, step_s)
+        return self._command_joints(goal_rad, other)
 
-    def _limits(self, geometry: ArmGeometry) -> SheetLimits:
-        return geometry.sheet_limits if self._alignment is None else self._relaxed_limits
+    @property
+    def _limits(self) -> SheetLimits:
+        return self._geometry.sheet_limits if self._alignment is None else self._relaxed_limits
 
-    def _command_joints(
-        self, goal_rad: Floats, geometry: ArmGeometry, other: OtherArm, step_s: float
-    ) -> Command:
+    def _command_joints(self, goal_rad: Floats, other: OtherArm) -> Command:
         """Return the command that moves towards joint angles (6,) rad.
 
-        If a limit is violated, a fault is latched and the arm stops.
+        If the motion would violate a limit, a fault is latched and the arm stops.
         """
-        velocity = self._limit_velocity(goal_rad, geometry, step_s)
-        flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
-        limits = self._limits(geometry)
-        violation = check_flange(flange, other.world_from_flange_commanded, limits) or check_sheet(
-            flange @ geometry.flange_from_edge,
-            other.world_from_flange_commanded @ geometry.other_flange_from_edge,
-            left=geometry.left,
-            limits=limits,
+        velocity = self._limit_velocity(goal_rad)
+        flange = self._geometry.world_from_flange(self.commanded_rad + velocity * self._step_s)
+        violation = self._geometry.check_limits(
+            flange, other.world_from_flange_commanded, self._limits
         )
         if violation is not None:
-            return self._latch_fault(f"commanded: {violation}", geometry, step_s)
+            return self._latch_fault(f"commanded: {violation}")
         self._goal_rad = goal_rad
-        return self._move(velocity, geometry, step_s)
+        return self._move(velocity)
 
-    def _latch_fault(self, text: str, geometry: ArmGeometry, step_s: float) -> Command:
+    def _latch_fault(self, text: str) -> Command:
         self.faults = (text,)
         self._inhibit(text, Event.FAULT)
-        return self._decelerate(text, geometry, step_s)
+        return self._decelerate(text)
 
-    def _slacken(
-        self, reason: str, geometry: ArmGeometry, other: OtherArm | None, step_s: float
-    ) -> Command:
-        """Return the command that stops the arm and then slackens the sheet.
+    def _slacken(self, reason: str, other: OtherArm | None) -> Command:
+        """Return the command that stops the arm, and then moves its edge until the sheet is slack.
 
-        The sheet becomes slack because this arm's edge moves towards the other edge.
         reason: text that is shown to the operator.
         """
         self._settle()
         measured = self.measured_rad
         starts = self._state is State.TAUT
         if not (starts or self._state is State.RELAX) or other is None or measured is None:
-            return self._decelerate(reason, geometry, step_s)
-        between = geometry.sheet_between(
-            geometry.world_from_edge(measured),
-            other.world_from_flange @ geometry.other_flange_from_edge,
-        )
-        limits = geometry.sheet_limits
+            return self._decelerate(reason)
+        between = self._geometry.measure_sheet(measured, other.world_from_flange)
+        limits = self._geometry.sheet_limits
         if between.stretch_ratio <= SLACK_STRETCH:
             self.handle(Event.RELAX_ENDED)
-            return self._decelerate(reason, geometry, step_s)
+            return self._decelerate(reason)
         if between.stretch_ratio > IMPLAUSIBLE_LENGTH_RATIO * limits.max_length_m / limits.width_m:
             text = f"{reason}; the measured length of the sheet is not possible"
-            return self._decelerate(text, geometry, step_s)
-        if starts and not self._stands_still(measured, geometry):
-            return self._decelerate(reason, geometry, step_s)
+            return self._decelerate(text)
+        if starts and not self._stands_still(measured):
+            return self._decelerate(reason)
         refusal = (
-            self._restart_refusal(measured, geometry)
+            self._restart_refusal(measured)
             if starts
             else check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
         )
         if refusal is not None:
             # The arm does not follow commands.  It would jump when it follows commands again.
             self.handle(Event.RELAX_ENDED)
-            return self._decelerate(f"{reason}; {refusal}", geometry, step_s)
+            return self._decelerate(f"{reason}; {refusal}")
         if starts or self._sheet is None or self._relax_from is None:
-            self._restart_at(measured, geometry)
+            self._restart_at(measured)
             self._sheet, self._relax_from = between, between.stretch_ratio
         # Each arm executes half of a commanded change of stretch.  The other arm rests, so this arm
         # commands twice the change: from a stretch ratio s to 2 - s instead of to 1.
@@ -816,25 +735,28 @@ class ArmControl:
             stretch_rate_per_s=0.0,
         )
         sheet = follow_sheet(
-            self._sheet, target, bounds=RELAX_BOUNDS, edges=geometry.edge_bound, step_s=step_s
+            self._sheet,
+            target,
+            bounds=RELAX_BOUNDS,
+            edges=self._geometry.edge_bound,
+            step_s=self._step_s,
         )
         try:
-            goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
+            goal_rad = self._geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError:
-            return self._decelerate(reason, geometry, step_s)
-        velocity = self._limit_velocity(goal_rad, geometry, step_s)
-        flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
+            return self._decelerate(reason)
+        velocity = self._limit_velocity(goal_rad)
+        flange = self._geometry.world_from_flange(self.commanded_rad + velocity * self._step_s)
         if check_flange(flange, other.world_from_flange, limits) is not None:
-            return self._decelerate(reason, geometry, step_s)
+            return self._decelerate(reason)
         self._sheet, self._goal_rad = sheet, goal_rad
         self.handle(Event.RELAX)
         self.reason = reason
-        return self._move(velocity, geometry, step_s)
+        return self._move(velocity)
 
-    def _decelerate(self, reason: str, geometry: ArmGeometry, step_s: float) -> Command:
-        """Return the command that decelerates the arm along its path.
+    def _decelerate(self, reason: str) -> Command:
+        """Return the command that decelerates the arm along its path, or keeps an arm at rest.
 
-        If the arm is at rest, the command keeps it at rest.
         reason: text that is shown to the operator.
         """
         self.handle(Event.RELAX_BLOCKED)
@@ -843,48 +765,31 @@ class ArmControl:
         self.reason = reason
         if self.at_rest:
             mode = "idle" if self.mode == "idle" else "stop"
-            return self._send(mode, self.commanded_rad, geometry, step_s)
-        slower = decelerate(self._velocity, limits=geometry.joint_limits, step_s=step_s)
-        velocity = limit_tool_speed(
-            self.commanded_rad,
-            self._velocity,
-            clamp_to_range(
-                self.commanded_rad,
-                self._velocity,
-                slower,
-                limits=geometry.joint_limits,
-                step_s=step_s,
-            ),
-            tool_points=geometry.tool_points,
-            max_tool_speed=geometry.max_tool_speed,
-            limits=geometry.joint_limits,
-            step_s=step_s,
-        )
-        return self._move(velocity, geometry, step_s)
+            return self._send(mode, self.commanded_rad)
+        return self._move(self._limit_velocity(NO_GOAL))
 
-    def _limit_velocity(self, goal_rad: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
+    def _limit_velocity(self, goal_rad: Floats) -> Floats:
         """Return joint velocities (6,) rad/s towards the moving goal `goal_rad` (6,).
 
-        The goal is assumed to continue at its last velocity.
+        The goal is assumed to continue at its last velocity. If the goal is not finite, the arm
+        decelerates.
         """
         before = self.commanded_rad if self._goal_rad is None else self._goal_rad
         return limit_velocity(
             self.commanded_rad,
             self._velocity,
             goal_rad,
-            (goal_rad - before) / step_s,
-            tool_points=geometry.tool_points,
-            max_tool_speed=geometry.max_tool_speed,
-            limits=geometry.joint_limits,
-            step_s=step_s,
+            (goal_rad - before) / self._step_s,
+            limits=self._geometry.joint_limits,
+            step_s=self._step_s,
         )
 
-    def _move(self, velocity: Floats, geometry: ArmGeometry, step_s: float) -> Command:
+    def _move(self, velocity: Floats) -> Command:
         self._velocity = velocity
-        return self._send("move", self.commanded_rad + velocity * step_s, geometry, step_s)
+        return self._send("move", self.commanded_rad + velocity * self._step_s)
 
-    def _send(self, mode: str, joints_rad: Floats, geometry: ArmGeometry, step_s: float) -> Command:
-        """Return the command for joint angles (6,) rad after the final checks of every command.
+    def _send(self, mode: str, joints_rad: Floats) -> Command:
+        """Return the command for joint angles (6,) rad after the final checks.
 
         A fault is latched if the state permits no motion, or if the step exceeds the maximum joint
         speeds or tool speed.
@@ -896,13 +801,11 @@ class ArmControl:
         bounded = bound_step(
             before,
             joints_rad,
-            tool_points=geometry.tool_points,
-            max_tool_speed=geometry.max_tool_speed,
-            limits=geometry.joint_limits,
-            step_s=step_s,
+            limits=self._geometry.joint_limits,
+            step_s=self._step_s,
         )
         if bounded is not joints_rad:
-            self._velocity = (bounded - before) / step_s
+            self._velocity = (bounded - before) / self._step_s
             self.faults = self.faults or ("commanded: a step beyond the joint or tool speed",)
         if self.faults:
             self._disarm(self.faults[0], Event.FAULT)
@@ -911,33 +814,30 @@ class ArmControl:
         if mode != "move":
             self._velocity = np.zeros(6)
         velocity = NO_MOTION if self.at_rest else self._velocity
-        self._standstill.on_command(bounded, velocity, step_s)
+        self._standstill.on_command(bounded, velocity, self._step_s)
         return Command(mode, bounded)
 
-    def _is_at_command(self, measured: Floats, geometry: ArmGeometry) -> bool:
-        """Return whether the measured joint angles (6,) rad are near the last commanded angles.
-
-        The measured and commanded positions of the edge may differ by MAX_RESTART_SHIFT_M.
-        """
-        shift_m = geometry.bound_edge_shift_m(self.commanded_rad, measured)
+    def _is_at_command(self, measured: Floats) -> bool:
+        """Return whether the edge is within MAX_RESTART_SHIFT_M of its commanded position."""
+        shift_m = self._geometry.bound_edge_shift_m(self.commanded_rad, measured)
         return shift_m <= MAX_RESTART_SHIFT_M
 
-    def _stands_still(self, measured: Floats, geometry: ArmGeometry) -> bool:
-        return self._standstill.is_standing(at_command=self._is_at_command(measured, geometry))
+    def _stands_still(self, measured: Floats) -> bool:
+        return self._standstill.is_standing(at_command=self._is_at_command(measured))
 
-    def _restart_refusal(self, measured: Floats, geometry: ArmGeometry) -> str | None:
+    def _restart_refusal(self, measured: Floats) -> str | None:
         """Return the reason why a motion must not start from the measured angles (6,) rad, or None.
 
-        A motion may start near the last commanded position. At another position, it may start only
-        if the measurements are plausible. After a wrong measurement, the arm would jump.
+        Away from the last commanded position, a motion may start only if the measurements are
+        plausible. If the measured angles were wrong, the arm would jump.
         """
-        lowest, highest = geometry.range_rad
+        lowest, highest = self._geometry.range_rad
         beyond = max(float((lowest - measured).max()), float((measured - highest).max()))
         if beyond > MAX_BEYOND_RANGE_RAD:
             return (
                 f"the measured joint angles are {np.degrees(beyond):.1f} degrees beyond their range"
             )
-        if self._is_at_command(measured, geometry):
+        if self._is_at_command(measured):
             return None
         monitor = self._standstill
         if monitor.is_alive and not monitor.has_jumped:
@@ -949,15 +849,12 @@ class ArmControl:
             f"angles that {defect}; check the arm, then restart its bridge"
         )
 
-    def _restart_at(self, measured: Floats, geometry: ArmGeometry) -> None:
+    def _restart_at(self, measured: Floats) -> None:
         """Replace the last commanded joint angles by the measured joint angles (6,) rad.
 
         If the arm does not stand still, a fault is latched instead.
         """
-        if (
-            not self._stands_still(measured, geometry)
-            or self._restart_refusal(measured, geometry) is not None
-        ):
+        if not self._stands_still(measured) or self._restart_refusal(measured) is not None:
             self.faults = self.faults or ("commanded: a start before the arm stands still",)
             self._inhibit(self.faults[0], Event.FAULT)
             return

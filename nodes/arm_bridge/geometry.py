@@ -2,31 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.scene import ArmModel, ClosedFormArm, JointChain, Scene
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.closed_form import ClosedFormKinematics
 from flexsheet.nodes.arm_bridge.joint_chain import NumericKinematics, SerialChain
-from flexsheet.nodes.arm_bridge.kinematics import ArmKinematics
-from flexsheet.nodes.arm_bridge.limiter import TOOL_SPEED_FRACTION, JointLimits, SheetLimits
+from flexsheet.nodes.arm_bridge.limiter import (
+    TOOL_SPEED_FRACTION,
+    JointLimits,
+    SheetLimits,
+    check_flange,
+    check_sheet,
+    measure_twist_rad,
+)
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import EdgeBound, SheetMotion
-from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
+from flexsheet.nodes.models.rigid import angle_between, apply, inverse, pose_matrix
 from flexsheet.nodes.models.sheet import flange_pose, sheet_from_edges
-
-Floats = NDArray[np.float64]
 
 RANGE_MARGIN_RAD = np.radians(2.0)
 
+RELAXED_M, RELAXED_RAD = 0.002, 0.01
+"""The margins (m and rad) by which a limit is widened if it is exceeded at the start of a motion.
+Servos ripple and measurements are noisy."""
+
 EDGE_SPEED_FRACTION = 0.95
-"""The fraction of the maximum tool speed that the motion of the sheet may use."""
+"""The fraction of the maximum tool speed that the sheet's edges may use."""
 
 
-def make_kinematics(model: ClosedFormArm | JointChain) -> ArmKinematics:
+def make_kinematics(
+    model: ClosedFormArm | JointChain,
+) -> ClosedFormKinematics | NumericKinematics:
     """Make the kinematics object for an arm model."""
     return (
         ClosedFormKinematics(model)
@@ -36,10 +47,10 @@ def make_kinematics(model: ClosedFormArm | JointChain) -> ArmKinematics:
 
 
 class ArmGeometry:
-    """The geometry and the limits of one arm, and the edge of the sheet that it holds.
+    """The geometry and the limits of one arm, and of the sheet's edge that the arm holds.
 
-    tool_points_flange: points (4, 3) m in the flange frame: the centre and both ends of the clamped
-        edge, and the flange.
+    tool_points_flange: points (4, 3) m in the flange frame: centre and both ends of the clamped
+        edge, and origin of the flange.
     """
 
     def __init__(self, scene: Scene, side: Side) -> None:
@@ -78,6 +89,8 @@ class ArmGeometry:
             self.range_rad[1] - RANGE_MARGIN_RAD,
             0.95 * speeds,
             6.0 * speeds,
+            self.tool_points,
+            self.max_tool_speed,
         )
         self.sheet_limits = SheetLimits(
             width_m=sheet.width_m,
@@ -118,28 +131,25 @@ class ArmGeometry:
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
-        """Return the tool points (4, 3) m in the base frame at joint angles (6,) rad.
-
-        The tool points are the centre and both ends of the clamped edge, and the flange.
-        """
+        """Return `tool_points_flange` (4, 3) m in the base frame at joint angles (6,) rad."""
         return apply(self._base_from_flange(joints_rad), self.tool_points_flange)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
-        """Return the joint angles (6,) rad that place this arm's edge for a pose of the sheet.
+        """Return the joint angles (6,) rad that move this arm's edge to a pose of the sheet.
 
         present_rad: present joint angles (6,), which must be near the result.
-        The result compensates for the displacement of the edge by the sheet's tension. Raises
-        UnreachableError if the arm cannot reach the pose.
+        The deflection of the arm by the sheet's tension is compensated. Raises UnreachableError if
+        the arm cannot reach the pose.
         """
         edge = motion.world_from_sheet.copy()
         edge[:3, 3] += self.edge_offset_m(motion.stretch_ratio) * edge[:3, 0]
         return self.solve_joints(flange_pose(edge, self.flange_from_edge), present_rad)
 
     def edge_offset_m(self, stretch_ratio: float) -> float:
-        """Return the edge's commanded coordinate (m) on the sheet's x axis.
+        """Return the commanded x coordinate (m) of the edge in the sheet's frame.
 
-        The result is negative for the left edge. It compensates for the tension of the sheet, which
-        pulls the edge towards the other edge.
+        The left edge has a negative coordinate. The deflection of the arm by the sheet's tension is
+        compensated.
         """
         length_m = stretch_ratio * self.sheet_limits.width_m
         moved_m = self._compliance_m_per_n * self.sheet_limits.force_n(length_m)
@@ -149,8 +159,7 @@ class ArmGeometry:
         """Return the encoder angles (6,) rad that place the flange at a world pose (4, 4).
 
         near_rad: joint angles (6,) near the result.
-        The compliance of the arm is not compensated. Raises UnreachableError if the arm cannot
-        reach the pose.
+        The arm is assumed to be rigid. Raises UnreachableError if the arm cannot reach the pose.
         """
         offsets_rad = self._joint_offsets_rad
         base_from_flange = self.base_from_world @ world_from_flange
@@ -160,7 +169,7 @@ class ArmGeometry:
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
         """Return the pose and stretch of a sheet at rest between the edges of both arms.
 
-        own_edge, other_edge: world poses (4, 4) of the edges, without the compliance of the arms.
+        own_edge, other_edge: world poses (4, 4) of the edges if the arms were rigid.
         """
         limits = self.sheet_limits
         left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)
@@ -176,13 +185,60 @@ class ArmGeometry:
         sheet[:3, 3] += shift_m * sheet[:3, 0]
         return SheetMotion(sheet, np.zeros(6), length_m / limits.width_m, 0.0)
 
+    def measure_sheet(self, joints_rad: Floats, world_from_other_flange: Floats) -> SheetMotion:
+        """Return the pose and stretch of a sheet at rest between both arms.
+
+        joints_rad: measured joint angles (6,) of this arm. world_from_other_flange: measured pose
+            (4, 4) of the other arm's flange.
+        """
+        other_edge = world_from_other_flange @ self.other_flange_from_edge
+        return self.sheet_between(self.world_from_edge(joints_rad), other_edge)
+
+    def check_limits(
+        self, flange: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
+    ) -> str | None:
+        """Return a description of the limit that the flanges or the sheet violate, or None.
+
+        flange, other_flange: world poses (4, 4). slack_m: tolerance on the limits of the flange.
+        """
+        return check_flange(flange, other_flange, limits, slack_m=slack_m) or check_sheet(
+            flange @ self.flange_from_edge,
+            other_flange @ self.other_flange_from_edge,
+            left=self.left,
+            limits=limits,
+        )
+
+    def relax_limits(self, flange: Floats, other_flange: Floats) -> SheetLimits:
+        """Widen the limits that the arms exceed, or nearly exceed, at the start of a motion.
+
+        flange, other_flange: world poses (4, 4) at the start.
+        """
+        limits = self.sheet_limits
+        edge = flange @ self.flange_from_edge
+        other_edge = other_flange @ self.other_flange_from_edge
+        across = other_edge[:3, 3] - edge[:3, 3]
+        max_length_m = float(np.linalg.norm(across)) + RELAXED_M
+        skew_rad = angle_between(across if self.left else -across, edge[:3, 0])
+        twist_rad = max(skew_rad, measure_twist_rad(edge, other_edge)) + RELAXED_RAD
+        distance_m = float(np.linalg.norm(other_flange[:3, 3] - flange[:3, 3])) - RELAXED_M
+        return replace(
+            limits,
+            max_length_m=max(limits.max_length_m, max_length_m),
+            max_edge_force_n=max(limits.max_edge_force_n, limits.force_n(max_length_m)),
+            max_twist_rad=max(limits.max_twist_rad, twist_rad),
+            min_flange_distance_m=min(limits.min_flange_distance_m, distance_m),
+            workspace_min_m=np.minimum(limits.workspace_min_m, flange[:3, 3] - RELAXED_M),
+            workspace_max_m=np.maximum(limits.workspace_max_m, flange[:3, 3] + RELAXED_M),
+        )
+
     def sheet_state(
         self, joints_rad: Floats, world_from_other_flange: Floats | None
     ) -> tuple[float | None, float | None]:
         """Return the distance between the edges (m) and the force on each edge (N).
 
-        joints_rad: joint angles (6,) of this arm. world_from_other_flange: pose (4, 4) of the other
-            flange; if it is None, both results are None.
+        joints_rad: joint angles (6,) of this arm.
+        world_from_other_flange: pose (4, 4) of the other arm's flange. If the pose is None, both
+            results are None.
         """
         if world_from_other_flange is None:
             return None, None

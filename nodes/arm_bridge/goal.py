@@ -1,6 +1,6 @@
-"""Convert a sheet target to a goal for one arm, and synchronize the two arms.
+"""Convert a sheet target to the goal of the next command, and synchronize the two arms.
 
-Poses are 4x4 in the world, rotations in rad, lengths in m, times in s or ns.
+Poses are 4x4 in the world frame.
 """
 
 from __future__ import annotations
@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.types import SheetTarget, SheetTrajectory
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import (
     SheetBounds,
     SheetMotion,
@@ -20,8 +20,6 @@ from flexsheet.nodes.models.motion import (
     measure_length,
 )
 from flexsheet.nodes.models.rigid import transform, vector_from_rotation
-
-Floats = NDArray[np.float64]
 
 # The joints can follow these accelerations (J6 22 rad/s^2, J2 9.4 rad/s^2).  With larger
 # accelerations, each arm would overshoot a target that reverses by a different distance.
@@ -35,15 +33,16 @@ FOLLOW_BOUNDS = SheetBounds(
 )
 
 SLOW_FROM_RAD = 0.05
-"""The lead (rad) of one edge over the other edge above which the leading arm slows down."""
+"""The lead of one arm over the other arm, as an angle (rad), above which the leading arm slows
+down."""
 
 WAIT_FROM_RAD = 0.12
-"""The lead (rad) of one edge over the other edge at which the leading arm waits. At 0.2 rad, the
-limiter stops both arms."""
+"""The lead of one arm over the other arm, as an angle (rad), at which the leading arm waits. At
+0.2 rad, the limiter stops both arms."""
 
 MAX_PREDICTION_S = 0.15
-"""The maximum time by which a target's timestamp may lie in the future. It consists of the
-prediction horizon and a margin."""
+"""The maximum time by which a target's timestamp may be in the future: the prediction horizon and a
+margin."""
 
 MAX_TRAJECTORY_S = 0.4
 """The maximum duration of a trajectory, during which an arm moves without a new message."""
@@ -54,10 +53,10 @@ SKEW_LENGTH_M = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """The target of the sheet, converted to the time at which a command takes effect.
+    """The desired motion of the sheet at the time when a command takes effect.
 
     overdue_s: time since the next target was due; negative before that time.
-    planner_ended: whether the planner, or a node on which it depends, has ended after the target.
+    planner_ended: whether the planner, or a node that provides its inputs, has ended.
     """
 
     motion: SheetMotion
@@ -68,11 +67,10 @@ class Goal:
 def extrapolate_goal(
     motion: SheetMotion, ahead_s: float, overdue_s: float, *, max_extrapolation_s: float
 ) -> Goal:
-    """Extrapolate the motion of a target by `ahead_s`.
+    """Extrapolate the motion of a target by `ahead_s`, at most by +-`max_extrapolation_s`.
 
-    The extrapolation is limited to `max_extrapolation_s` into the past and the future.
-    overdue_s: time since the next target was due. The goal contains a longer time if the limit of
-        the extrapolation is exceeded, or if the target is too far in the future.
+    overdue_s: time since the next target was due. This time is increased if the extrapolation is
+        limited, or if the target is too far in the future.
     """
     carried_s = min(max(ahead_s, -max_extrapolation_s), max_extrapolation_s)
     late_s = max(overdue_s, ahead_s - max_extrapolation_s, -ahead_s - MAX_PREDICTION_S)
@@ -94,10 +92,10 @@ class GoalTiming:
 
 
 def find_trajectory(target: SheetTarget) -> SheetTrajectory | None:
-    """Return the trajectory of a target, or None if the arm must not follow it.
+    """Return the trajectory of a target, or None if there is no permitted trajectory.
 
-    The arm follows a trajectory only if its speeds and decelerations are within FOLLOW_BOUNDS, and
-    if its duration is at most MAX_TRAJECTORY_S.
+    The speeds and decelerations of a permitted trajectory are within FOLLOW_BOUNDS. Its duration is
+    at most MAX_TRAJECTORY_S.
     """
     trajectory, bounds = target.trajectory, FOLLOW_BOUNDS
     if trajectory is None or not trajectory.brake_s > 0.0 <= trajectory.keep_s:
@@ -125,8 +123,8 @@ def make_goal(
 
     received_ns, now_ns: arrival time of the target, and present time.
     trajectory: result of `find_trajectory` if the other arm follows the trajectory too. The target
-        is then overdue as soon as the trajectory has ended. If None, the target is extrapolated
-        with its velocity.
+        is then overdue when the trajectory has ended. If None, the target is extrapolated with
+        constant velocity.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s
@@ -153,9 +151,8 @@ def compute_sync_factor(
     target: target pose world_from_sheet (4, 4).
     left: whether this arm holds the left edge.
 
-    The two bridges compute their commands at different times, so a late cycle of one bridge twists
-    the sheet. The arm that is ahead on the path to the target slows down in proportion to its lead.
-    Only one arm can be ahead, so the arms never wait for each other.
+    A late control cycle of one bridge would twist the sheet. The arm that is ahead on the path to
+    the target therefore slows down in proportion to its lead.
     """
     across = other_edge[:3, 3] - own_edge[:3, 3]
     half = (0.5 if left else -0.5) * sqrt(float(across @ across))
@@ -191,9 +188,6 @@ def _sheet_centre(edge: Floats, along_m: float) -> Floats:
 
 
 def _difference(pose: Floats, other: Floats) -> Floats:
-    """Return the difference of two poses (4, 4) as one vector (6,).
-
-    The vector consists of the rotation (rad) and the offset divided by SKEW_LENGTH_M.
-    """
+    """Return the rotation vector (rad) and the offset divided by SKEW_LENGTH_M as a vector (6,)."""
     rotation = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
     return np.concatenate([rotation, (other[:3, 3] - pose[:3, 3]) / SKEW_LENGTH_M])

@@ -1,25 +1,23 @@
 """Compute the kinematics of any arm with six rotary joints numerically.
 
 Joint angles are (6,) or (n, 6) in radians, poses are 4x4 `base_from_flange` in metres. The inverse
-kinematics use a damped Newton method, which starts at known joint angles and has a bounded number
-of steps. The joint angles for a distant pose are solved through intermediate poses, so that the arm
-stays on its branch.
+kinematics use a damped Newton method, which starts at known joint angles. A distant pose is solved
+through intermediate poses, so the arm does not switch to another solution.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import degrees, pi
+from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import JointChain
-from flexsheet.nodes.arm_bridge.kinematics import SeedBranch, UnreachableError
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import pose_matrix
-
-Floats = NDArray[np.float64]
 
 MAX_STEPS = 12
 """The maximum number of Newton steps from known joint angles. A control cycle needs 2 or 3."""
@@ -46,7 +44,7 @@ same unit."""
 
 MIN_SINGULAR_VALUE, NEAR_SINGULAR_VALUE = 0.01, 0.05
 """The minimum values of the Jacobian's smallest singular value, for single poses and for paths. At
-the second value, a flange speed of 0.25 m/s requires at most 20 rad/s of each joint."""
+the second value, a flange speed of 0.25 m/s requires joint speeds of at most 20 rad/s."""
 
 SEEDS = 256
 """The number of random joint vectors from which `solve_all` searches for solutions."""
@@ -55,6 +53,27 @@ SEED_STEPS = 40
 
 MIN_DIFFERENCE = 0.02
 """The minimum of |sin(difference / 2)| for at least one joint of two distinct solutions."""
+
+
+class UnreachableError(FlexsheetError, ValueError):
+    """An error for a flange pose that no permitted joint angles reach.
+
+    limit: "reach", "singularity", or the joint ("J1" to "J6") that is out of range in the nearest
+        solution.
+    """
+
+    code = "unreachable"
+    remedy = "Run `flexsheet doctor scene SCENE`, which lists the limits and possible changes."
+
+    def __init__(self, text: str, limit: str) -> None:
+        super().__init__(text)
+        self.limit = limit
+
+
+class SeedBranch(NamedTuple):
+    """A branch of an arm without closed-form kinematics, defined by one joint solution (6,) rad."""
+
+    seed_rad: tuple[float, ...]
 
 
 class SerialChain:
@@ -136,7 +155,7 @@ class NumericKinematics:
         return self._chain.forward(np.asarray(joints_rad, dtype=np.float64))
 
     def jacobian(self, joints_rad: Floats) -> Floats:
-        """Return the Jacobian (n, 6, 6) at joint angles (n, 6) rad."""
+        """Return the Jacobian (n, 6, 6) in the base frame at joint angles (n, 6) rad."""
         return self._chain.jacobian(joints_rad)
 
     def _refine(self, poses: Floats, joints_rad: Floats, steps: int) -> tuple[Floats, Floats]:
@@ -159,9 +178,9 @@ class NumericKinematics:
         return joints, largest
 
     def _continue(self, poses: Floats, joints_rad: Floats) -> tuple[Floats, Floats]:
-        """Return joint angles (n, 6) rad for flange poses (n, 4, 4), and the errors (n,).
+        """Return joint angles (n, 6) rad for flange poses (n, 4, 4), and the pose errors (n,).
 
-        The arm moves through intermediate poses, so the result is on the branch of `joints_rad`.
+        The solution proceeds from `joints_rad` (6,) through intermediate poses.
         """
         start = self.forward(joints_rad)
         rotation = scipy.spatial.transform.Rotation
@@ -226,7 +245,7 @@ class NumericKinematics:
         """Return all known joint solutions (6,) rad for a flange pose within the joint ranges.
 
         The solutions are sorted by their distance from the start angles. The search starts from
-        random angles with a fixed seed, so it may miss a solution.
+        random joint angles, and may miss a solution.
         """
         random = np.random.default_rng(1)
         low, high = np.maximum(self._lowest, -pi), np.minimum(self._highest, pi)
@@ -249,7 +268,7 @@ class NumericKinematics:
         return SeedBranch(tuple(float(angle) for angle in joints_rad))
 
     def list_branches(self, base_from_flange: Floats) -> Sequence[SeedBranch]:
-        """Return the branches on which the arm reaches the first reachable pose of (n, 4, 4)."""
+        """Return the branches that reach the first reachable one of the flange poses (n, 4, 4)."""
         for pose in base_from_flange:
             if found := self.solve_all(pose):
                 return [self.find_branch(joints) for joints in found]
@@ -260,7 +279,7 @@ class NumericKinematics:
     ) -> Floats:
         """Return the joint angles (n, 6) rad for flange poses (n, 4, 4) on one branch.
 
-        The angles are NaN for poses that are out of reach.
+        Angles are NaN for poses out of reach.
         """
         joints, errors = self._continue(base_from_flange, np.array(branch.seed_rad))
         return np.where(errors[:, None] <= MAX_ERROR, joints, np.nan)

@@ -1,32 +1,28 @@
 """Limit every command to an arm.
 
-Joint speed, joint acceleration and tool speed are clamped, which delays the arm. The tool speed is
-the maximum speed of the flange and of the edge that it holds. Limits of the sheet, of the distance
-between the flanges and of the workspace cannot be enforced by clamping. If one of them is violated,
-a check returns a text, and the caller stops the arm. Joint angles are (6,) rad, poses 4x4 in
-metres.
+Joint speed, joint acceleration and tool speed are clamped. The tool speed is the maximum speed of
+the flange and of the clamped edge of the sheet. Limits of the sheet, of the distance between the
+flanges and of the workspace cannot be clamped. If such a limit is violated, a check returns a text,
+and the caller stops the arm. Joint angles are (6,) rad, poses 4x4 in metres.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.notes import NodeNote
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.motion import BRAKE_FRACTION, closing_speed
 from flexsheet.nodes.models.rigid import angle_between
 from flexsheet.nodes.models.sheet.tension import edge_force_n
 
-Floats = NDArray[np.float64]
-
 TOOL_SPEED_FRACTION = 0.82
-"""The fraction of the maximum tool speed that commands may use. A margin is necessary because the
-actual speed of an arm ripples. The ripple is largest if wrist joints rotate fast in opposite
-directions (benchmarks/limiter.py)."""
+"""The fraction of the maximum tool speed that commands may use. The margin is necessary because the
+actual speed of an arm ripples (benchmarks/limiter.py)."""
 
 MAX_TRAVEL_STEP_S = 0.01
 """The maximum duration of the motion that one command may contain. After a longer gap between
@@ -43,22 +39,24 @@ MIN_BLEND = 0.02
 ROUNDING_FACTOR = 1.0 + 1e-6
 """The factor by which computed values may exceed a limit because of rounding errors."""
 
-RELAXED_M, RELAXED_RAD = 0.002, 0.01
-"""The margins (m and rad) by which a limit is widened if it is exceeded at the start of a motion.
-They are necessary because servos ripple and measurements are noisy."""
-
 RANGE_BRAKE_FRACTION = 2.0 / 3.0
 """The fraction of a joint's maximum acceleration that is reserved for stopping within its range."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointLimits:
-    """The range (rad), speed (rad/s) and acceleration (rad/s^2) limits of the joints, each (6,)."""
+    """The limits (6,) of the joints' ranges, speeds and accelerations, and of the tool speed.
+
+    tool_points: function from joint angles (6,) rad to points (n, 3) m on the tool.
+    max_tool_speed: maximum speed of the tool points, m/s.
+    """
 
     min_rad: Floats
     max_rad: Floats
     speed_rad_per_s: Floats
     acceleration_rad_per_s2: Floats
+    tool_points: Callable[[Floats], Floats]
+    max_tool_speed: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,12 +74,12 @@ class SheetLimits:
     workspace_min_m: Floats
     workspace_max_m: Floats
     compliance_m_per_n: float = 0.0
-    """The sum of the compliances of both flanges in the direction of the sheet's tension."""
+    """The sum of both flanges' compliances in the direction of the sheet's tension."""
 
     def sheet_length_m(self, edge_distance_m: float) -> float:
-        """Return the length of the sheet (m) if the arms comply with its tension.
+        """Return the length (m) of a sheet whose tension bends the arms.
 
-        edge_distance_m: distance between the edges that rigid arms would have.
+        edge_distance_m: distance between the edges if the arms were rigid.
         """
         if self.compliance_m_per_n == 0.0 or not self.width_m < edge_distance_m < math.inf:
             return edge_distance_m
@@ -114,20 +112,18 @@ def limit_velocity(
     goal_rad: Floats,
     goal_velocity: Floats,
     *,
-    tool_points: Callable[[Floats], Floats],
-    max_tool_speed: float,
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
     """Return joint velocities (6,) rad/s for the next step towards a moving goal.
 
     velocity: result of the previous call. goal_rad: joint angles (6,) of the goal at the end of the
-        step. If they are not finite, the arm decelerates. tool_points: function that converts joint
-        angles to points (n, 3) m, whose speed is limited to `max_tool_speed`.
+        step. If they are not finite, the arm decelerates.
 
     For any goal, joints_rad + result * step_s is within the joint ranges, and joint and tool speeds
-    are within their limits. The acceleration exceeds its limit only if the joint range or the tool
-    speed requires it. Raises ValueError if `step_s` is not between MIN_STEP_S and MAX_STEP_S.
+    are within their limits. If the tool would be too fast, the result is a blend of the desired and
+    of decelerating velocities. The acceleration exceeds its limit only if the joint range or the
+    tool speed requires it. Raises ValueError if `step_s` is not between MIN_STEP_S and MAX_STEP_S.
     """
     if not MIN_STEP_S <= step_s <= MAX_STEP_S:
         raise ValueError(
@@ -139,101 +135,12 @@ def limit_velocity(
         )
     else:
         desired = decelerate(velocity, limits=limits, step_s=step_s)
-    return limit_tool_speed(
-        joints_rad,
-        velocity,
-        clamp_to_range(joints_rad, velocity, desired, limits=limits, step_s=step_s),
-        tool_points=tool_points,
-        max_tool_speed=max_tool_speed,
-        limits=limits,
-        step_s=step_s,
-    )
-
-
-def find_desired_velocity(
-    joints_rad: Floats,
-    goal_rad: Floats,
-    goal_velocity: Floats,
-    *,
-    limits: JointLimits,
-    step_s: float,
-) -> Floats:
-    """Return joint velocities (6,) rad/s that lead to the goal without overshoot.
-
-    The velocities reach the goal in this step, or permit the joints to stop at the goal.
-    """
-    max_speed = limits.speed_rad_per_s
-    goal = _clamp(goal_rad, limits.min_rad, limits.max_rad)
-    along = _clamp(goal_velocity, -max_speed, max_speed)
-    offset = goal - along * step_s - joints_rad
-    brake = BRAKE_FRACTION * limits.acceleration_rad_per_s2
-    closing = np.sign(offset) * closing_speed(np.abs(offset), brake, step_s)
-    return _clamp(along + closing, -max_speed, max_speed)
-
-
-def clamp_to_range(
-    joints_rad: Floats, velocity: Floats, desired: Floats, *, limits: JointLimits, step_s: float
-) -> Floats:
-    """Limit velocities (6,) rad/s so that the joints can stop within their ranges.
-
-    velocity: result of the previous step, from which the result differs by at most the maximum
-        acceleration.
-    """
-    max_acceleration = limits.acceleration_rad_per_s2
-    up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
-    down = _find_max_speed(joints_rad - limits.min_rad, max_acceleration, step_s)
-    reach = max_acceleration * step_s
-    result = _clamp(_clamp(desired, -down, up), velocity - reach, velocity + reach)
-    lower = (limits.min_rad - joints_rad) / step_s
-    upper = (limits.max_rad - joints_rad) / step_s
-    # Outside the range, where a motion may start, only motion back into it is allowed.
-    return _clamp(result, np.minimum(lower, 0.0), np.maximum(upper, 0.0))
-
-
-def _clamp(values: Floats, lowest: Floats, highest: Floats) -> Floats:
-    """Limit array elements to the range from `lowest` to `highest`.
-
-    For arrays of six numbers, numpy.clip takes five times as long.
-    """
-    return np.minimum(np.maximum(values, lowest), highest)
-
-
-def _find_max_speed(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
-    """Return the highest speeds from which the joints can stop within the given distances."""
-    return closing_speed(np.maximum(distance, 0.0), RANGE_BRAKE_FRACTION * acceleration, step_s)
-
-
-def decelerate(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
-    """Return the joint velocities (6,) rad/s after one step of deceleration.
-
-    All velocities decrease by the same factor.
-    """
-    stopping_s = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
-    return velocity * max(0.0, 1.0 - step_s / stopping_s) if stopping_s > 0.0 else velocity
-
-
-def limit_tool_speed(
-    joints_rad: Floats,
-    velocity: Floats,
-    desired: Floats,
-    *,
-    tool_points: Callable[[Floats], Floats],
-    max_tool_speed: float,
-    limits: JointLimits,
-    step_s: float,
-) -> Floats:
-    """Return joint velocities (6,) rad/s near the desired velocities within the maximum tool speed.
-
-    velocity: result of the previous call.
-    The result is a blend of the desired velocities and of decelerating velocities, which respects
-    the acceleration limit. If even the decelerating velocities are too fast, they are scaled down
-    and exceed the acceleration limit.
-    """
-    here = tool_points(joints_rad)
-    max_shift_m = max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
+    desired = clamp_to_range(joints_rad, velocity, desired, limits=limits, step_s=step_s)
+    here = limits.tool_points(joints_rad)
+    max_shift_m = limits.max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
 
     def shifts(candidate: Floats) -> Floats:
-        return tool_points(joints_rad + candidate * step_s) - here
+        return limits.tool_points(joints_rad + candidate * step_s) - here
 
     fast = shifts(desired)
     if _longest(fast) <= max_shift_m:
@@ -260,20 +167,70 @@ def limit_tool_speed(
     return slower
 
 
+def find_desired_velocity(
+    joints_rad: Floats,
+    goal_rad: Floats,
+    goal_velocity: Floats,
+    *,
+    limits: JointLimits,
+    step_s: float,
+) -> Floats:
+    """Return the joint velocities (6,) rad/s that reach the goal without overshoot."""
+    max_speed = limits.speed_rad_per_s
+    goal = _clamp(goal_rad, limits.min_rad, limits.max_rad)
+    along = _clamp(goal_velocity, -max_speed, max_speed)
+    offset = goal - along * step_s - joints_rad
+    brake = BRAKE_FRACTION * limits.acceleration_rad_per_s2
+    closing = np.sign(offset) * closing_speed(np.abs(offset), brake, step_s)
+    return _clamp(along + closing, -max_speed, max_speed)
+
+
+def clamp_to_range(
+    joints_rad: Floats, velocity: Floats, desired: Floats, *, limits: JointLimits, step_s: float
+) -> Floats:
+    """Limit velocities (6,) rad/s so that the joints can stop within their ranges.
+
+    velocity: velocities of the previous step. The result respects the maximum acceleration.
+    """
+    max_acceleration = limits.acceleration_rad_per_s2
+    up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
+    down = _find_max_speed(joints_rad - limits.min_rad, max_acceleration, step_s)
+    reach = max_acceleration * step_s
+    result = _clamp(_clamp(desired, -down, up), velocity - reach, velocity + reach)
+    lower = (limits.min_rad - joints_rad) / step_s
+    upper = (limits.max_rad - joints_rad) / step_s
+    # Outside the range, where a motion may start, only motion back into it is allowed.
+    return _clamp(result, np.minimum(lower, 0.0), np.maximum(upper, 0.0))
+
+
+def _clamp(values: Floats, lowest: Floats, highest: Floats) -> Floats:
+    """Limit array elements to a range; for six elements, numpy.clip takes five times as long."""
+    return np.minimum(np.maximum(values, lowest), highest)
+
+
+def _find_max_speed(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
+    """Return the highest speeds from which the joints can stop within the given distances."""
+    return closing_speed(np.maximum(distance, 0.0), RANGE_BRAKE_FRACTION * acceleration, step_s)
+
+
+def decelerate(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
+    """Return the joint velocities (6,) rad/s after one step of deceleration by a common factor."""
+    stopping_s = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
+    return velocity * max(0.0, 1.0 - step_s / stopping_s) if stopping_s > 0.0 else velocity
+
+
 def bound_step(
     joints_rad: Floats,
     desired_rad: Floats,
     *,
-    tool_points: Callable[[Floats], Floats],
-    max_tool_speed: float,
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
     """Return the joint angles (6,) rad that one step towards `desired_rad` can reach.
 
     Joint speeds and tool speed limit the step. If the limits permit the whole step, the same object
-    `desired_rad` is returned. Otherwise the result is a point on the straight line to
-    `desired_rad`. If `desired_rad` is not finite, the result is `joints_rad`.
+    `desired_rad` is returned. Otherwise, the result is between `joints_rad` and `desired_rad`. If
+    `desired_rad` is not finite, the result is `joints_rad`.
     """
     if desired_rad is joints_rad:
         return desired_rad
@@ -283,16 +240,16 @@ def bound_step(
         return joints_rad
     if ratio > ROUNDING_FACTOR:
         step = step / ratio
-    here = tool_points(joints_rad)
-    max_shift_m = max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
+    here = limits.tool_points(joints_rad)
+    max_shift_m = limits.max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
     shift = _longest(
-        tool_points(joints_rad + step if ratio > ROUNDING_FACTOR else desired_rad) - here
+        limits.tool_points(joints_rad + step if ratio > ROUNDING_FACTOR else desired_rad) - here
     )
     if ratio <= ROUNDING_FACTOR and shift <= ROUNDING_FACTOR * max_shift_m:
         return desired_rad
     while shift > max_shift_m:
         step = step * (0.99 * max_shift_m / shift)
-        shift = _longest(tool_points(joints_rad + step) - here)
+        shift = _longest(limits.tool_points(joints_rad + step) - here)
     result: Floats = joints_rad + step
     return result
 
@@ -302,10 +259,9 @@ def _longest(shifts: Floats) -> float:
 
 
 def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
-    """Return the largest blend factor (0 to 1) with which all points move at most `max_shift_m`.
+    """Return the largest blend factor (0 to 1) at which no point moves more than `max_shift_m`.
 
     slow, fast: displacements (n, 3) m of the points for the factors 0 and 1.
-    The result solves |slow + factor * (fast - slow)| = max_shift_m for the critical point.
     """
     change = fast - slow
     square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)
@@ -314,39 +270,8 @@ def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
     return float(((root - mixed) / np.maximum(square, 1e-30)).min()) * (1.0 - 1e-3)
 
 
-def relax_limits(
-    limits: SheetLimits,
-    flange: Floats,
-    edge: Floats,
-    other_flange: Floats,
-    other_edge: Floats,
-    *,
-    left: bool,
-) -> SheetLimits:
-    """Widen the limits that the arms exceed, or nearly exceed, at the start of a motion.
-
-    All poses are (4, 4) in the world. left: whether this arm holds the left edge.
-    """
-    across = other_edge[:3, 3] - edge[:3, 3]
-    apart = other_flange[:3, 3] - flange[:3, 3]
-    max_length_m = math.sqrt(float(across @ across)) + RELAXED_M
-    skew_rad = angle_between(across if left else -across, edge[:3, 0])
-    return replace(
-        limits,
-        max_length_m=max(limits.max_length_m, max_length_m),
-        max_edge_force_n=max(limits.max_edge_force_n, limits.force_n(max_length_m)),
-        max_twist_rad=max(
-            limits.max_twist_rad, max(skew_rad, _twist(edge, other_edge)) + RELAXED_RAD
-        ),
-        min_flange_distance_m=min(
-            limits.min_flange_distance_m, math.sqrt(float(apart @ apart)) - RELAXED_M
-        ),
-        workspace_min_m=np.minimum(limits.workspace_min_m, flange[:3, 3] - RELAXED_M),
-        workspace_max_m=np.maximum(limits.workspace_max_m, flange[:3, 3] + RELAXED_M),
-    )
-
-
-def _twist(edge: Floats, other_edge: Floats) -> float:
+def measure_twist_rad(edge: Floats, other_edge: Floats) -> float:
+    """Return the angle (rad) of the rotation between two edges, given by poses (4, 4)."""
     # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2).
     apart = (other_edge[:3, :3] - edge[:3, :3]).ravel()
     return 2.0 * math.asin(min(1.0, math.sqrt(float(apart @ apart) / 8.0)))
@@ -368,7 +293,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
     force = limits.force_n(distance)
     if not force <= limits.max_edge_force_n:
         return f"the edge force is {force:.1f} N, maximum {limits.max_edge_force_n:.1f} N"
-    twist = _twist(edge, other_edge)
+    twist = measure_twist_rad(edge, other_edge)
     if not twist <= limits.max_twist_rad:
         return (
             f"the edges are rotated by {np.degrees(twist):.1f} degrees relative to each other, "
@@ -386,9 +311,7 @@ def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLi
 def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Return a description of the violated limit of a flange, or None.
-
-    The limits are the workspace and the distance between the flanges.
+    """Return a description of the violated limit (workspace or flange distance), or None.
 
     flange_world, other_flange: world poses (4, 4). slack_m: tolerance on both limits.
     Values that are not finite violate both limits.
@@ -411,7 +334,7 @@ def check_flange(
 def check_tracking_error(
     joints_rad: Floats, measured_rad: Floats, max_error_rad: float
 ) -> str | None:
-    """Return a description of the tracking error if it exceeds the maximum, otherwise None.
+    """Return a description of a tracking error above the maximum, or None.
 
     joints_rad, measured_rad: commanded and measured joint angles (6,).
     """

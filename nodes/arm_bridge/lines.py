@@ -18,7 +18,6 @@ import asyncio
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.nodes.arm_bridge.link import (
     JOINTS,
@@ -29,8 +28,7 @@ from flexsheet.nodes.arm_bridge.link import (
     ConnectedLink,
     validate_joints,
 )
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 MAX_LINE_BYTES = 512
 
@@ -64,7 +62,7 @@ def decode_line(line: bytes, sequence: int) -> tuple[ArmStatus, tuple[int, ...]]
 
 
 class LineLink(ConnectedLink):
-    """A driver for one arm whose controller program exchanges lines of text over TCP."""
+    """A driver for a controller program that exchanges lines of text over TCP."""
 
     period_s = 0.008
 
@@ -75,7 +73,6 @@ class LineLink(ConnectedLink):
 
     @property
     def connected(self) -> bool:
-        """Return whether the connection is open."""
         return self._streams is not None and not self._streams[1].is_closing()
 
     async def _connect(self) -> None:

@@ -9,18 +9,13 @@ from dataclasses import dataclass, field, replace
 from enum import Enum, StrEnum, auto
 from typing import ClassVar, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
-
 from flexsheet.messages.errors import FlexsheetError
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 JOINTS = 6
 
 MAX_UNCHANGED_S = 0.05
-"""The maximum time for which a controller's counters may stay unchanged: seven cycles of 7.1 ms.
-Two exchanges within one cycle of the controller may return the same counters."""
+"""The maximum time for which a controller's counters may stay unchanged: seven cycles of 7.1 ms."""
 
 MIN_PAUSE_S, MAX_PAUSE_S = 0.05, 0.2
 """The minimum and the maximum pause before a driver opens a failed connection again."""
@@ -86,21 +81,18 @@ FAULT_TEXTS = {
 
 
 class Freshness(StrEnum):
-    """A classification of measured joint angles by the counters in the controller's answers."""
+    """The freshness of measured joint angles according to the controller's counters."""
 
     FIRST = "first"
     """The first measurement since the start of the link or of the controller."""
     FRESH = "fresh"
     """A new measurement, because the counters have advanced."""
     REPEATED = "repeated"
-    """A repeated measurement, whose counters are unchanged for a permitted time
-    (`max_unchanged_s`)."""
+    """A repeated measurement: the counters are unchanged, but not for too long a time."""
     STALLED = "stalled"
-    """A repeated measurement, whose counters are unchanged for too long a time
-    (`max_unchanged_s`)."""
+    """A repeated measurement: the counters are unchanged for too long a time."""
     REVERSED = "reversed"
-    """A measurement that is older than the previous measurement, because a counter has
-    decreased."""
+    """A measurement from before the previous measurement, because a counter has decreased."""
 
     @property
     def is_usable(self) -> bool:
@@ -109,7 +101,7 @@ class Freshness(StrEnum):
 
 
 class CounterMonitor:
-    """A monitor of a controller's 32-bit counters, which detects old or repeated measurements.
+    """A detector of old or repeated measurements by the controller's 32-bit counters.
 
     max_unchanged_s: maximum time for which the counters may stay unchanged.
     """
@@ -124,8 +116,8 @@ class CounterMonitor:
     ) -> Freshness:
         """Classify the freshness of an answer by its counters.
 
-        counters: counters of the controller, all of which must advance. The first counter is the
-            number or the time of the controller's measurements.
+        counters: counters of the controller, which must all advance. The first counter is the
+            number or the time of the measurements.
         sent_ns, received_ns: times of the command and of its answer on this computer's clock.
         may_restart: whether a decreased counter means that the controller has restarted.
         """
@@ -178,9 +170,8 @@ class BlockField:
 class ArmLink(Protocol):
     """The interface for the exchange of commands and answers with one arm.
 
-    The mode `move` commands a motion to the given joint angles. The modes `hold`, `stop` and `idle`
-    command no motion. The mode `idle` also restarts the exchange after a fault or a lost
-    connection.
+    The mode `move` commands a motion to joint angles. The modes `hold`, `stop` and `idle` command
+    no motion. The mode `idle` restarts the exchange after a fault or a lost connection.
     """
 
     def due(self, now_ns: int) -> bool:
@@ -200,12 +191,11 @@ class ArmLink(Protocol):
 
 
 class ConnectedLink(ABC):
-    """A base class of drivers that use one connection, on which each command gets one answer.
+    """A base class of drivers that send commands over one connection and receive one answer each.
 
     A driver implements `connected`, `_connect`, `_request` and `_disconnect`. The base class opens
-    the connection when it is needed, and closes it after a failure. After the first failure it
-    reconnects immediately. Before further attempts it waits for MIN_PAUSE_S to MAX_PAUSE_S,
-    doubling the pause each time.
+    the connection, and closes the connection after a failure. The first reconnection is immediate.
+    Further attempts wait for MIN_PAUSE_S to MAX_PAUSE_S, with a doubled pause each time.
     connections: number of connections that were opened.
     """
 
@@ -236,9 +226,9 @@ class ConnectedLink(ABC):
     ) -> tuple[ArmStatus, tuple[int, ...]]:
         """Send one command, wait for its answer, and return the arm's status and counters.
 
-        mode, joints_rad: see `ArmLink`. now_ns: time of the command. The counters have 32 bits, and
-            the first counter is the number of the controller's joint measurements.
-        Raises ArmSilentError, ArmRefusedError or ArmAnswerError.
+        mode, joints_rad: see `ArmLink`. now_ns: time of the command.
+        The first counter is the number of the controller's joint measurements. Raises
+        ArmSilentError, ArmRefusedError or ArmAnswerError.
         """
 
     @abstractmethod
@@ -246,17 +236,10 @@ class ConnectedLink(ABC):
         """Close the connection if it is open."""
 
     def due(self, now_ns: int) -> bool:
-        """Return whether an exchange may be attempted now.
-
-        After a failure, the next exchange must wait for a pause.
-        """
+        """Return whether an exchange may be attempted now, or must wait after a failure."""
         return self.connected or now_ns >= self._try_again_ns
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:
-        """Send a command with joint angles (6,) rad, and return the arm's answer.
-
-        Raises ArmLinkError if the exchange fails.
-        """
         loop = asyncio.get_running_loop()
         start_s = loop.time()
         try:
@@ -288,15 +271,11 @@ class ConnectedLink(ABC):
         return replace(status, freshness=freshness)
 
     def close(self) -> None:
-        """Close the connection; the next exchange opens it again."""
         self._disconnect()
 
 
 def validate_joints(joints_rad: Floats) -> tuple[float, ...]:
-    """Return joint angles (6,) rad as a tuple; raise ValueError unless six angles are finite.
-
-    Drivers check the joint angles again, although the limiter has already checked them.
-    """
+    """Return joint angles (6,) rad as a tuple; raise ValueError unless six angles are finite."""
     joints = tuple(float(angle) for angle in joints_rad)
     if len(joints) != JOINTS or not all(math.isfinite(angle) for angle in joints):
         raise ValueError(f"a command must contain {JOINTS} finite angles, not {joints}")
@@ -306,8 +285,8 @@ def validate_joints(joints_rad: Floats) -> tuple[float, ...]:
 def propagate_cancellation() -> None:
     """Raise CancelledError if the current task was cancelled.
 
-    In Python 3.11, a time-out can suppress a cancellation that occurs in the same iteration of the
-    event loop. The cancelled task would then never end.
+    In Python 3.11, a time-out can suppress a cancellation in the same iteration of the event loop.
+    The cancelled task would then never end.
     """
     task = asyncio.current_task()
     if task is not None and task.cancelling():

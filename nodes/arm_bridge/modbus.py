@@ -1,9 +1,9 @@
 """Exchange commands with an arm by Modbus TCP.
 
-Each cycle sends one request (function code 23) with magic number, version, sequence number and CRC.
-`COMMAND` and `STATUS` define the register map. `website.registers_page` writes the tables of
-docs/modbus.md from this map. Numbers of 32 bits occupy two registers, the high register first. The
-CRC-32 (as in zlib) covers all preceding registers of its block, high byte first.
+Each control cycle sends one request (function code 23). `COMMAND` and `STATUS` define the register
+map, from which `website.registers_page` generates the tables of docs/modbus.md. Numbers of 32 bits
+occupy two registers, the high register first. The CRC-32 (as in zlib) covers all preceding
+registers of its block, high byte first.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerSocket
@@ -32,8 +31,7 @@ from flexsheet.nodes.arm_bridge.link import (
     ConnectedLink,
     validate_joints,
 )
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 MAGIC = 0x4653
 VERSION = 1
@@ -101,7 +99,7 @@ _STATUS_REGISTERS = count_registers(STATUS)
 
 @dataclass(frozen=True, slots=True)
 class ModbusStatus(ArmStatus):
-    """The contents of a status block, whose fields are described in `STATUS`."""
+    """The contents of a status block; see `STATUS` for a description of the fields."""
 
     accepted: int
     cycle: int
@@ -168,8 +166,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
 class _Framer(FramerSocket):
     """A Modbus framer that fails the pending request if an answer cannot be decoded.
 
-    The framer of pymodbus raises the error in the event loop instead, and the request waits until
-    its time-out.
+    With the framer of pymodbus, the request would wait until its time-out.
     """
 
     def __init__(self, client: AsyncModbusTcpClient) -> None:
@@ -196,8 +193,8 @@ class ModbusLink(ConnectedLink):
     """A driver for one arm that uses one Modbus TCP connection.
 
     After a failure, the connection is closed if an answer may still arrive. Otherwise pymodbus
-    3.16.1 could return the late answer to the next request. Other wrong answers are detected by
-    their sequence number and CRC.
+    3.16.1 could return the late answer to the next request. The sequence number and the CRC detect
+    other wrong answers.
     """
 
     def __init__(self, host: str, port: int, *, timeout_s: float = 0.03) -> None:

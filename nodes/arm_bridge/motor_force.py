@@ -2,8 +2,8 @@
 
 The difference between the motor currents with and without the sheet is proportional to the joint
 torques. Static friction of the gears adds an unknown torque of about a tenth of the rated torque.
-The estimate therefore detects errors of several newtons in the sheet's tension, but it is not
-precise enough to calibrate the sheet.
+The estimate detects errors of several newtons in the sheet's tension, but cannot calibrate the
+sheet.
 """
 
 from __future__ import annotations
@@ -11,21 +11,20 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Finite, Positive
 from flexsheet.messages.types import Force, Side
+from flexsheet.nodes.arrays import Floats
 
-Floats = NDArray[np.float64]
 SixPositive = tuple[Positive, Positive, Positive, Positive, Positive, Positive]
 Six = tuple[Finite, Finite, Finite, Finite, Finite, Finite]
 
 STEP_RAD = 1e-5
 MAX_SPEED_RAD_PER_S = 0.02
-"""The maximum joint speed at which the estimate is valid. At higher speeds, the currents also
-depend on sliding friction and acceleration."""
+"""The maximum joint speed at which the estimate is valid. At higher speeds, sliding friction and
+acceleration change the currents."""
 
 PERIOD_NS = 50_000_000
 

@@ -1,9 +1,8 @@
 """Exchange commands with a Mitsubishi controller over UDP by real-time external control (MXT).
 
-A robot program runs `Open "ENET:..." As #1 : Mxt 1,1,<filter ms>`. In each of its cycles, the
-controller then reads one command packet and answers with its measurements. Packets have 196 bytes
-and consist of little-endian fields of fixed width. `PACKET` defines their layout. docs/mxt.md
-states which parts the manufacturer documents, and which parts no public source explains.
+A robot program runs `Open "ENET:..." As #1 : Mxt 1,1,<filter ms>`. In each cycle, the controller
+then reads one command packet and answers with measurements. Packets have 196 bytes of little-endian
+fields, which `PACKET` defines. docs/mxt.md states which parts the manufacturer documents.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.nodes.arm_bridge.link import (
     JOINTS,
@@ -30,8 +28,7 @@ from flexsheet.nodes.arm_bridge.link import (
     propagate_cancellation,
     validate_joints,
 )
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 CONTROLLER_CYCLE_S = 0.0071
 PACKET_BYTES = 196
@@ -75,12 +72,7 @@ PACKET = (
 )
 
 
-def make_struct_format(packet: Sequence[BlockField]) -> str:
-    """Return the format of a packet for Python's `struct` module, little-endian without padding."""
-    return "<" + "".join(f"{field.count}{field.kind}" for field in packet)
-
-
-_PACKET = struct.Struct(make_struct_format(PACKET))
+_PACKET = struct.Struct("<" + "".join(f"{field.count}{field.kind}" for field in PACKET))
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,10 +151,9 @@ def has_advanced(count: int, before: int, steps: int) -> bool:
 class MxtLink:
     """A driver for a controller that runs an `Mxt` program.
 
-    The socket stays open, so that the controller always answers to the same port. Late answers are
-    detected by the controller's counter, which must advance by the number of commands since the
-    last answer. After a lost command, the next answer is therefore dropped too. The mode `idle`
-    restarts the comparison of the counter.
+    Late answers are detected by the controller's counter, which must advance by the number of
+    commands since the last answer. After a lost command, the next answer is therefore dropped too.
+    The mode `idle` restarts the comparison of the counter.
     stale: number of late answers that were dropped.
     """
 
@@ -183,8 +174,6 @@ class MxtLink:
         self._unanswered = 0
 
     def due(self, now_ns: int) -> bool:
-        """Return whether an exchange may be attempted now: always, because UDP has no
-        connection."""
         return True
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> MxtStatus:
@@ -227,7 +216,7 @@ class MxtLink:
         return replace(status, freshness=freshness)
 
     async def _open(self) -> socket.socket:
-        """Return the connected socket, which receives packets only from the controller."""
+        """Return the socket, which receives packets from the controller only."""
         if self._socket is None:
             link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
             link.setblocking(False)
@@ -261,7 +250,7 @@ class MxtLink:
     def close(self) -> None:
         """Command the controller to end external control.
 
-        If this packet is lost, the controller ends external control after its time-out.
+        If the packet is lost, the controller ends external control after a time-out.
         """
         if self._socket is not None:
             with contextlib.suppress(OSError):

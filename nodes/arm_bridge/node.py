@@ -37,8 +37,7 @@ from flexsheet.nodes.models.servo_lag import LagBounds, ServoLagEstimator
 from flexsheet.nodes.node import Input, Node, Output, periodic
 
 MIN_SERVO_LAG_S = 0.002
-"""The minimum plausible delay of a servo. A shorter measured delay is an error, because no servo of
-an arm is faster."""
+"""The minimum plausible delay of a servo. A shorter measured delay is a measurement error."""
 
 CHECK_PERIOD_NS = 100_000_000
 """The period of the arm's self-checks. The results are published once per second."""
@@ -102,10 +101,7 @@ class ArmBridge(Node):
         self._cycling = asyncio.Lock()
 
     async def close(self) -> None:
-        """Send a stop command to the arm.
-
-        If the command is lost, the arm's own watchdog stops the arm.
-        """
+        """Send a stop command to the arm, and close the connection."""
         async with self._cycling:
             self._geometry, joints_rad = None, self._control.commanded_rad
             try:
@@ -222,7 +218,7 @@ class ArmBridge(Node):
     def _estimate_force(
         self, geometry: ArmGeometry, other: OtherArm | None, status: ArmStatus
     ) -> None:
-        """Publish the pull of the sheet on the arm, if the arm has reported motor currents."""
+        """Publish the sheet's pull on the arm if the arm has reported motor currents."""
         if self._motor_force is None or status.currents_percent is None or other is None:
             return
         own = geometry.world_from_edge(status.joints_rad)[:3, 3]
@@ -255,10 +251,9 @@ class ArmBridge(Node):
             self.arm_latency.publish(ArmLatency(side=self.parameters.side, latency_s=latency_s))
 
     def _read_goal(self, trajectory: SheetTrajectory | None) -> Goal | None:
-        """Return the goal at the time when the next command takes effect, from the newest target.
+        """Return the goal at the time when the next command takes effect.
 
-        trajectory: trajectory of the target if the other arm follows the trajectory too, otherwise
-            None.
+        trajectory: trajectory of the target if the other arm follows it too, otherwise None.
         """
         target = self.sheet_target.message
         if target is None:

@@ -1,4 +1,4 @@
-"""Represent the arm at the other edge of the sheet by the state that its node publishes."""
+"""Convert and check the state message of the arm at the other edge of the sheet."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmMode, ArmState
 from flexsheet.nodes.arm_bridge.goal import MAX_PREDICTION_S, MAX_TRAJECTORY_S
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import is_rigid
 
-Floats = NDArray[np.float64]
-
 MAX_FUTURE_S = 0.02
-"""The maximum time by which the timestamp of a state may lie in the future. The errors of the
-measured clock offsets are smaller."""
+"""The tolerance for timestamps in the future, because of clock errors."""
 
 MAX_TARGET_DIFFERENCE_NS = round(1e9 * MAX_TRAJECTORY_S)
-"""The maximum time between the camera exposures of two targets whose trajectories overlap."""
+"""The maximum time between the camera exposures of two targets with overlapping trajectories."""
 
 MAX_TRAJECTORY_END_NS = round(1e9 * (MAX_PREDICTION_S + MAX_TRAJECTORY_S))
 """The maximum time from the camera exposure of a target to the end of its trajectory."""
@@ -32,9 +29,9 @@ class OtherArm:
 
     ready: whether the other arm may move.
     estop_engaged: whether the other arm's bridge has latched an e-stop.
-    agrees: whether the other arm may follow the trajectory of the same target or of an adjacent
-        target. The age of the state is then counted from the end of that trajectory.
-    ended: whether the other arm's bridge has ended after it published this state.
+    agrees: whether the other arm follows a trajectory that overlaps with the trajectory of this
+        arm. The age of the state is then counted from the end of the other arm's trajectory.
+    ended: whether the other arm's bridge has ended.
     """
 
     joints_rad: Floats
@@ -60,8 +57,8 @@ class OtherArm:
     ) -> OtherArm:
         """Convert a state message of the other arm's bridge.
 
-        age_s: age of the message. target_source_ns: time of the camera exposure on which this arm's
-            target is based.
+        age_s: age of the message. target_source_ns: time of the camera exposure for this arm's
+            target.
         """
         other_ns = state.target_source_ns
         ends_ns = min(state.trajectory_ends_ns, other_ns + MAX_TRAJECTORY_END_NS)

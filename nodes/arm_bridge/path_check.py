@@ -1,9 +1,9 @@
 """Check before a motion whether both arms can move the sheet to its target.
 
-The bridge of each arm receives the joint angles of both arms. It simulates the sheet's motion, and
-checks at each pose whether both arms are within their limits. A check takes some milliseconds and
-therefore runs outside the cycle that sends commands. If necessary, the arms are first aligned. They
-then move to joint angles at which the sheet is flat and on the path.
+The bridge of each arm knows the joint angles of both arms. The bridge simulates the sheet's motion,
+and checks whether both arms stay within their limits. A check takes some milliseconds and therefore
+runs outside the control cycle. If necessary, the arms are first aligned: they move to joint angles
+at which the sheet is flat and on the path.
 """
 
 from __future__ import annotations
@@ -12,28 +12,21 @@ import asyncio
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.notes import NodeNote
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.limiter import (
-    SheetLimits,
-    check_flange,
-    check_sheet,
-    relax_limits,
-)
+from flexsheet.nodes.arm_bridge.limiter import SheetLimits
 from flexsheet.nodes.arm_bridge.reach import (
     PathError,
     PathStep,
     interpolate_sheet,
-    plan_path_through,
+    plan_path,
     solve_step,
 )
+from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.interpolation import smoothstep
 from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, follow_sheet
 from flexsheet.nodes.models.rigid import is_rigid, vector_from_rotation
-
-Floats = NDArray[np.float64]
 
 # Slow bounds (a quarter of the tool speed) for the motion from rest to the target, because the user
 # may touch the sheet.
@@ -48,29 +41,28 @@ START_BOUNDS = SheetBounds(
 
 REHEARSAL_STEP_S = 0.05
 MAX_REHEARSAL_S = 60.0
-"""The maximum duration of a simulated motion. Motions across the whole workspace with START_BOUNDS
-are shorter."""
+"""The maximum duration of a simulated motion. Motions across the whole workspace are shorter."""
 
 CORNER_EVERY = 4
 """The number of simulated steps between two corners of the checked path. The straight lines between
 the corners deviate from the simulated motion by less than 1 mm."""
 
 NEAR_M, NEAR_RAD, NEAR_STRETCH = 0.03, 0.2, 0.02
-"""The maximum differences in position (m), rotation (rad) and stretch between a checked target and
-a newer target for which the check remains valid."""
+"""The maximum changes of the target in position (m), rotation (rad) and stretch ratio for which a
+check remains valid."""
 
 MAX_START_MOTION_RAD = 0.002
-"""The maximum joint motion after a check. If a joint has moved farther, the check is invalid."""
+"""The maximum joint motion since a check for which the check remains valid."""
 
 ALIGN_FRACTIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""The positions on the path, as fractions of its length, to which the arms may align. The first
-feasible position is used."""
+"""The positions (fractions of the path) to which the arms may align. The first feasible position is
+used."""
 
 MAX_ALIGN_STEP_RAD = 0.02
 """The maximum change of a joint between two checked points of an alignment."""
 
 MAX_ALIGN_RAD = 1.0
-"""The maximum joint motion of an alignment. A larger motion could switch to another branch of the
+"""The maximum joint motion of an alignment. A larger motion could switch to another solution of the
 inverse kinematics."""
 
 ALIGN_SPEED_M_PER_S, ALIGN_SPEED_RAD_PER_S = 0.06, 0.5
@@ -82,7 +74,7 @@ PEAK_TO_MEAN_SPEED = 1.5
 
 @dataclass(frozen=True, slots=True)
 class PathCheckRequest:
-    """A path to check: start and target of the sheet, and joint angles (6,) rad of both arms."""
+    """The start and the target of the sheet, and the joint angles (6,) rad of both arms."""
 
     start: SheetMotion
     goal: SheetMotion
@@ -92,7 +84,7 @@ class PathCheckRequest:
     def begins_at(self, own_rad: Floats, other_rad: Floats) -> bool:
         """Return whether both arms are still at the start of the path.
 
-        own_rad, other_rad: present joint angles (6,) of both arms.
+        own_rad, other_rad: present joint angles (6,).
         """
         moved_rad = max(
             float(np.abs(own_rad - self.own_rad).max()),
@@ -136,7 +128,7 @@ class Alignment:
     """A straight joint motion that moves one arm to a point on the path of the sheet.
 
     An alignment is necessary if the arms have stopped with a twisted sheet, or at the end of a
-    joint's range. Their joint angles then do not correspond to a pose of a flat sheet.
+    joint's range.
 
     sheet: first pose on the path that both arms can reach.
     from_rad, to_rad: this arm's joint angles (6,) at the start and at the end.
@@ -156,7 +148,7 @@ class Alignment:
 
 
 def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> Alignment | str:
-    """Return the alignment of this arm to the path, or a text if an arm cannot follow the path."""
+    """Return the alignment of this arm to the path, or the reason why the path is blocked."""
     left, right = (arm, other) if arm.left else (other, arm)
     if not (is_rigid(request.start.world_from_sheet) and is_rigid(request.goal.world_from_sheet)):
         return (
@@ -179,9 +171,7 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
             continue
         try:
             corners = rehearse(sheet, request.goal, arm.edge_bound)
-            plan_path_through(
-                left, right, corners, left_rad=there.left_rad, right_rad=there.right_rad
-            )
+            plan_path(left, right, corners, left_rad=there.left_rad, right_rad=there.right_rad)
         except PathError as error:
             first = first or error
             # A start at a smaller fraction would lead to the blocked position again.
@@ -196,7 +186,7 @@ def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) 
 def _check_alignment(
     left: ArmGeometry, right: ArmGeometry, begin: PathStep, there: PathStep
 ) -> None:
-    """Check a straight joint motion of both arms; raise PathError if it violates a limit.
+    """Raise PathError if a straight joint motion of both arms violates a limit.
 
     begin, there: joint angles of both arms at the start and at the end.
     Limits that are already violated at the start are widened.
@@ -209,24 +199,16 @@ def _check_alignment(
     for part in np.linspace(0.0, 1.0, count + 1):
         joints = begin.left_rad + part * changes[0], begin.right_rad + part * changes[1]
         flanges = [arm.world_from_flange(rad) for arm, rad in zip(arms, joints, strict=True)]
-        edges = [flange @ arm.flange_from_edge for arm, flange in zip(arms, flanges, strict=True)]
         for number, arm in enumerate(arms):
-            poses = flanges[number], edges[number], flanges[1 - number], edges[1 - number]
+            own, other = flanges[number], flanges[1 - number]
             if part == 0.0:
-                limits.append(relax_limits(arm.sheet_limits, *poses, left=arm.left))
-            violation = check_flange(poses[0], poses[2], limits[number]) or check_sheet(
-                poses[1], poses[3], left=arm.left, limits=limits[number]
-            )
+                limits.append(arm.relax_limits(own, other))
+            violation = arm.check_limits(own, other, limits[number])
             if violation is None and max_change_rad > MAX_ALIGN_RAD:
                 violation = "its joint angles are too far from the path of the sheet"
             if violation is not None:
-                raise PathError(
-                    violation,
-                    side=arm.side,
-                    limit="alignment",
-                    fraction=0.0,
-                    world_from_sheet=there.sheet.world_from_sheet,
-                )
+                pose = there.sheet.world_from_sheet
+                raise PathError(arm.side, violation, "alignment", 0.0, pose)
 
 
 def _find_duration_s(
@@ -246,7 +228,7 @@ def _find_duration_s(
 
 
 class PathChecker:
-    """A runner of path checks, which executes one check at a time in a thread."""
+    """A runner of path checks in a thread, one check at a time."""
 
     def __init__(self, arm: ArmGeometry, other: ArmGeometry) -> None:
         self._arm, self._other = arm, other
@@ -255,10 +237,9 @@ class PathChecker:
     def poll(
         self, request: PathCheckRequest | None
     ) -> tuple[PathCheckRequest, Alignment | str] | None:
-        """Return a finished request with its result, or None if no check has finished.
+        """Return a finished request and its result, or None; call this method in every cycle.
 
-        request: check to start unless another check is running; None if no check is necessary.
-        This method must be called in every cycle.
+        request: check to start unless a check is running; None if no check is necessary.
         """
         if self._running is None:
             if request is not None:

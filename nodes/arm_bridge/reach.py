@@ -1,16 +1,16 @@
-"""Check whether the arms can reach poses of the sheet: many poses at once, or along a path.
+"""Check whether the arms can reach many poses of the sheet, or follow a path.
 
 Two arms hold the sheet by its left and right edges. Poses of the sheet are (n, 4, 4) in the world
-with stretch ratios (n,); joint angles are (n, 6) rad. A margin is the distance to a limit, and it
-is positive within the limit. Margins of speeds are fractions of the limit. A branch is one of the
-discrete solutions of the inverse kinematics.
+with stretch ratios (n,). Joint angles are (n, 6) rad. A margin is the distance to a limit, positive
+within the limit. Margins of speeds are fractions of the limit. A branch is one of the discrete
+solutions of the inverse kinematics.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
+from flexsheet.nodes.arm_bridge.joint_chain import UnreachableError
+from flexsheet.nodes.arrays import Bools, Floats
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import (
     inverse,
@@ -28,9 +29,6 @@ from flexsheet.nodes.models.rigid import (
     vector_from_rotation,
 )
 from flexsheet.nodes.models.sheet.tension import edge_force_n
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 RANGES = tuple(f"J{joint} range" for joint in range(1, 7))
 SPEEDS = tuple(f"J{joint} speed" for joint in range(1, 7))
@@ -49,42 +47,31 @@ COMMAND_LIMITS = ("reach", *RANGES, "workspace", "flange distance", "edge force"
 """The names of the limits that the limiter also enforces for every command."""
 SPEED_LIMITS = (*SPEEDS, "tool speed")
 LIMITS = (*POSE_LIMITS, *SPEED_LIMITS)
-"""The names of all limits. If a pose violates several limits, the first violated limit in this
-order is reported."""
+"""The names of all limits. The first violated limit in this order is reported."""
 
 BRANCH_SAMPLES = 500
 """The approximate number of sampled poses from which `find_best_reach` selects the branch."""
 
 SPEED_DAMPING = 1e-12
-"""The damping term that limits the computed joint speeds at a singularity."""
+"""The damping term of the normal equations. It limits the computed speeds at a singularity."""
 
 MAX_STEP_RAD = 0.05
 """The maximum change of a joint between two samples of a path."""
 
 MIN_FRACTION = 1e-6
-"""The minimum distance between two samples, as a fraction of the path. If a joint changes by more
-than MAX_STEP_RAD over this distance, the motion of the joint is discontinuous."""
+"""The minimum distance between two samples, as a fraction of the path. A joint motion of more than
+MAX_STEP_RAD over this distance is discontinuous."""
 
 ROUNDING = 1e-9
-"""The tolerance by which rounding errors may make a margin negative."""
-
-DETOURS_M = (
-    (0.0, 0.0, 0.05),
-    (0.0, 0.0, 0.1),
-    (0.0, 0.05, 0.05),
-    (0.0, -0.05, 0.05),
-    (0.0, 0.08, 0.0),
-    (0.0, -0.08, 0.0),
-)
-"""The offsets (m, world frame) of detours, in the order in which they are tried."""
+"""The tolerance of margins for rounding errors."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPoses:
     """Poses (n, 4, 4), stretch ratios (n,) and twists (n, k, 6) of the sheet in the world.
 
-    twists_world: k velocities (m/s, rad/s) of the sheet's centre that the arms must be able to
-        follow at each pose; k may be 0.
+    twists_world: velocities (m/s, rad/s) of the sheet's centre that the arms must be able to follow
+        at each pose; k may be 0.
     """
 
     world_from_sheet: Floats
@@ -95,10 +82,7 @@ class SheetPoses:
         return len(self.stretch_ratio)
 
     def some(self, chosen: NDArray[np.intp] | Bools) -> SheetPoses:
-        """Return a subset of the poses.
-
-        chosen: array of indices, or of one boolean per pose.
-        """
+        """Return the poses that an array of indices or of booleans selects."""
         return SheetPoses(
             self.world_from_sheet[chosen], self.stretch_ratio[chosen], self.twists_world[chosen]
         )
@@ -114,8 +98,7 @@ class ArmReach:
 
     joints_rad: joint angles (n, 6); NaN for poses that are out of reach.
     margins: margins (n,) for each limit in `LIMITS`. Margins that depend on joint angles are NaN
-        for poses that are out of reach. Margins of singularities that the arm does not have are
-        infinite.
+        for poses out of reach. Margins are infinite for singularities that the arm does not have.
     """
 
     branch: Any
@@ -172,9 +155,8 @@ def compute_reach(
 def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses) -> ArmReach:
     """Return the joint angles and margins on the branch that reaches the most poses.
 
-    If several branches reach equally many poses, the branch with the larger margins is selected.
-    The same branch is used for all poses, because an arm cannot change its branch while it holds
-    the sheet.
+    Among branches that reach equally many poses, the branch with the larger margins is selected. An
+    arm cannot change its branch while the arm holds the sheet.
     """
     still = places.without_twists().some(
         np.arange(0, len(places), max(1, len(places) // BRANCH_SAMPLES))
@@ -256,28 +238,9 @@ def _speeds(
 
 
 def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
-    """Return the tool points (n, 4, 3) m in the world frame.
-
-    The points are the centre and both ends of the clamped edge, and the flange.
-    """
+    """Return the points `ArmGeometry.tool_points_flange` (n, 4, 3) m in the world frame."""
     points = np.einsum("nij,pj->npi", flanges[:, :3, :3], geometry.tool_points_flange)
     return np.asarray(points + flanges[:, None, :3, 3])
-
-
-@dataclass(frozen=True, slots=True)
-class SheetPath:
-    """A path of the sheet that both arms can follow: m poses from start to goal.
-
-    left_rad, right_rad: joint angles (m, 6) of both arms, each on one branch.
-    times_s: times (m,) of the poses if joints and edges move with their maximum speeds.
-    via_m: offset of the detour in the world frame; None for a straight path.
-    """
-
-    places: SheetPoses
-    left_rad: Floats
-    right_rad: Floats
-    times_s: Floats
-    via_m: tuple[float, float, float] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +262,7 @@ class PathError(FlexsheetError, ValueError):
     remedy = "Move the arms nearer to the sheet by hand, then enable them again."
 
     def __init__(
-        self, why: str, *, side: Side, limit: str, fraction: float, world_from_sheet: Floats
+        self, side: Side, why: str, limit: str, fraction: float, world_from_sheet: Floats
     ) -> None:
         x, y, z = np.round(1e3 * world_from_sheet[:3, 3]) + 0.0
         super().__init__(
@@ -314,63 +277,22 @@ class PathError(FlexsheetError, ValueError):
 def plan_path(
     left: ArmGeometry,
     right: ArmGeometry,
-    start: SheetMotion,
-    goal: SheetMotion,
-    *,
-    left_rad: Floats | None = None,
-    right_rad: Floats | None = None,
-    detours_m: Sequence[tuple[float, float, float]] = DETOURS_M,
-) -> SheetPath:
-    """Plan a path for both arms between two poses and stretches of the sheet.
-
-    left_rad, right_rad: joint angles (6,) at the start; if None, all branches are tried.
-    detours_m: offsets of the detours that are tried if the straight path violates a limit.
-
-    On a straight path, the sheet rotates about one axis and its stretch changes linearly. On a
-    detour, the sheet is shifted by the offset after the start, and shifted back at the end. Raises
-    PathError if neither the straight path nor a detour is possible. The error names the limit that
-    the straight path violates.
-    """
-    starts = list(product(_starts(left, start, left_rad), _starts(right, start, right_rad)))
-    first: PathError | None = None
-    for via in (None, *detours_m):
-        corners = [start, goal] if via is None else [start, *_shifted((start, goal), via), goal]
-        for at_left, at_right in starts:
-            try:
-                track = _sample_path(left, right, corners, PathStep(start, at_left, at_right))
-                return _check_limits(left, right, track, via)
-            except PathError as error:
-                first = first or error
-    assert first is not None
-    raise first
-
-
-def plan_path_through(
-    left: ArmGeometry,
-    right: ArmGeometry,
     corners: Sequence[SheetMotion],
     *,
     left_rad: Floats,
     right_rad: Floats,
-) -> SheetPath:
+) -> list[PathStep]:
     """Plan a path for both arms that is straight between the given corners.
 
-    left_rad, right_rad: joint angles (6,) at the first corner.
-    Raises PathError if the path violates a limit.
+    left_rad, right_rad: joint angles (6,) near those at the first corner.
+    Between two corners, the sheet rotates about one axis and its stretch changes linearly. Raises
+    PathError if the path violates a limit.
     """
-    begin = PathStep(
-        corners[0],
-        _solve_joints(left, corners[0], left_rad, fraction=0.0),
-        _solve_joints(right, corners[0], right_rad, fraction=0.0),
-    )
-    return _check_limits(left, right, _sample_path(left, right, corners, begin), None)
-
-
-def _shifted(
-    places: Sequence[SheetMotion], offset_m: tuple[float, float, float]
-) -> list[SheetMotion]:
-    shift = transform(np.eye(3), np.array(offset_m))
-    return [replace(one, world_from_sheet=shift @ one.world_from_sheet) for one in places]
+    near = PathStep(corners[0], left_rad, right_rad)
+    begin = _solve_both(left, right, corners[0], near, fraction=0.0)
+    steps = _sample_path(left, right, corners, begin)
+    _check_limits(left, right, steps)
+    return steps
 
 
 def _sample_path(
@@ -387,11 +309,7 @@ def _sample_path(
             ahead = min(fraction + step, 1.0)
             place, before = interpolate_sheet(near, far, ahead), track[-1]
             whole = (number + ahead) / (len(corners) - 1)
-            there = PathStep(
-                place,
-                _solve_joints(left, place, before.left_rad, fraction=whole),
-                _solve_joints(right, place, before.right_rad, fraction=whole),
-            )
+            there = _solve_both(left, right, place, before, fraction=whole)
             jumps_rad = [
                 float(np.abs(there.left_rad - before.left_rad).max()),
                 float(np.abs(there.right_rad - before.right_rad).max()),
@@ -425,31 +343,7 @@ def _explain_jump(
         if binding < 0
         else f"its joint solution violates the limit {limit} beyond this position"
     )
-    return PathError(
-        why, side=arm.side, limit=limit, fraction=fraction, world_from_sheet=there.world_from_sheet
-    )
-
-
-def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[Floats]:
-    """Return the joint angles (6,) rad that an arm may have at the start of a path.
-
-    given: joint angles near the solution. If None, one solution per branch within the joint ranges
-        is returned. Solutions with larger distances from the ends of the ranges are first.
-    """
-    if given is not None:
-        return [_solve_joints(arm, start, given, fraction=0.0)]
-    pose = arm.base_from_world @ compute_flange_poses(arm, _make_poses([start]))[0]
-    revolutions = np.array([0.0, 2.0 * np.pi, -2.0 * np.pi])
-    lowest, highest = arm.joint_limits.min_rad, arm.joint_limits.max_rad
-    found: list[tuple[float, Floats]] = []
-    for solution in arm.kinematics.solve_all(pose):
-        rotated = solution[:, None] + revolutions
-        margin = np.minimum(rotated - lowest[:, None], highest[:, None] - rotated)
-        joints = rotated[np.arange(6), margin.argmax(axis=1)]
-        found.append((float(margin.max(axis=1).min()), joints))
-    found.sort(key=lambda one: -one[0])
-    in_range = [joints for margin, joints in found if margin >= 0.0]
-    return in_range or [_solve_joints(arm, start, arm.start_rad, fraction=0.0)]
+    return PathError(arm.side, why, limit, fraction, there.world_from_sheet)
 
 
 def _solve_joints(
@@ -460,13 +354,17 @@ def _solve_joints(
         return arm.solve_joints(pose, near_rad)
     except UnreachableError as error:
         limit = f"{error.limit} range" if f"{error.limit} range" in RANGES else error.limit
-        raise PathError(
-            str(error),
-            side=arm.side,
-            limit=limit,
-            fraction=fraction,
-            world_from_sheet=place.world_from_sheet,
-        ) from error
+        raise PathError(arm.side, str(error), limit, fraction, place.world_from_sheet) from error
+
+
+def _solve_both(
+    left: ArmGeometry, right: ArmGeometry, sheet: SheetMotion, near: PathStep, *, fraction: float
+) -> PathStep:
+    return PathStep(
+        sheet,
+        _solve_joints(left, sheet, near.left_rad, fraction=fraction),
+        _solve_joints(right, sheet, near.right_rad, fraction=fraction),
+    )
 
 
 def solve_step(
@@ -474,15 +372,11 @@ def solve_step(
 ) -> PathStep:
     """Solve the joint angles of both arms for a pose of the sheet.
 
-    near: neighbouring step, whose joint angles are near the solution.
-    fraction: position on the path (0 to 1), which the error text states.
+    near: neighbouring step on the path, with joint angles near the solution.
+    fraction: position on the path (0 to 1) for the error text.
     Raises PathError if a limit of COMMAND_LIMITS is violated.
     """
-    step = PathStep(
-        sheet,
-        _solve_joints(left, sheet, near.left_rad, fraction=fraction),
-        _solve_joints(right, sheet, near.right_rad, fraction=fraction),
-    )
+    step = _solve_both(left, right, sheet, near, fraction=fraction)
     places = _make_poses([sheet])
     flanges = [compute_flange_poses(arm, places) for arm in (left, right)]
     for number, (arm, joints) in enumerate(((left, step.left_rad), (right, step.right_rad))):
@@ -495,18 +389,13 @@ def solve_step(
         )
         for limit in COMMAND_LIMITS:
             if not margins[limit][0] >= 0.0:
-                raise PathError(
-                    f"the limit {limit} is violated",
-                    side=arm.side,
-                    limit=limit,
-                    fraction=fraction,
-                    world_from_sheet=sheet.world_from_sheet,
-                )
+                why = f"the limit {limit} is violated"
+                raise PathError(arm.side, why, limit, fraction, sheet.world_from_sheet)
     return step
 
 
 def interpolate_sheet(start: SheetMotion, goal: SheetMotion, fraction: float) -> SheetMotion:
-    """Return the sheet at rest at a position on the straight path between two poses.
+    """Return the sheet at rest on the straight path between two poses.
 
     fraction: position on the path, 0 to 1.
     """
@@ -526,13 +415,8 @@ def _make_poses(motions: Sequence[SheetMotion]) -> SheetPoses:
     )
 
 
-def _check_limits(
-    left: ArmGeometry,
-    right: ArmGeometry,
-    track: Sequence[PathStep],
-    via: tuple[float, float, float] | None,
-) -> SheetPath:
-    """Return the path, or raise PathError if one of its poses violates a limit.
+def _check_limits(left: ArmGeometry, right: ArmGeometry, track: Sequence[PathStep]) -> None:
+    """Raise PathError if one of the poses of a path violates a limit.
 
     A limit that is violated at the start may remain violated by the same amount.
     """
@@ -542,7 +426,6 @@ def _check_limits(
         np.array([step.right_rad for step in track]),
     )
     flanges = [compute_flange_poses(arm, places) for arm in (left, right)]
-    times = np.zeros(len(track))
     for index, arm in enumerate((left, right)):
         branch = arm.kinematics.find_branch(joints[index][0])
         own, other = flanges[index], flanges[1 - index]
@@ -554,16 +437,6 @@ def _check_limits(
         broken = np.flatnonzero(~reach.reachable)
         if len(broken):
             limit = LIMITS[int(reach.binding[broken[0]])]
-            raise PathError(
-                f"the limit {limit} is violated",
-                side=arm.side,
-                limit=limit,
-                fraction=float(broken[0]) / max(len(track) - 1, 1),
-                world_from_sheet=places.world_from_sheet[broken[0]],
-            )
-        steps = np.abs(np.diff(joints[index], axis=0)) / arm.joint_limits.speed_rad_per_s
-        points = _tool_points(arm, own)
-        travel = np.linalg.norm(np.diff(points, axis=0), axis=2).max(axis=1) / arm.max_tool_speed
-        slowest = np.maximum(steps.max(axis=1), travel)
-        times[1:] = np.maximum(times[1:], slowest)
-    return SheetPath(places, joints[0], joints[1], np.cumsum(times), via)
+            fraction = float(broken[0]) / max(len(track) - 1, 1)
+            why = f"the limit {limit} is violated"
+            raise PathError(arm.side, why, limit, fraction, places.world_from_sheet[broken[0]])

@@ -18,15 +18,13 @@ reports per second."""
 
 @dataclass(slots=True)
 class LastExchange:
-    """The times of the newest exchange with the arm.
+    """The times (ns on this computer's clock) of the newest exchange with the arm.
 
-    target, received_ns: header and arrival time of the sheet target from which the command was
-        computed.
+    target, received_ns: header and arrival time of the sheet target.
     trajectory_ends_ns: end of the target's trajectory; 0 without a trajectory.
     sent_ns, measured_ns: times of the last command and of the last answer; 0 before the first
         exchange.
     duration_s: duration of the last exchange.
-    All times are in ns on this computer's clock.
     """
 
     target: Header | None = None
@@ -42,14 +40,14 @@ class LastExchange:
 
 
 class LatencyMean:
-    """The mean latency from the camera exposure of a target until the arm has moved."""
+    """The mean latency from the camera exposure until the arm has moved."""
 
     def __init__(self) -> None:
         self._target: Header | None = None
         self._sum_s, self._count = 0.0, 0
 
     def add(self, exchange: LastExchange, lag: ServoLagEstimator) -> float | None:
-        """Add an exchange, unless its target was added before.
+        """Add an exchange with a new target, and ignore exchanges with the same target.
 
         Returns the mean latency (s) after every REPORTED_TARGETS targets, otherwise None.
         """

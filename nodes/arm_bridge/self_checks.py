@@ -9,13 +9,13 @@ from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.models.servo_lag import LagEstimate
 
 LAG_THRESHOLD_S = 0.01
-"""The maximum deviation of the measured servo lag from the configured lag. It equals five standard
-deviations of a calibrated lag (2 ms)."""
+"""The maximum deviation of the measured servo lag from the configured lag: five standard deviations
+of a calibrated lag (2 ms)."""
 
 TRACKING_THRESHOLD_RAD = 0.005
-"""The maximum difference between the tracking error and the tracking error of an ideal servo with
-the measured lag. It corresponds to 2 mm at 0.4 m. The largest tabulated backlash (0.6 mrad per
-joint) causes a fourth of this displacement."""
+"""The maximum difference between the tracking error and that of an ideal servo with the measured
+lag. At 0.4 m, it corresponds to 2 mm, which is four times the effect of the largest tabulated
+backlash (0.6 mrad per joint)."""
 
 
 class ServoCheck:
@@ -24,8 +24,8 @@ class ServoCheck:
     configured_lag_s: lag of the arm according to the parameters.
     command_period_s: period of the commands to the arm.
 
-    An overloaded computer sends commands late and reads answers late, which changes the measured
-    lag of a correct arm. A deviation that both delays together explain is ignored.
+    An overloaded computer sends commands late and reads answers late. A deviation of the lag that
+    these delays explain is ignored.
     """
 
     def __init__(self, side: Side, configured_lag_s: float, command_period_s: float) -> None:

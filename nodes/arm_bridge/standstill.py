@@ -3,36 +3,31 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.nodes.arm_bridge.link import Freshness
-
-Floats = NDArray[np.float64]
+from flexsheet.nodes.arrays import Floats
 
 STANDSTILL_COUNT = 5
 """The number of consecutive unchanged measurements after which an arm at its last command is at
 rest."""
 
 SETTLED_COUNT = 100
-"""The number of consecutive unchanged measurements after which an arm that is not at its last
-command is at rest. It is sufficient for measurements that lag by 0.7 s."""
+"""The number of consecutive unchanged measurements after which an arm away from its last command is
+at rest. The number is sufficient for measurements that lag by 0.7 s."""
 
 STANDSTILL_RAD = 1e-3
 """The maximum difference between measurements that count as unchanged: 200 times the encoder
 noise."""
 
 MAX_RESTART_SHIFT_M = 0.005
-"""The maximum distance between commanded and measured edge at which a motion may restart from the
-measured position. Joint servos with a lag of at least 15 ms then move there at less than 0.25
-m/s."""
+"""The maximum distance between commanded and measured edge at which a motion may restart. Servos
+with a lag of at least 15 ms cover this distance at less than 0.25 m/s."""
 
 JUMP_MARGIN_RAD = 0.002
-"""The step by which measured joint angles may change in addition to a motion at a plausible
-speed."""
+"""The tolerance of the plausible joint motion between two measurements."""
 
 JUMP_SPEED_RAD_PER_S = 0.5
-"""The joint speed that is plausible without a command. The operator may move the arm with its teach
-pendant."""
+"""The plausible joint speed without a command. The operator may move the arm by teach pendant."""
 
 OVERSPEED = 1.5
 """The maximum ratio of an arm's speed to its commanded speed while the arm catches up."""
@@ -46,14 +41,16 @@ ON_PATH_RAD = 0.005
 
 
 class StandstillMonitor:
-    """A monitor that counts unchanged measurements since the last command that moved the arm.
+    """A monitor that counts unchanged measurements since the last motion.
 
     has_jumped: whether measurements have changed faster than the arm can move.
+    is_alive: whether the measurements contain encoder noise. Measurements without any noise
+        indicate that the controller repeats old joint angles.
     """
 
     def __init__(self) -> None:
         self.has_jumped = False
-        self._alive = False
+        self.is_alive = False
         self._count = 0
         self._anchor_rad = self._last_rad = np.full(6, np.nan)
         self._elapsed_s, self._speeds_rad_per_s = 0.0, np.zeros(6)
@@ -66,28 +63,17 @@ class StandstillMonitor:
         """
         return self._count >= (STANDSTILL_COUNT if at_command else SETTLED_COUNT)
 
-    @property
-    def is_alive(self) -> bool:
-        """Return whether the measurements contain encoder noise.
-
-        Measurements without any noise indicate that the controller repeats old joint angles.
-        """
-        return self._alive
-
     def restart(self) -> None:
-        """Restart the count of measurements after a motion."""
-        self._count, self._alive = 0, False
+        """Restart the count of unchanged measurements."""
+        self._count, self.is_alive = 0, False
 
     def forget(self) -> None:
-        """Discard the count and the last measured joint angles after a gap in the measurements."""
+        """Discard the count and the last measured joint angles."""
         self.restart()
         self._last_rad = np.full(6, np.nan)
 
     def on_command(self, joints_rad: Floats, velocity_rad_per_s: Floats, step_s: float) -> None:
-        """Update the monitor after a command that covers `step_s`.
-
-        joints_rad, velocity_rad_per_s: commanded joint angles (6,) and joint velocities (6,).
-        """
+        """Add the joint angles (6,) and joint velocities (6,) of a command for `step_s` seconds."""
         self._elapsed_s += step_s
         speeds = np.abs(velocity_rad_per_s)
         decay = max(0.0, 1.0 - step_s / MEMORY_S)
@@ -103,7 +89,7 @@ class StandstillMonitor:
             self.restart()
 
     def on_measurement(self, joints_rad: Floats, freshness: Freshness) -> None:
-        """Update the monitor with a measurement of the joint angles (6,) rad."""
+        """Add a measurement of the joint angles (6,) rad."""
         if freshness == Freshness.REPEATED:
             return
         if not freshness.is_usable:
@@ -121,7 +107,7 @@ class StandstillMonitor:
             self.has_jumped = True
         if self._count and float(np.abs(joints_rad - self._anchor_rad).max()) <= STANDSTILL_RAD:
             self._count += 1
-            self._alive = self._alive or bool(change.any())
+            self.is_alive = self.is_alive or bool(change.any())
         else:
-            self._anchor_rad, self._count, self._alive = joints_rad, 1, False
+            self._anchor_rad, self._count, self.is_alive = joints_rad, 1, False
         self._last_rad, self._elapsed_s = joints_rad, 0.0

@@ -63,15 +63,17 @@ S, E = State, Event
 OFFLINE = frozenset({S.STARTING, S.DISCONNECTED})
 DISARMED_AT_REST = frozenset({S.IDLE, S.TAUT, S.FAULT, S.ESTOP})
 ARMED_AT_REST = frozenset({S.ARMED, S.ARMED_TAUT, S.CHECKING, S.CHECKING_TAUT})
+AT_REST = DISARMED_AT_REST | ARMED_AT_REST
 TRACKING = frozenset({S.FOLLOW, S.HOLD})
 PAUSING_STATES = frozenset({S.PAUSING, S.PAUSING_TAUT})
 STOPPING_STATES = frozenset({S.STOPPING, S.STOPPING_TAUT})
+DECELERATING = PAUSING_STATES | STOPPING_STATES
 RELAXING = frozenset({S.RELAX})
 
 CHECKING_STATES = frozenset({S.CHECKING, S.CHECKING_TAUT})
 READY_STATES = ARMED_AT_REST | TRACKING | PAUSING_STATES
 """The states in which the arm is armed and may move."""
-MOTION_STATES = TRACKING | PAUSING_STATES | STOPPING_STATES | RELAXING
+MOTION_STATES = TRACKING | DECELERATING | RELAXING
 """The states in which commands may change the joint angles."""
 
 MODES: Mapping[State, ArmMode] = {
@@ -93,7 +95,7 @@ MODES: Mapping[State, ArmMode] = {
     S.STOPPING_TAUT: "stopping",
     S.RELAX: "relax",
 }
-"""The published mode of each state. In the state TAUT with a latched fault, the mode is `fault`."""
+"""The published mode of each state. Exception: the mode is `fault` in TAUT with a latched fault."""
 
 Row = dict[tuple[State, Event], State | None]
 
@@ -133,40 +135,9 @@ _STOP_AND_NEVER_RELAX = (
 )
 
 TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
-    **_row(
-        E.CONNECTION_LOST,
-        dict.fromkeys(
-            OFFLINE
-            | DISARMED_AT_REST
-            | ARMED_AT_REST
-            | TRACKING
-            | PAUSING_STATES
-            | STOPPING_STATES
-            | RELAXING,
-            S.DISCONNECTED,
-        ),
-    ),
-    **_row(
-        E.CONNECTED,
-        dict.fromkeys(OFFLINE, S.IDLE),
-        DISARMED_AT_REST,
-        ARMED_AT_REST,
-        TRACKING,
-        PAUSING_STATES,
-        STOPPING_STATES,
-        RELAXING,
-    ),
-    **_row(
-        E.ANSWER_MISSED,
-        {S.FOLLOW: S.HOLD},
-        OFFLINE,
-        DISARMED_AT_REST,
-        ARMED_AT_REST,
-        {S.HOLD},
-        PAUSING_STATES,
-        STOPPING_STATES,
-        RELAXING,
-    ),
+    **_row(E.CONNECTION_LOST, dict.fromkeys(State, S.DISCONNECTED)),
+    **_row(E.CONNECTED, dict.fromkeys(OFFLINE, S.IDLE), AT_REST, MOTION_STATES),
+    **_row(E.ANSWER_MISSED, {S.FOLLOW: S.HOLD}, OFFLINE, AT_REST, MOTION_STATES - {S.FOLLOW}),
     **_row(
         E.WATCHDOG_TRIPPED,
         _STOP_AND_NEVER_RELAX,
@@ -201,8 +172,7 @@ TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
         OFFLINE,
         {S.IDLE, S.TAUT},
         ARMED_AT_REST,
-        PAUSING_STATES,
-        STOPPING_STATES,
+        DECELERATING,
     ),
     **_row(
         E.ARM,
@@ -263,41 +233,26 @@ TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
             S.STOPPING_TAUT: S.TAUT,
         },
         OFFLINE,
-        DISARMED_AT_REST,
-        ARMED_AT_REST,
+        AT_REST,
         TRACKING,
         RELAXING,
     ),
-    **_row(
-        E.RELAX,
-        {S.TAUT: S.RELAX},
-        OFFLINE,
-        {S.IDLE, S.FAULT, S.ESTOP},
-        ARMED_AT_REST,
-        TRACKING,
-        PAUSING_STATES,
-        STOPPING_STATES,
-        RELAXING,
-    ),
+    **_row(E.RELAX, {S.TAUT: S.RELAX}, OFFLINE, AT_REST - {S.TAUT}, MOTION_STATES),
     **_row(
         E.RELAX_BLOCKED,
         {S.RELAX: S.STOPPING_TAUT},
         OFFLINE,
-        DISARMED_AT_REST,
-        ARMED_AT_REST,
+        AT_REST,
         TRACKING,
-        PAUSING_STATES,
-        STOPPING_STATES,
+        DECELERATING,
     ),
     **_row(
         E.RELAX_ENDED,
         {S.RELAX: S.STOPPING, S.TAUT: S.IDLE},
         OFFLINE,
-        {S.IDLE, S.FAULT, S.ESTOP},
-        ARMED_AT_REST,
+        AT_REST - {S.TAUT},
         TRACKING,
-        PAUSING_STATES,
-        STOPPING_STATES,
+        DECELERATING,
     ),
     **_row(
         E.WAIT_FOR_OTHER,
@@ -308,10 +263,8 @@ TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
             S.HOLD: S.PAUSING_TAUT,
         },
         OFFLINE,
-        DISARMED_AT_REST,
-        {S.ARMED, S.ARMED_TAUT},
-        PAUSING_STATES,
-        STOPPING_STATES,
+        AT_REST - CHECKING_STATES,
+        DECELERATING,
         RELAXING,
     ),
     **_row(
@@ -320,43 +273,16 @@ TRANSITIONS: Mapping[tuple[State, Event], State | None] = {
         OFFLINE,
         DISARMED_AT_REST,
         CHECKING_STATES,
-        TRACKING,
-        PAUSING_STATES,
-        STOPPING_STATES,
-        RELAXING,
+        MOTION_STATES,
     ),
     **_row(
         E.PATH_CLEAR,
         dict.fromkeys(CHECKING_STATES, S.FOLLOW),
         OFFLINE,
-        DISARMED_AT_REST,
-        {S.ARMED, S.ARMED_TAUT},
-        TRACKING,
-        PAUSING_STATES,
-        STOPPING_STATES,
-        RELAXING,
+        AT_REST - CHECKING_STATES,
+        MOTION_STATES,
     ),
-    **_row(
-        E.LATE,
-        {S.FOLLOW: S.HOLD},
-        OFFLINE,
-        DISARMED_AT_REST,
-        ARMED_AT_REST,
-        {S.HOLD},
-        PAUSING_STATES,
-        STOPPING_STATES,
-        RELAXING,
-    ),
-    **_row(
-        E.IN_TIME,
-        {S.HOLD: S.FOLLOW},
-        OFFLINE,
-        DISARMED_AT_REST,
-        ARMED_AT_REST,
-        {S.FOLLOW},
-        PAUSING_STATES,
-        STOPPING_STATES,
-        RELAXING,
-    ),
+    **_row(E.LATE, {S.FOLLOW: S.HOLD}, OFFLINE, AT_REST, MOTION_STATES - {S.FOLLOW}),
+    **_row(E.IN_TIME, {S.HOLD: S.FOLLOW}, OFFLINE, AT_REST, MOTION_STATES - {S.HOLD}),
 }
-"""The next state for each pair of state and event. None means that the state ignores the event."""
+"""The next state for each pair of state and event; None if the state ignores the event."""

@@ -1,21 +1,20 @@
 """Choose the stretch and the normal offset of the sheet that render the force of an object.
 
-Two arms hold a stretched sheet at the surface of a virtual object. If the sheet stayed in the
-object's tangent plane, a finger at depth d in the object would indent the sheet by d. The force of
-the sheet would then equal the force of the object at one depth only. The sheet is therefore moved
-along its normal by an offset r(d) behind the tangent plane. A negative offset is in front of the
-tangent plane:
+Two arms hold a stretched sheet at the surface of a virtual object. A finger at depth d in the
+object would indent a sheet in the object's tangent plane by d. The sheet's force would then equal
+the object's force at one depth only. The sheet is therefore moved along its normal by an offset
+r(d) behind the tangent plane:
 
     F_sheet(stretch, d - r(d)) = F_object(d).
 
-A retreat is an offset that increases with the depth. The sheet follows with a delay, so a retreat
-removes energy from slow pushes and damps them. An advance is an offset that decreases with the
-depth, and it adds energy. `nodes.models.hand_loop` computes the largest slopes dr/dd at which the
-loop with any hand is stable. The lowest stretch that renders the curve without an advance is
-chosen. If there is no such stretch, the stretch with the smallest advance is chosen.
+The sheet retreats if the offset increases with the depth, and advances if the offset decreases. The
+sheet follows with a delay, so a retreat damps slow pushes, and an advance adds energy. The module
+`hand_loop` computes the largest slopes dr/dd at which the control loop with any hand is stable. The
+lowest stretch that renders the force without an advance is chosen. If there is none, the stretch
+with the smallest advance is chosen.
 
-The sheet does not advance if the forces are too small to be felt. Otherwise the sheet would respond
-to the noise of the camera while a finger only strokes the object.
+The sheet does not advance at forces that are too small to be felt. Otherwise the sheet would
+respond to the noise of the camera while a finger strokes the object.
 """
 
 from __future__ import annotations
@@ -49,36 +48,32 @@ from flexsheet.nodes.models.sheet.tension import (
 USABLE_FRACTION = 0.85
 """The fraction of the maximum edge force and strain that the planner uses.
 
-The bridges stop the arms if commanded or measured poses exceed the limits. A margin is necessary
-because each arm receives the state of the other arm one or two cycles late."""
+The margin is necessary because each arm receives the state of the other arm one or two control
+cycles late."""
 
 FORCE_JND_FLOOR_N = 0.05
-"""The minimum divisor for the relative error of a force. Smaller forces have relative errors of at
-least a tenth, as in the first 2 mm of an object of 4 kPa."""
+"""The smallest force that can be felt, which is also the minimum divisor of relative errors."""
 
 DEADBAND_START_N, DEADBAND_END_N = 0.25 * FORCE_JND_FLOOR_N, FORCE_JND_FLOOR_N
-"""The contact forces between which the sheet's advance towards the finger increases from zero to
-its full value. The contact force is the maximum of the object's force and the sheet's force."""
+"""The contact forces (maximum of the object's and the sheet's force) between which the sheet's
+advance increases from zero to its full value."""
 
 DEADBAND_START_M, DEADBAND_END_M = 0.3e-3, 1.2e-3
-"""The depths between which the sheet's advance towards the finger increases from zero to its full
-value. A fingertip at a smaller depth may only rest on the object."""
+"""The depths between which the sheet's advance increases from zero to its full value."""
 
 TARGET_ERROR_RATIO = 0.10
 """The relative error of the rendered force above which the planner reports the error."""
 
 WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
-"""The smallest relative difference of stiffness that users notice. The first value applies if users
-feel the deformation of the skin (Bergmann Tiest & Kappers 2009). The second value applies if
-neither work nor terminal force is a cue (Tan et al. 1995)."""
+"""The smallest relative differences of stiffness that users notice: with deformation of the skin
+(Bergmann Tiest & Kappers 2009), and without work and terminal force as cues (Tan et al. 1995)."""
 
 MAX_ADVANCE_PER_DEPTH = 0.5
-"""The maximum advance of the sheet towards the finger per depth of the push. With a value of 0.5,
-the sheet feels 1.5 times as stiff. The bounds for a stable control loop of sheet and hand are
-usually lower."""
+"""The maximum advance of the sheet towards the finger per depth of the push. With 0.5, the sheet
+feels 1.5 times as stiff. The bounds for a stable loop with the hand are usually lower."""
 
 SLOPE_TOLERANCE = 0.03
-"""The amount by which a slope may exceed its bound. The bounds contain larger safety margins."""
+"""The tolerance of slopes with respect to their bounds, which contain larger safety margins."""
 
 STRETCH_CANDIDATES = 17
 """The number of stretch ratios that are tried between the minimum and the maximum ratio."""
@@ -95,9 +90,8 @@ class UnfitCurveError(FlexsheetError, ValueError):
 class ObjectCurve:
     """The force of an object as a function of depth, given by n ascending points from (0, 0).
 
-    The curve between the points is a monotone cubic. Beyond the last point, the curve is a line
-    with the slope at this point. Raises UnfitCurveError if the points are not finite or not
-    ascending.
+    The curve is a monotone cubic between the points, and a line beyond the last point. Raises
+    UnfitCurveError if the points are not finite or not ascending.
     """
 
     depths_m: Floats
@@ -128,11 +122,6 @@ class ObjectCurve:
         """Make the curve from an array (n, 2) with the columns depth (m) and force (N)."""
         return cls(np.ascontiguousarray(rows[:, 0]), np.ascontiguousarray(rows[:, 1]))
 
-    @classmethod
-    def linear(cls, stiffness_n_per_m: float, max_depth_m: float) -> ObjectCurve:
-        """Make the force curve of a linear spring."""
-        return cls(np.array([0.0, max_depth_m]), np.array([0.0, stiffness_n_per_m * max_depth_m]))
-
     def force_n(self, depths_m: Floats) -> Floats:
         """Return the forces (n,), N, at depths (n,), m; the force is 0 for negative depths."""
         last = self.depths_m[-1]
@@ -144,17 +133,15 @@ class ObjectCurve:
 
 @dataclass(frozen=True, slots=True)
 class StretchLimits:
-    """The limits of the sheet, of the arms that stretch it, and of the control loop with the hand.
+    """The limits of the sheet's stretch, edge force and offset.
 
     edge_force_n: maximum force on each clamp.
-    max_advance_per_depth: maximum advance of the sheet per depth of the push.
     bounds: bounds on the slope of the offset; None for an analysis without a hand.
     """
 
     min_stretch_ratio: float
     max_stretch_ratio: float
     edge_force_n: float
-    max_advance_per_depth: float = MAX_ADVANCE_PER_DEPTH
     bounds: OffsetBounds | None = None
 
     def max_advance(self, stiffnesses_n_per_m: Floats) -> Floats:
@@ -162,7 +149,7 @@ class StretchLimits:
 
         stiffnesses_n_per_m: stiffnesses (n,) of the sheet.
         """
-        result = np.full(len(stiffnesses_n_per_m), self.max_advance_per_depth)
+        result = np.full(len(stiffnesses_n_per_m), MAX_ADVANCE_PER_DEPTH)
         if self.bounds is None:
             return result
         lowest = float(self.bounds.bandwidths_rad_per_s[0])
@@ -176,8 +163,8 @@ def make_stretch_limits(
     """Return the limits of the stretch within the usable fraction of the scene's limits.
 
     bounds: bounds on the slope of the offset for a stable control loop of sheet and hand.
-    The edge force is limited for a sheet without contact. `render_force` limits the additional
-    force of a push.
+    The stretch is limited by the edge force without contact. `render_force` limits the additional
+    edge force of a push.
     """
     force = USABLE_FRACTION * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -240,9 +227,9 @@ _KNOTS = np.concatenate([np.zeros(3), np.geomspace(4e-3, 1.0, 56), np.ones(2)])
 DEPTH_FRACTIONS = 0.5 * (_KNOTS[1:-2] + _KNOTS[2:-1])
 """The depths at which the offset is computed, as fractions of the maximum depth.
 
-They are the Greville abscissae of a quadratic B-spline with the knots `_KNOTS`, where the control
-points of the spline lie. The slope of the spline is continuous and bounded by the slopes between
-its control points. Bounds that hold at these depths therefore hold at all depths."""
+These depths are the Greville abscissae of a quadratic B-spline with the knots `_KNOTS`. The slopes
+between the control points bound the slope of the spline. Bounds that hold at these depths therefore
+hold at all depths."""
 
 SATURATION_FRACTION = 0.1
 """The fraction of the maximum indentation over which the indentation saturates smoothly."""
@@ -260,12 +247,12 @@ def render_force(
 
     push: stretch ratio, finger radius and position of the push.
     max_depth_m: maximum depth of the finger in the object.
-    The indentation is limited so that the edge force stays within its limit. The indentation
-    increases per depth by at most 1 + `limits.max_advance`.
+    The edge force limits the indentation. The indentation increases by at most
+    1 + `limits.max_advance` times the increase of the depth.
     """
     depths = max_depth_m * DEPTH_FRACTIONS
     desired = curve.force_n(depths)
-    max_ideal_m = (1.0 + limits.max_advance_per_depth) * max_depth_m
+    max_ideal_m = (1.0 + MAX_ADVANCE_PER_DEPTH) * max_depth_m
     ideal = depth_for_force(model, push, desired, max_depth_m=max_ideal_m)
     without_offset = model.evaluate(push, depths)
     ideal = _apply_deadband(depths, ideal, np.maximum(desired, without_offset.force_n))
@@ -294,10 +281,7 @@ def render_force(
 def _indentation_for_edge_force(
     model: SheetForceModel, edge_force_n: float, push: SheetPush, *, max_depth_m: float
 ) -> float:
-    """Return the indentation (m) at which the force on each clamp is `edge_force_n`.
-
-    The result is 0 if the force on each clamp is larger even without indentation.
-    """
+    """Return the indentation (m) at which the force on each clamp is `edge_force_n`, at least 0."""
     grid = 2.0 * max_depth_m * DEPTH_FRACTIONS[1:]
     flat = _flat_edge_force_n(model, push.stretch_ratio)
     if flat >= edge_force_n:
@@ -310,11 +294,10 @@ def _indentation_for_edge_force(
 
 
 def _apply_deadband(depths: Floats, indentation: Floats, forces_n: Floats) -> Floats:
-    """Reduce the sheet's advance towards the finger to zero if it is too small to be felt.
+    """Reduce the sheet's advance smoothly to zero at small depths and small contact forces.
 
     depths, indentation: depths and indentations (n,), m. forces_n: contact forces (n,).
-    Returns the changed indentations (n,), m. The advance decreases smoothly with the depth and the
-    contact force.
+    Returns the changed indentations (n,), m.
     """
     force_weight = _fade(forces_n, DEADBAND_START_N, DEADBAND_END_N)
     depth_weight = _fade(depths, DEADBAND_START_M, DEADBAND_END_M)
@@ -394,9 +377,9 @@ class Compliance:
     def choose_bandwidth_rad_per_s(self) -> tuple[float, bool]:
         """Choose the bandwidth (rad/s) of the depth filter, and return whether the loop is stable.
 
-        The result is the largest bandwidth for which the slopes of the offset for a push at the
-        centre are within their bounds. If no bandwidth satisfies the bounds, the smallest bandwidth
-        is chosen. Without bounds, the bandwidth is infinite.
+        The result is the largest bandwidth at which the slopes of the offset are within their
+        bounds. If there is none, the smallest bandwidth is chosen. Without bounds, the bandwidth is
+        infinite.
         """
         bounds, push = self.limits.bounds, self.centre
         if bounds is None:
@@ -418,8 +401,8 @@ class Compliance:
     def _weights(self, position_m: SheetPosition) -> Floats:
         """Return the weights (9,) for interpolation between the positions of `_nodes`.
 
-        The weights are linear in x^2 and y^2, because the sheet is symmetric. They are not
-        negative. Bounds that hold at these positions therefore hold between them.
+        The interpolation is linear in x^2 and y^2. No weight is negative, so bounds that hold at
+        these positions hold between them.
         """
         weights = [
             _interpolate_squares(nodes, abs(at))
@@ -429,10 +412,7 @@ class Compliance:
 
 
 def _interpolate_squares(nodes: Floats, at: float) -> Floats:
-    """Return weights (n,) for interpolation between nodes (n,).
-
-    The interpolation is linear in the square of the coordinate.
-    """
+    """Return weights (n,) of nodes (n,) for interpolation linear in the squared coordinate."""
     squares, square = nodes**2, min(at, float(nodes[-1])) ** 2
     upper = int(np.clip(np.searchsorted(squares, square), 1, len(nodes) - 1))
     t = (square - squares[upper - 1]) / (squares[upper] - squares[upper - 1])
@@ -518,10 +498,10 @@ def _find_best_stretch(
 
 
 def _note(rendered: RenderedForce, position_error_m: float) -> str:
-    """Return a text about forces that the sheet cannot render, or an empty text.
+    """Return a warning about forces that the sheet cannot render, or an empty text.
 
-    position_error_m: error of the sheet's position. The text also reports an object that is so soft
-        that this error changes the force noticeably.
+    position_error_m: error of the sheet's position. The text also warns of objects so soft that
+        this error changes the force noticeably.
     """
     error = rendered.error_ratio
     off = np.abs(error) > TARGET_ERROR_RATIO
@@ -557,17 +537,6 @@ def compute_force_uncertainty_ratio(rendered: RenderedForce, position_error_m: f
     return change / max(float(rendered.object_force_n[-1]), 1e-9)
 
 
-@dataclass(frozen=True, slots=True)
-class StretchChoice:
-    """A stretch that renders an object's stiffness.
-
-    note: text about a stiffness that the sheet cannot render; empty if the sheet can render it.
-    """
-
-    stretch_ratio: float
-    note: str
-
-
 def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
     """Return the minimum and maximum stretch ratio within the usable edge force and strain."""
     at_max_force = stretch_for_edge_force(USABLE_FRACTION * sheet.max_edge_force_n, sheet)
@@ -575,11 +544,12 @@ def compute_stretch_range(sheet: SheetSpec) -> tuple[float, float]:
     return sheet.min_stretch_ratio, max(sheet.min_stretch_ratio, min(at_max_strain, at_max_force))
 
 
-def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
+def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> tuple[float, str]:
     """Return the stretch that renders an object's stiffness at small pushes without an offset.
 
-    The linear model of the sheet ignores the nonlinearity of the object's force and the size of the
-    fingertip.
+    The second result is a text about a stiffness that the sheet cannot render, or an empty text.
+
+    The sheet is modelled as linear, and the fingertip as a point.
     """
     least, largest = compute_stretch_range(sheet)
     desired = stretch_for_edge_force(
@@ -595,4 +565,4 @@ def choose_stretch(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
         note = (
             f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet, {rendered:.0f} N/m"
         )
-    return StretchChoice(stretch, note)
+    return stretch, note

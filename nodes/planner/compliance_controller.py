@@ -22,8 +22,8 @@ from flexsheet.nodes.planner.compliance import (
 from flexsheet.nodes.planner.hysteresis import HysteresisCorrection
 
 EQUAL_RATIO = 0.02
-"""The relative difference below which two force curves are treated as equal. Users notice only
-differences that are seven times as large."""
+"""The relative difference below which two force curves are equal. Users notice only differences
+that are seven times as large."""
 
 FIRST_DELAY_S = 0.06
 """The initial value of the delay between the measurement of a depth and the motion of the sheet."""
@@ -41,9 +41,9 @@ class ComplianceController:
     mode: "force_curve" renders the object's force as a function of depth. "stiffness" renders the
         object's stiffness at small pushes by the stretch (Furukawa et al. 2007). "constant_stretch"
         uses the minimum stretch.
-    hysteresis_ratio: fraction of the loading energy that the rubber loses in a cycle; None for the
-        value in the scene.
-    bounds: bounds on the offset's slope for a stable control loop of sheet and hand; None without a
+    hysteresis_ratio: fraction of the loading energy that the rubber loses in a cycle; None to use
+        the value in the scene.
+    bounds: bounds on the offset's slope for a stable control loop with the hand; None without a
         hand.
     delay_s: time from the measurement of a depth until the sheet has moved.
     bandwidth_rad_per_s: bandwidth of the depth filter; None without bounds.
@@ -77,29 +77,30 @@ class ComplianceController:
     def update(self, soft_body: SoftBody, *, in_contact: bool) -> None:
         """Fit the stretch and the offset of the sheet to the soft body under the finger.
 
-        During contact, the stretch remains constant, because users could feel the motion of the
-        edges.
-
-        Raises UnfitCurveError if the force curve is invalid; the last valid fit is then used.
+        The stretch remains constant during contact, because users would feel the motion of the
+        edges. Raises UnfitCurveError if the force curve is invalid; the last fit then stays in use.
         """
         if self._mode == "constant_stretch":
             return
         if self._mode == "stiffness":
             if soft_body.stiffness_n_per_m > 0.0:
-                choice = choose_stretch(soft_body.stiffness_n_per_m, self._scene.sheet)
-                self.stretch_ratio, self.note = choice.stretch_ratio, choice.note
+                self.stretch_ratio, self.note = choose_stretch(
+                    soft_body.stiffness_n_per_m, self._scene.sheet
+                )
             return
         rows = soft_body.force_curve
         if len(rows) == 0:
             return
         forces_n = np.interp(self._compared_m, rows[:, 0], rows[:, 1])
-        if self._fitted_n is not None and _are_equal(forces_n, self._fitted_n):
-            return
+        if self._fitted_n is not None:
+            differences_n = np.abs(forces_n - self._fitted_n)
+            if (differences_n < EQUAL_RATIO * np.maximum(self._fitted_n, FORCE_JND_FLOOR_N)).all():
+                return
         self._fit(ObjectCurve.from_rows(rows), in_contact=in_contact)
         self._fitted_n = forces_n
 
     def set_delay(self, delay_s: float, *, in_contact: bool) -> None:
-        """Update the measured delay between the measurement of a depth and the motion of the sheet.
+        """Set the delay from the measurement of a depth to the motion of the sheet.
 
         Without contact, stretch and offset are fitted again if the delay changes the bounds.
         """
@@ -144,10 +145,7 @@ class ComplianceController:
         self.note = "; ".join(filter(None, (fitted.note, self._range_note(fitted), hand_note)))
 
     def _range_note(self, fitted: Compliance) -> str:
-        """Return the reason why the force model is invalid for the deepest push.
-
-        The result is empty if the model is valid.
-        """
+        """Return why the force model is invalid for the deepest push, or an empty text."""
         max_depth_m = self._scene.working_range.push_depth_m
         push = SheetPush(fitted.stretch_ratio, fitted.finger_radius_m)
         reason = self._model.invalid_reason(push, float(fitted.indentation_m(max_depth_m)))
@@ -160,8 +158,8 @@ class ComplianceController:
 
         depth_m: depth of the finger in the object.
         position_m: (x, y) of the contact on the sheet.
-        A positive offset is behind the object's tangent plane. If the rubber has hysteresis, the
-        result depends on the depths of earlier calls.
+        A positive offset is behind the object's tangent plane. With hysteresis, the result also
+        depends on the depths of earlier calls.
         """
         force_ratio = 1.0 if self._hysteresis is None else self._hysteresis.update(depth_m)
         if self._compliance is None or depth_m <= 0.0:
@@ -183,8 +181,3 @@ class ComplianceController:
         if below <= 0.0:
             return 1.0
         return max(float(np.log(above / below) / np.log(1.05 / 0.95)), 0.5)
-
-
-def _are_equal(forces_n: Floats, others_n: Floats) -> bool:
-    difference = np.abs(forces_n - others_n) / np.maximum(others_n, FORCE_JND_FLOOR_N)
-    return bool((difference < EQUAL_RATIO).all())

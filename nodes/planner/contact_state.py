@@ -19,7 +19,6 @@ from flexsheet.nodes.models.rigid import inverse
 from flexsheet.nodes.models.shapes import Nearest, Shape, projection_jacobian, tightest_curvature
 from flexsheet.nodes.planner.rolling import (
     SheetContact,
-    compute_rim_lift_m,
     compute_rolling_twist,
     compute_tangent_twist,
     limit_tilt,
@@ -30,13 +29,13 @@ from flexsheet.nodes.planner.rolling import (
 )
 
 SHALLOW_RATIO, DEEP_RATIO = 0.15, 0.5
-"""Two ratios of the finger's depth to the radius of curvature. Below the first ratio, the contact
-is the surface point nearest to the finger. Above the second ratio, the contact moves as far as the
-finger moves along the sheet."""
+"""Two ratios of the finger's depth to the object's radius of curvature. Below the first ratio, the
+contact is the surface point nearest to the finger. Above the second ratio, the contact moves as far
+as the finger moves along the sheet."""
 
 MIN_RADIUS_FRACTION = 0.15
-"""The minimum distance of a finger from a centre of curvature, as a fraction of the radius. At a
-smaller distance, it would be ambiguous on which side of the object the finger is."""
+"""The minimum distance of a finger from a centre of curvature, as a fraction of the radius. Nearer
+to the centre, the side of the object is ambiguous."""
 
 MIN_CURVATURE_PER_M = 1e-3
 MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
@@ -44,13 +43,13 @@ MAX_DISTANCE_M, MAX_FINGER_SPEED_M_PER_S = 10.0, 10.0
 speed."""
 
 MAX_TILT_RAD = 1.4
-"""The maximum tilt of the sheet in any scene.
+"""The maximum tilt of the sheet in any scene. Two normals within this tilt are never opposite."""
 
-Two normals within this tilt are never opposite, so the shortest rotation between them is unique."""
+RIM_RADIUS_M = 0.03
+"""The radius around the contact in which a finger deforms the sheet."""
 
 MIN_LIFT_M = 2e-4
-"""The height of the surrounding surface above the contact from which the contact is reported as
-concave."""
+"""The minimum height of the surrounding surface above a contact that is reported as concave."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +89,14 @@ class ContactCommand:
 
 
 class UnpresentableError(FlexsheetError, ValueError):
-    """An error for an object whose surface the sheet cannot render."""
+    """An error for an object that the sheet cannot render."""
 
     code = "unpresentable"
     remedy = "Make the object larger or smoother, or the sheet wider."
 
 
 class ContactStateMachine:
-    """A state machine of one finger's contact with the object: approach, contact and hold.
+    """A state machine of the finger's contact with the object.
 
     home: axes (3, 3) of the sheet before the first contact; the third axis is the sheet's normal.
     Raises UnpresentableError if the tilt of the object's front exceeds the maximum.
@@ -205,8 +204,8 @@ class ContactStateMachine:
             finger.
 
         At small depths, the contact is the surface point nearest to the finger. Deep inside the
-        object, this point is arbitrary, so the contact moves as far as the finger moves along the
-        sheet. At depths in between, both motions are blended.
+        object, the contact moves as far as the finger moves along the sheet. Both motions are
+        blended in between.
         """
         normal = self.contact.normal
         tangential = np.eye(3) - np.outer(normal, normal)
@@ -227,8 +226,8 @@ class ContactStateMachine:
     ) -> tuple[SheetContact, SheetReason | None]:
         """Roll the sheet on the object until the contact is at the surface point `found`.
 
-        If the contact reaches the limit of the sheet's usable area, the motion ends there. The
-        second result then states the reason; otherwise it is None.
+        The contact stays within the usable area of the sheet. The second result is the violated
+        limit, or None.
         """
         rolled = roll_contact(contact, found)
         limit = np.array([self._limits.half_width_m, self._limits.half_height_m])
@@ -244,7 +243,9 @@ class ContactStateMachine:
         return rolled, "past_sheet_width" if axis == 0 else "past_sheet_height"
 
     def _lift(self, contact: SheetContact) -> SheetContact:
-        return replace(contact, lift_m=compute_rim_lift_m(self._shape, contact))
+        """Lift the sheet above the surface of a concave object around the contact."""
+        lift_m = self._shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
+        return replace(contact, lift_m=lift_m)
 
     def _concavity_reason(self) -> SheetReason:
         return "concave_contact" if self.contact.lift_m > MIN_LIFT_M else "ok"
@@ -261,8 +262,7 @@ def _is_too_deep(found: Nearest) -> bool:
 def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
     """Return the velocity (3,) m/s of the surface point that is nearest to a moving finger.
 
-    The velocity is infinite at a centre of curvature. It is therefore limited to its value at the
-    distance `MIN_RADIUS_FRACTION`.
+    The velocity would be infinite at a centre of curvature, and is therefore limited.
     """
     try:
         rate = projection_jacobian(found) @ velocity
@@ -273,8 +273,5 @@ def _nearest_point_rate(found: Nearest, velocity: Floats) -> Floats:
 
 
 def _norm(vector: Floats) -> float:
-    """Return the length of a vector (3,).
-
-    The result is not finite if an element of the vector is not finite.
-    """
+    """Return the length of a vector (3,), not finite if an element is not finite."""
     return hypot(*vector.tolist())

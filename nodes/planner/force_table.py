@@ -57,7 +57,7 @@ def make_table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> TabulatedSheetModel:
-    """Return the force table of a scene from the cache; if it is missing, compute and store it."""
+    """Return the force table of a scene from the cache, or compute and store the table."""
     sheet = scene.sheet
     ends = sorted({sheet.min_stretch_ratio, sheet.max_stretch_ratio})
     return cached(

@@ -39,10 +39,9 @@ def bounds_cache(rate_hz: float) -> Specification[OffsetBoundsTable]:
 def load_or_compute_bounds(
     rate_hz: float, cache_dir: Path | None, progress: Callable[[str], None] = lambda text: None
 ) -> OffsetBoundsTable:
-    """Return the bounds for a camera's frame rate from the cache.
+    """Return the bounds for a camera's frame rate from the cache, or compute and store the bounds.
 
-    If the cache does not contain the bounds, compute and store them. progress: receives a text
-    before the computation.
+    progress: function that receives a text before the computation.
     """
 
     def compute() -> OffsetBoundsTable:

@@ -1,9 +1,9 @@
 """Model the hysteresis of the sheet's rubber.
 
-While the finger moves inwards (loading), the force is 1 + h times the elastic force. While it moves
-outwards, the force is 1 - h times the elastic force. Here h = r / (2 - r), and r is the fraction of
-the loading energy that the rubber loses. When the finger reverses, the factor changes linearly with
-the finger's travel.
+The force is 1 + h times the elastic force while the finger moves inwards (loading), and 1 - h times
+the elastic force while the finger moves outwards. Here h = r / (2 - r), and r is the fraction of
+the loading energy that the rubber loses. After a reversal, the factor changes linearly with the
+finger's travel.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ REVERSAL_RATIO = 0.2
 of the depth."""
 
 MIN_REVERSAL_M = 4e-4
-"""The minimum travel of the finger after a reversal until the hysteresis is fully reversed. At
-small depths, tremor would otherwise reverse the hysteresis."""
+"""The minimum travel of the finger after a reversal until the hysteresis is fully reversed. With a
+smaller value, tremor would reverse the hysteresis at small depths."""
 
 
 class HysteresisCorrection:
@@ -28,10 +28,7 @@ class HysteresisCorrection:
         self._depth_m, self._direction = 0.0, 1.0
 
     def update(self, depth_m: float) -> float:
-        """Add a depth (m) of the finger, and return the ratio of force to elastic force.
-
-        Each contact begins with loading. If the depth does not change, the ratio does not change.
-        """
+        """Add a depth (m) of the finger, and return the ratio of force to elastic force."""
         if depth_m <= 0.0:
             self._depth_m, self._direction = 0.0, 1.0
             return 1.0

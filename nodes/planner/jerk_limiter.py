@@ -1,10 +1,9 @@
 """Move the sheet towards a target with limited speed, acceleration and jerk.
 
-Position, orientation and stretch are limited separately, in three stages per step. The first stage
-determines a velocity towards the target from which the sheet can stop at the target. The second
-stage determines an acceleration that reaches this velocity without overshoot. The third stage
-changes the present acceleration towards the determined acceleration as far as the jerk limit
-permits.
+Position, orientation and stretch are limited separately. Each step first determines a velocity from
+which the sheet can stop at the target. The desired acceleration reaches this velocity without
+overshoot. The present acceleration then changes towards the desired acceleration as far as the jerk
+limit permits.
 """
 
 from __future__ import annotations
@@ -141,10 +140,9 @@ def step_sheet(
 def _desired_velocities(
     now: SheetMotion, target: SheetMotion, bounds: SheetBounds, edges: EdgeBound, step_s: float
 ) -> Floats:
-    """Return the desired mean velocities (7,) of the next step.
+    """Return the desired mean velocities (7,) of the next step within the edges' speed limit.
 
-    The elements are linear velocity (3), angular velocity (3) and stretch rate (1). They respect
-    the speed limit of the sheet's edges.
+    The elements are linear velocity (3), angular velocity (3) and stretch rate (1).
     """
     displacement = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     rotation = vector_from_rotation(
@@ -182,13 +180,11 @@ def _desired_velocities(
 def divide_edge_speed(
     edges: EdgeBound, speeds: tuple[float, float], distances: tuple[float, float]
 ) -> tuple[float, float]:
-    """Return the factors (0..1) on linear and angular speed that respect the edges' speed limit.
+    """Return the factors (0..1) for linear and angular speed that respect the edges' speed limit.
 
     speeds, distances: linear and angular speed (m/s, rad/s), and remaining distances (m, rad).
-
-    The speed limit is divided between translation and rotation in proportion to their remaining
-    distances, so that both end at the same time. If one motion needs less than its part, the other
-    motion receives the difference.
+    The speed limit is divided in proportion to the remaining distances. A part that one motion does
+    not need is available to the other motion.
     """
     limit, reach = edges.speed_m_per_s, edges.reach_m
     linear, angular = speeds[0], reach * speeds[1]

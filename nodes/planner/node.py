@@ -101,7 +101,7 @@ class Planner(Node):
     def on_scene(self, scene: Scene, header: Header) -> None:
         # If the new object cannot be presented, the last object's plan must not stay in use.
         self._trajectory = self._compliance = None
-        self._trajectory = SheetTrajectoryPlanner(scene, self.parameters.trajectory_settings())
+        self._trajectory = SheetTrajectoryPlanner(scene, self.parameters)
         if self._calibration is None:
             method: SheetForceMethod = resolve_method(
                 self.parameters.sheet_force, scene.methods.sheet_force, "scaled"

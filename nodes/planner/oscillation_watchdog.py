@@ -14,12 +14,12 @@ MIN_AMPLITUDE_M = 2e-4
 """The root mean square amplitude of the depth below which an oscillation cannot be felt."""
 
 GROWTH_RATIO = 1.15
-"""The ratio of the amplitude in the second half of the window to that in the first half that
-triggers the watchdog."""
+"""The ratio of the amplitudes in the second and the first half of the window that triggers the
+watchdog."""
 
 STEADY_RATIO = 0.95
-"""The ratio of the amplitude in the second half of the window to that in the first half above which
-an oscillation does not decay."""
+"""The ratio of the amplitudes in the second and the first half of the window above which an
+oscillation does not decay."""
 
 SUSTAINED_S = 1.5
 """The time without decay of an oscillation after which the watchdog is triggered."""
@@ -28,16 +28,15 @@ FADE_S = 0.3
 """The time in which the motion of the sheet's offset is reduced to zero."""
 
 SLOW_S = 0.35
-"""The time constant of the filter that removes slow changes of depth and offset. Slow changes do
-not count as oscillation."""
+"""The time constant of the filter that removes slow changes of depth and offset."""
 
 
 class OscillationWatchdog:
-    """A watchdog that stops the motion of the sheet's offset if this motion drives an oscillation.
+    """A watchdog that stops the motion of the sheet's offset if the motion drives an oscillation.
 
     The sheet transfers energy to the finger if the integral of the offset over the depth is
-    positive in a cycle. A voluntary motion of the finger against the sheet transfers energy to the
-    sheet. The watchdog is therefore triggered only by an unstable control loop.
+    positive in a cycle. A voluntary motion of the finger transfers energy to the sheet instead, and
+    does not trigger the watchdog.
 
     weight: factor for the offset's motion, from 1 (follows the finger) to 0 (at rest).
     triggers: number of oscillations that were stopped.
@@ -101,9 +100,9 @@ class OscillationWatchdog:
 
 
 def _oscillates(depths: np.ndarray) -> bool:
-    """Return whether the depths (n,), m, change their sign at least twice.
+    """Return whether the depths (n,), m, change their sign at least twice, unlike a single push.
 
-    Values smaller than MIN_AMPLITUDE_M are ignored. A single push changes the sign only once.
+    Values smaller than MIN_AMPLITUDE_M are ignored.
     """
     large = depths[np.abs(depths) > MIN_AMPLITUDE_M]
     return int(np.count_nonzero(np.diff(np.sign(large)))) >= 2

@@ -13,7 +13,6 @@ from flexsheet.nodes.models.motion import SheetBounds
 from flexsheet.nodes.node import NodeParameters
 from flexsheet.nodes.parameter_marks import SheetCalibrationFile
 from flexsheet.nodes.planner.jerk_limiter import JerkBounds
-from flexsheet.nodes.planner.trajectory import TrajectorySettings
 
 
 class PlannerParameters(NodeParameters):
@@ -108,20 +107,19 @@ class PlannerParameters(NodeParameters):
         default=9.0, description="maximum third derivative of the stretch ratio, 1/s^3"
     )
 
-    def trajectory_settings(self) -> TrajectorySettings:
-        """Return the limits of the planned trajectory that the parameters define."""
-        return TrajectorySettings(
-            SheetBounds(
-                self.speed_m_per_s,
-                self.acceleration_m_per_s2,
-                self.turn_rad_per_s,
-                self.turn_acceleration_rad_per_s2,
-                self.stretch_rate_per_s,
-                self.stretch_acceleration_per_s2,
-            ),
-            JerkBounds(self.jerk_m_per_s3, self.turn_jerk_rad_per_s3, self.stretch_jerk_per_s3),
-            contact_on_m=self.contact_on_m,
-            contact_off_m=self.contact_off_m,
-            tilt_margin_rad=self.tilt_margin_rad,
-            max_spin_rad=self.max_spin_rad,
+    @property
+    def bounds(self) -> SheetBounds:
+        """Return the maximum speeds and accelerations of the sheet."""
+        return SheetBounds(
+            self.speed_m_per_s,
+            self.acceleration_m_per_s2,
+            self.turn_rad_per_s,
+            self.turn_acceleration_rad_per_s2,
+            self.stretch_rate_per_s,
+            self.stretch_acceleration_per_s2,
         )
+
+    @property
+    def jerks(self) -> JerkBounds:
+        """Return the maximum jerks of the sheet."""
+        return JerkBounds(self.jerk_m_per_s3, self.turn_jerk_rad_per_s3, self.stretch_jerk_per_s3)

@@ -20,17 +20,11 @@ from flexsheet.nodes.models.rigid import angle_between, transform
 from flexsheet.nodes.models.shapes import Nearest, Shape
 
 MIN_STEP_RATIO = 1.0 / 512.0
-"""The resolution of the search for the last surface point within the maximum tilt, as a fraction of
-the search distance."""
+"""The resolution of the search of `limit_tilt`, as a fraction of the search distance."""
 
 MIN_INNER_STEP_RATIO, NEAR_LIMIT_RAD = MIN_STEP_RATIO / 4.0**5, np.radians(1.0)
-"""The finer resolution of the search, and the minimum distance from the maximum tilt at which it is
-used. It is necessary deep inside the object, where a small step can change the normal by many
-degrees."""
-
-RIM_RADIUS_M = 0.03
-"""The radius around the contact in which the object is tested for points above the tangent
-plane."""
+"""The finer resolution of the search, and the distance from the maximum tilt beyond which the finer
+resolution is used. Deep inside the object, a small step can rotate the normal by many degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +68,8 @@ class SheetContact:
 def transport_axes(axes: Floats, normal: Floats) -> Floats:
     """Rotate axes (3, 3) by the smallest rotation that maps the third axis to `normal` (3,).
 
-    This rotation is the parallel transport along the shorter arc between both normals. The result
-    is undefined for opposite normals. It is orthogonal, because rounding errors do not accumulate.
+    The rotation is the parallel transport along the shorter arc between both normals. The result is
+    undefined for opposite normals. Rounding errors do not accumulate.
     """
     both = axes[:, 2] + normal
     # The rotation is the product of two Householder reflections.  The first reflection
@@ -88,10 +82,9 @@ def transport_axes(axes: Floats, normal: Floats) -> Floats:
 def roll_contact(contact: SheetContact, found: Nearest) -> SheetContact:
     """Return the contact after the sheet has rolled to the surface point `found`.
 
-    The displacement of the contact on the sheet is computed from the chord between both points. The
-    chord is projected onto the plane halfway between the tangent planes, and scaled to the length
-    of the arc. The displacement is exact on circles. On other curves, its error is of third order
-    in the angle.
+    The displacement of the contact on the sheet is the chord between both points, projected onto
+    the plane halfway between the tangent planes, and scaled to the length of the arc. The
+    displacement is exact on circles. On other curves, the error is of third order in the angle.
     """
     axes = transport_axes(contact.axes, found.normal)
     middle = transport_axes(contact.axes, _normalize(contact.normal + found.normal))
@@ -114,8 +107,8 @@ def make_tangent_contact(home: Floats, found: Nearest, half_width_m: float) -> S
 
     home: axes (3, 3) of the sheet before they are rotated to the normal.
     half_width_m: maximum distance of the contact from the sheet's centre.
-    The contact is on the sheet's horizontal centre line. If the maximum distance permits, the
-    sheet's centre and the object's origin have the same coordinate along the sheet's x axis.
+    The contact is on the sheet's horizontal centre line. Within the maximum distance, the sheet's
+    centre is aligned with the object's origin along the sheet's x axis.
     """
     axes = transport_axes(home, found.normal)
     x = float(np.clip(axes[:, 0] @ found.point, -half_width_m, half_width_m))
@@ -126,9 +119,8 @@ def compute_rolling_twist(contact: SheetContact, rate: Floats) -> Floats:
     """Return the twist (6,) of the rolling sheet's centre for a given velocity of the contact.
 
     rate: velocity (3,) m/s of the contact on the object.
-    The twist consists of linear velocity (m/s) and angular velocity (rad/s). Without spin, the
-    angular velocity is n x dn/dt with the normal n. Without slip, the sheet's point in contact is
-    at rest.
+    The twist consists of linear velocity (m/s) and angular velocity (rad/s). The angular velocity
+    is n x dn/dt with the normal n. The sheet's point in contact is at rest.
     """
     tangential = rate - contact.normal * (rate @ contact.normal)
     angular = cross(contact.normal, contact.shape_operator @ tangential)
@@ -172,8 +164,7 @@ def cross(a: Floats, b: Floats) -> Floats:
 def measure_spin_rad(axes: Floats, home: Floats) -> float:
     """Return the angle (rad) by which `axes` (3, 3) are rotated about their normal.
 
-    home: axes (3, 3) with the angle 0. They are first rotated by the smallest rotation that makes
-        both normals equal.
+    home: axes (3, 3) with the angle 0, after the smallest rotation that makes both normals equal.
     """
     ready = transport_axes(home, axes[:, 2])
     return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
@@ -182,13 +173,12 @@ def measure_spin_rad(axes: Floats, home: Floats) -> float:
 def limit_tilt(
     shape: Shape, start: Nearest, found: Nearest, front: Floats, max_tilt_rad: float
 ) -> tuple[Nearest, bool]:
-    """Return the last surface point towards `found` whose normal is within the maximum tilt.
+    """Return the last surface point within the maximum tilt between `start` and `found`.
 
     The second result is whether this point differs from `found`.
     front: unit vector (3,) from which the tilt is measured.
-    start: surface point within the maximum tilt, at which the search starts. The search follows the
-        straight line to `found` in increasing steps. Each step is projected onto the surface, so
-        that the search stays on the sheet's side of the object.
+    The search follows the straight line to `found` in increasing steps, and projects each step onto
+    the surface.
     """
     limit, near = np.cos(max_tilt_rad), np.cos(max(max_tilt_rad - NEAR_LIMIT_RAD, 0.0))
     if found.normal @ front >= limit:
@@ -203,16 +193,6 @@ def limit_tilt(
         else:
             step *= 0.25
     return best, True
-
-
-def compute_rim_lift_m(shape: Shape, contact: SheetContact) -> float:
-    """Return the distance (m) by which the tangent plane must be lifted above a concave object.
-
-    At this distance, the object does not penetrate the plane. The result is 0 if the object is not
-    concave. Only the surface within `RIM_RADIUS_M` of the contact is considered, because a finger
-    deforms the sheet only there.
-    """
-    return shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
 
 
 def _normalize(vector: Floats) -> Floats:

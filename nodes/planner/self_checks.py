@@ -23,8 +23,8 @@ def check_stiffness(
 ) -> tuple[SelfCheck, ...]:
     """Compare Young's modulus times thickness in the scene with the calibrated product.
 
-    Returns () without a calibration. A difference is an error: rendered forces depend on the
-    calibration, but the sag and the limits of the edge force depend on the scene.
+    Returns () without a calibration. The two values must agree, because the rendered forces depend
+    on the calibration, and the sag and the limits of the edge force depend on the scene.
     """
     if calibration is None:
         return ()
@@ -54,13 +54,13 @@ MIN_FORCE_N = 0.2
 """The minimum force for a comparison. The relative errors of smaller forces are too large."""
 
 QUIET_S, QUIET_M = 0.15, 0.0005
-"""The criterion for a push at rest. From QUIET_S before to QUIET_S after the measured force, the
-indentation must not change by more than QUIET_M."""
+"""The criterion for a push at rest: within QUIET_S before and after the measurement, the
+indentation changes by at most QUIET_M."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedPush:
-    """The state of the sheet that the planner has commanded for the time `valid_at_ns`.
+    """The planned push for the time `valid_at_ns`.
 
     position_m: (x, y) of the contact on the sheet.
     """
@@ -96,10 +96,7 @@ class MeasuredForceCheck:
             self._compare(*self._waiting.popleft())
 
     def add_force(self, force: Force, at_ns: int) -> None:
-        """Add a measured force that is valid and along the sheet's normal; ignore other forces.
-
-        at_ns: time of the measurement.
-        """
+        """Add a valid force along the sheet's normal that was measured at `at_ns`."""
         if force.valid and force.axis == "sheet_normal":
             self._waiting.append((at_ns, force.force_n))
 

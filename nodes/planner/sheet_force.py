@@ -40,7 +40,7 @@ def make_rubber(sheet: SheetSpec) -> Rubber:
 def make_force_model(
     sheet: SheetSpec, calibration: SheetCalibration | None = None
 ) -> SheetForceModel:
-    """Return the calibrated force model of the sheet, or an ideal model without a calibration.
+    """Return the force model of a calibrated sheet, or of ideal rubber without a calibration.
 
     Raises CalibrationMismatchError if the calibrated sheet has another size.
     """
@@ -123,7 +123,7 @@ def sheet_force_family(reference: ReferenceForce, make_table: MakeTable | None) 
     """Define the benchmark of the force models over stretch, depth and position.
 
     reference: function that returns the reference force.
-    make_table: function that loads or computes the table; None to omit models that need minutes.
+    make_table: function that loads or computes the table; None to omit slow models.
     """
     return Family(
         name="sheet-force",

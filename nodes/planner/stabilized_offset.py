@@ -1,4 +1,4 @@
-"""Compute the sheet's offset from the depth so that the control loop with the hand is stable."""
+"""Compute the sheet's offset from a filtered depth, for a stable control loop with the hand."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ OffsetAtDepth = Callable[[float], float]
 class StabilizedOffset:
     """A filter that computes the sheet's offset behind the object's tangent plane.
 
-    The measured depth is smoothed by the filter of the module `hand_loop`. The depth is not
-    predicted over the whole delay. Such a prediction would shift the least stable frequency of the
-    control loop into the range of hand oscillations. The offset never exceeds the depth, so the
-    sheet stays in contact with a finger that moves away.
+    The filter of the module `hand_loop` smooths the measured depth. The depth is not predicted over
+    the whole delay, because a prediction would shift the least stable frequency of the control loop
+    into the range of hand oscillations. The offset never exceeds the depth, so the sheet stays in
+    contact with a finger that moves away.
     """
 
     def __init__(self) -> None:

@@ -5,27 +5,25 @@ from __future__ import annotations
 from flexsheet.messages.types import Side
 
 RESTART_COUNT = 3
-"""The number of consecutive late fingertips with ascending timestamps that indicate a clock that
-was set back."""
+"""The number of consecutive late fingertips that indicate a clock that was set back."""
 
 MIN_STEP_NS = 1_000_000
 """The minimum plausible interval between two exposures. No camera is faster."""
 
 AGE_WEIGHT = 0.05
-"""The weight of the newest value in the exponential moving average of the age of fingertips. At
-60 Hz, it corresponds to a time constant of 0.33 s."""
+"""The weight of the newest value in the exponential average of the age of fingertips. At 60 Hz, the
+time constant is 0.33 s."""
 
 DELAY_WEIGHT = 0.11
-"""The weight of the newest value in the exponential moving average of an arm's reported latency.
-At 5 Hz, it corresponds to a time constant of 1.7 s."""
+"""The weight of the newest value in the exponential average of an arm's latency. At 5 Hz, the time
+constant is 1.7 s."""
 
 
 class MonotonicTimestampFilter:
-    """A filter that drops every fingertip that was exposed before the last accepted fingertip.
+    """A filter that drops fingertips with a timestamp before that of the last accepted fingertip.
 
-    The sheet is already planned for a later time than that of the dropped fingertip.
-    `RESTART_COUNT` consecutive late fingertips indicate that the clock was set back. The filter
-    then restarts.
+    After `RESTART_COUNT` consecutive late fingertips, the filter restarts, because the clock was
+    then set back.
     """
 
     def __init__(self) -> None:
@@ -50,10 +48,9 @@ class MonotonicTimestampFilter:
 
 
 class ActuationDelayEstimator:
-    """An estimator of the time from the publication of a fingertip position to the arms' motion.
+    """An estimator of the time from the publication of a fingertip to the arms' motion.
 
-    This delay is the latency that the arms report, minus the mean age of the fingertip positions at
-    their publication.
+    The delay is the latency that the arms report, minus the mean age of fingertips at publication.
     delay_s: mean delay over both arms, or the initial value before any report.
     """
 
@@ -64,7 +61,7 @@ class ActuationDelayEstimator:
         self._delays_s: dict[Side, float] = {}
 
     def on_fingertip(self, age_s: float) -> None:
-        """Include in the mean the age (s) of a valid fingertip position when it was published."""
+        """Add the age (s) of a valid fingertip at its publication."""
         before_s = age_s if self._age_s is None else self._age_s
         self._age_s = before_s + AGE_WEIGHT * (age_s - before_s)
 
@@ -81,9 +78,7 @@ class ActuationDelayEstimator:
 
 
 def update_horizon_s(horizon_s: float, needed_s: float, max_s: float) -> float:
-    """Return the prediction horizon (s) of the next target.
-
-    The horizon changes slowly, so that the sheet does not jump after a late fingertip.
+    """Return the prediction horizon (s) of the next target, which changes slowly.
 
     horizon_s: prediction horizon of the last target.
     needed_s: time from the exposure until the sheet reaches the target.

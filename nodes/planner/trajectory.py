@@ -19,31 +19,30 @@ from flexsheet.nodes.planner.contact_state import (
     ContactLimits,
     ContactStateMachine,
 )
-from flexsheet.nodes.planner.jerk_limiter import JerkBounds, JerkLimitedState, step_sheet
+from flexsheet.nodes.planner.jerk_limiter import JerkLimitedState, step_sheet
+from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.rolling import cross
 from flexsheet.nodes.planner.sheet_force import make_rubber
 from flexsheet.nodes.planner.stabilized_offset import StabilizedOffset
 
 EDGE_SPEED_FRACTION = 0.7
-"""The fraction of the maximum tool speed that the planner uses. A late arm can use the remaining
-speed to catch up."""
+"""The fraction of the maximum tool speed that the planner uses. A late arm needs the rest to catch
+up."""
 
 EDGE_MARGIN_M = 0.03
-"""The minimum distance of a contact from a clamped edge. It prevents contact between the finger and
-the clamp."""
+"""The minimum distance of a contact from a clamp, so the finger cannot touch the clamp."""
 
 MAX_DEPTH_FRACTION = 1.4
-"""The ratio of the finger's depth to the scene's maximum push depth above which the finger has
-passed through the object."""
+"""The ratio of the finger's depth to the scene's push depth above which the finger has passed
+through the object."""
 
 MAX_STEP_S = 0.1
-"""The time without fingertips after which the sheet restarts from rest. The arms have then
+"""The time without fingertips after which the sheet restarts from rest, because the arms have
 stopped."""
 
-
 KEEP_S = 0.15
-"""The time for which a trajectory continues with constant velocity. It is long enough to repeat a
-lost packet, which takes 0.1 to 0.15 s."""
+"""The time for which a trajectory continues with constant velocity. A lost packet is repeated
+within 0.1 to 0.15 s."""
 
 MIN_BRAKE_S, MAX_BRAKE_S = 0.1, 0.2
 """The minimum and maximum duration of the deceleration at the end of a trajectory."""
@@ -67,37 +66,18 @@ class PlannedStep:
     normal_offset_m: float
 
 
-@dataclass(frozen=True, slots=True)
-class TrajectorySettings:
-    """The limits of the sheet's trajectory.
-
-    contact_on_m, contact_off_m: distances of the finger from the sheet at which contact begins and
-        ends.
-    tilt_margin_rad: angle by which the sheet may exceed the maximum tilt of the scene.
-    max_spin_rad: maximum rotation of the sheet about its normal by rolling.
-    """
-
-    bounds: SheetBounds
-    jerks: JerkBounds
-    contact_on_m: float
-    contact_off_m: float
-    tilt_margin_rad: float
-    max_spin_rad: float
-
-
 class SheetTrajectoryPlanner:
     """A planner of the sheet's motion on one virtual object.
 
-    No clock is used, so equal measurements and timestamps result in equal motions. Raises
-    UnpresentableError if the tilt of the object's front exceeds the maximum.
+    Raises UnpresentableError if the tilt of the object's front exceeds the maximum.
     """
 
-    def __init__(self, scene: Scene, settings: TrajectorySettings) -> None:
+    def __init__(self, scene: Scene, settings: PlannerParameters) -> None:
         pose, sheet = scene.object.world_from_object, scene.sheet
         self._world_from_object = pose_matrix(pose)
         self._object_from_world = inverse(self._world_from_object)
         self._rotate_twist = np.kron(np.eye(2), self._world_from_object[:3, :3])
-        self._settings = settings
+        self._bounds, self._jerks = settings.bounds, settings.jerks
         self._rubber, self._density_kg_per_m3 = make_rubber(sheet), sheet.density_kg_per_m3
         self._edges = EdgeBound(
             EDGE_SPEED_FRACTION * scene.arms.max_tool_speed_m_per_s, 0.5 * sheet.height_m
@@ -171,10 +151,9 @@ class SheetTrajectoryPlanner:
         moved_m: float,
         speed_m_per_s: float,
     ) -> float:
-        """Update the offset behind the tangent plane, and return the rate (m/s) of the offset.
+        """Update the offset behind the tangent plane, and return the offset's rate (m/s).
 
-        moved_m, speed_m_per_s: predicted displacement and speed of the finger along the object's
-            normal.
+        moved_m, speed_m_per_s: predicted displacement and speed of the finger along the normal.
         """
         x, y = self._command.contact.position_sheet_m
         at = (float(x), float(y))
@@ -193,7 +172,7 @@ class SheetTrajectoryPlanner:
 
     @property
     def watchdog_triggers(self) -> int:
-        """Return the number of oscillations of finger and sheet that the watchdog has stopped."""
+        """Return the number of oscillations that the watchdog has stopped."""
         return self._offset.watchdog.triggers
 
     def _sag_m(self, sheet: SheetMotion, x_m: float, y_m: float) -> float:
@@ -235,8 +214,8 @@ class SheetTrajectoryPlanner:
         self._state = step_sheet(
             self._state,
             target,
-            bounds=self._settings.bounds,
-            jerks=self._settings.jerks,
+            bounds=self._bounds,
+            jerks=self._jerks,
             edges=self._edges,
             step_s=min(step_s, MAX_STEP_S),
         )
@@ -251,7 +230,7 @@ class SheetTrajectoryPlanner:
         contact_sheet = apply(inverse(self.motion.world_from_sheet), contact_world)[:2]
         return PlannedStep(
             self.motion,
-            plan_continuation(self.motion, self._settings.bounds),
+            plan_continuation(self.motion, self._bounds),
             command,
             contact_world,
             self._world_from_object[:3, :3] @ command.contact.normal,
@@ -261,10 +240,7 @@ class SheetTrajectoryPlanner:
 
 
 def plan_continuation(motion: SheetMotion, bounds: SheetBounds) -> SheetTrajectory | None:
-    """Return the trajectory of the sheet from a target until rest.
-
-    The result is None if the sheet cannot stop in time.
-    """
+    """Return the trajectory of the sheet to rest, or None if the sheet cannot stop in time."""
     brake_s = max(
         MIN_BRAKE_S,
         measure_length(motion.twist_world[:3]) / bounds.acceleration_m_per_s2,

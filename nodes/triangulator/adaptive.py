@@ -2,9 +2,9 @@
 
 Each filter assumes one motion model: white noise in the acceleration or in the jerk, alone or with
 an oscillator. The prediction is the weighted sum of the filters' predictions. The weights minimise
-the mean square error of this sum at the prediction horizon. They are computed from the covariance
-of the filters' errors at that horizon in the last seconds. Negative weights are allowed, because
-the sum can then represent a motion spectrum that no single model has.
+the mean square error of the sum at the prediction horizon, according to the covariance of the
+filters' errors in the last seconds. Weights may be negative, so the sum can represent motion
+spectra that no single model has.
 
 Sources: Bates and Granger, Operational Research Quarterly 20, 1969 (combination by the covariance
     of the errors); Singer, IEEE Trans. Aerospace and Electronic Systems 6, 1970 (decaying
@@ -30,32 +30,31 @@ noise (m^2/s^3) and of the jerk noise (m^2/s^5). The last two are the frequency 
 standard deviation (m) of the oscillator."""
 
 STATES = 5
-"""The number of states of a model per axis. The states are position, velocity and acceleration of
-the finger without the oscillator, and displacement and velocity of the oscillator."""
+"""The number of states of a model per axis: position, velocity and acceleration of the finger
+without the oscillator, and displacement and velocity of the oscillator."""
 
 OBSERVED = np.array([1.0, 0.0, 0.0, 1.0, 0.0])
-"""The observation vector. Its product with a state is the position of the finger."""
+"""The observation vector. The product of this vector and a state is the position of the finger."""
 
 ACCELERATION_DECAY_PER_S = 6.0
 """The exponential decay rate of the acceleration (Singer 1970). A hand cannot maintain an
 acceleration for long."""
 
 MAX_OSCILLATOR_WIDTH_HZ = 2.0
-"""The maximum half-power bandwidth of an oscillator. It covers the width of a tremor's spectral
-peak and the drift of its frequency. Slow oscillators, which model voluntary motion around one
-point, have a damping ratio of one half."""
+"""The maximum half-power bandwidth of an oscillator, which covers the spectral peak of a tremor and
+drifts of its frequency. Slow oscillators model voluntary motion around one point, with a damping
+ratio of one half."""
 
 SCORED_HORIZONS_S = (0.0, 0.05, 0.1)
-"""The prediction horizons (s) at which the errors of the predictors are measured, to compute the
-weights of the predictors. Horizons are rounded up to whole frames, and the first horizon is one
-frame. Weights for other horizons are interpolated."""
+"""The prediction horizons (s) at which the prediction errors are measured to compute the weights.
+Horizons are rounded up to whole frames, and the first horizon is one frame. Weights for other
+horizons are interpolated."""
 
 MAX_AGE_NS = round(2e9 * SCORED_HORIZONS_S[-1])
 """The maximum age of the earlier filter states that are stored to measure prediction errors."""
 
 STAMP_JITTER_NS = 2_000_000
-"""The tolerance for jitter of the camera's timestamps, by which a state may be younger than the
-horizon for which its error is measured."""
+"""The tolerance for jitter of the camera's timestamps."""
 
 MEMORY_S, MEMORY_POINTS = 1.0, 60
 """The time constant and the minimum number of points for averaging the covariance of the filters'
@@ -65,38 +64,34 @@ RECENT_S, RECENT_POINTS = 0.2, 10
 """The time constant and the minimum number of points for averaging recent mean square errors."""
 
 OUTDATED_RATIO = 1.5
-"""The error ratio above which the error covariance is outdated.
-
-The covariance was then estimated during another kind of motion. The ratio is the mean square error
-of the weighted sum divided by the mean square error of the best model."""
+"""The error ratio above which the error covariance is outdated because the motion has changed. The
+ratio is the mean square error of the weighted sum divided by that of the best model."""
 
 OUTDATED_MEMORY_S, OUTDATED_MEMORY_POINTS = 0.15, 8
-"""The time constant and the minimum number of points for averaging the error covariance while it is
-outdated."""
+"""The time constant and the minimum number of points for averaging an outdated error covariance."""
 
 PRIOR_POINTS, PRIOR_ERROR_M = 3, 1e-4
-"""The weight (in points) and the value of the initial variance of every filter's prediction errors.
-The unit of the variance is m instead of m^2, because errors are divided by the square root of their
-magnitude."""
+"""The weight (in points) and the value of the initial variance of prediction errors. The unit is m
+instead of m^2, because errors are divided by the square root of their magnitude."""
 
 MIN_ERROR_M = 1e-9
 """A constant that is added to the magnitude of errors to avoid a division by zero."""
 
 SHRINKAGE = 0.02
 """The regularisation of the weights towards equal weights, as a fraction of the mean square
-difference between the predictions. It is necessary because the covariance of the errors is
-estimated from only a few seconds."""
+difference between the predictions. The covariance of the errors is known from a few seconds
+only."""
 
 COMBINE_EVERY_POINTS = 4
 """The number of points after which the weights are computed again."""
 
 MIN_GAIN = 0.1
-"""The minimum gain of the filtered position. It is limited because the gain is computed from the
-mean square innovation, whose relative error is about 0.1."""
+"""The minimum gain of the filtered position. The gain is computed from the mean square innovation,
+which has a relative error of about 0.1."""
 
 START_POINTS = 32
-"""The number of points at the start of a track for which a Kalman filter with a large initial
-covariance determines the gains. Later points use the steady-state gains."""
+"""The number of points at the start of a track with time-varying Kalman gains. Later points use the
+steady-state gains."""
 
 INITIAL_SPEED_M_PER_S, INITIAL_ACCELERATION = 0.1, 1.0
 """The standard deviations of speed (m/s) and acceleration (m/s^2) at the start of a track."""
@@ -109,8 +104,7 @@ INTERVAL_RATIO, NOISE_RATIO = 1.08, 1.5
 are computed and cached."""
 
 TIME_STEP_S = 1e-5
-"""The time resolution of cached state transitions. In this time, a finger at 0.1 m/s moves by 1
-um."""
+"""The time resolution of cached state transitions: a finger at 0.1 m/s moves by 1 um."""
 
 MAX_CORRELATION = 0.3
 """The correlation of the measurement noise between two axes above which the axes are rotated."""
@@ -194,8 +188,7 @@ def solve_riccati(transition: Floats, process_noise: Floats, variance: float) ->
     """Return the steady-state error covariances (models, 5, 5) just before each measurement.
 
     variance: variance of the measurement noise, m^2.
-    The Riccati equation is solved by the doubling algorithm (Chu et al. 2004), in which each
-    iteration doubles the number of frames.
+    The doubling algorithm (Chu et al. 2004) solves the Riccati equation.
     """
     rows, identity = transition.transpose(0, 2, 1), np.eye(STATES)
     information = np.broadcast_to(np.outer(OBSERVED, OBSERVED) / variance, rows.shape)
@@ -251,8 +244,8 @@ def find_gains(dt: float, variances: list[float], points: int) -> Floats:
     variances: variance of the measurement noise on each of the three axes, m^2.
     points: number of points in the track, at least two.
 
-    The first call for an interval or a variance solves the Riccati equations, which takes some
-    milliseconds. Later calls with similar values take microseconds.
+    The first call for an interval or a variance takes some milliseconds, and later calls with
+    similar values take microseconds.
     """
     interval = round(
         math.log(min(max(dt, MIN_INTERVAL_S), MAX_INTERVAL_S)) / math.log(INTERVAL_RATIO)
@@ -279,8 +272,7 @@ def _find_observation(steps: int) -> Floats:
 def _find_rows(horizons: bytes) -> Floats:
     """Return the matrix (n, models * 5) that predicts positions at n horizons from weighted states.
 
-    horizons: bytes of a float64 array (n,) of horizons, s. Bytes are hashable, which the cache
-        requires.
+    horizons: bytes of a float64 array (n,) of horizons, s. The cache requires hashable arguments.
     """
     rows = [OBSERVED @ compute_transition(float(time)) for time in np.frombuffer(horizons)]
     return np.array(rows).reshape(len(rows), -1)
@@ -290,12 +282,10 @@ def _find_rows(horizons: bytes) -> Floats:
 def _find_factors(horizons: bytes, ages_ms: tuple[int, ...]) -> Floats:
     """Return factors (scored horizons + 1, n, 1) that interpolate predictions to n horizons.
 
-    horizons: bytes of a float64 array (n,) of horizons, s. Bytes are hashable, which the cache
-        requires.
+    horizons: bytes of a float64 array (n,) of horizons, s. The cache requires hashable arguments.
     ages_ms: age, ms, for which the weights of each scored horizon were computed.
-
-    The last factor applies to the correction by the filtered position. It decreases from one at the
-    horizon zero to zero at the first age.
+    The last factor applies to the correction by the filtered position, and decreases from one at
+    the horizon zero to zero at the first age.
     """
     times_ms = 1e3 * np.frombuffer(horizons)
     anchors_ms, counts = np.unique(ages_ms, return_counts=True)
@@ -309,9 +299,8 @@ def combine(covariance: Floats) -> Floats:
     """Return the weights (..., models) that minimise the mean square error of the weighted sum.
 
     covariance: covariance (..., models, models) of the models' prediction errors, in any unit.
-        Measurement noise in the errors does not change the result, because it is the same for all
-        models.
-    The sum of the weights is 1.
+    The sum of the weights is 1. Measurement noise does not change the result, because the noise is
+    the same for all models.
     """
     count = covariance.shape[-1]
     own = covariance.trace(axis1=-2, axis2=-1) / count
@@ -333,12 +322,11 @@ class BankEstimate(Estimate):
     points: number of points since the start of the track.
     past_ns, past: earlier times and states, oldest first, for the longest scored horizon.
     error_covariance: covariance (scored horizons, 3, models, models), m, of the models' prediction
-        errors by axis. Every error was divided by the square root of the errors' magnitude at its
-        time.
-    weights: weights (scored horizons, 3, models), whose sum over the models is 1.
+        errors by axis, divided by the square root of the errors' magnitude.
+    weights: weights (scored horizons, 3, models) with the sum 1 over the models.
     recent: recent mean square errors (scored horizons, 3, models + 1), m^2, of each model and of
         the weighted sum.
-    scored_ages_ms: ages of the states whose predictions were compared with the newest point.
+    scored_ages_ms: ages of the predictions that were compared with the newest point.
     innovation: mean square (3,), m^2, of the combined innovation.
     position, variance: filtered position (3,) m along the axes, and its error variance (3,) m^2.
     velocity_variance: error variance (3,), m^2/s^2, of the velocity along the axes.
@@ -360,7 +348,7 @@ class BankEstimate(Estimate):
 
 @dataclass(frozen=True, slots=True)
 class AdaptiveBank:
-    """A tracking method that predicts by a weighted sum of the predictions of Kalman filters."""
+    """A tracking method that combines the predictions of several Kalman filters."""
 
     max_speed_m_per_s: float
 
@@ -496,10 +484,10 @@ def _prediction_errors(
     at_ns, point: time and position (3,) m of the new point, along the axes of the states.
     innovations: errors (models, 3), m, of the predictions from the newest state.
 
-    The first result contains the errors (scored horizons, 3, models), m. For the first horizon,
-    they are the innovations. For every other horizon, they are the errors of the newest state that
-    is at least as old as the horizon, or of the oldest state. The second result contains the ages
-    (ms) of the states that were used.
+    The first result contains the errors (scored horizons, 3, models), m. The errors for the first
+    horizon are the innovations. For every other horizon, the newest state that is at least as old
+    as the horizon is used, or the oldest state. The second result contains the ages (ms) of these
+    states.
     """
     errors = np.empty((len(SCORED_HORIZONS_S), 3, len(MODELS)))
     errors[0] = innovations.T
@@ -515,7 +503,7 @@ def _prediction_errors(
 
 
 def _align(estimate: BankEstimate, covariance: Floats) -> tuple[BankEstimate, Floats]:
-    """Rotate the axes of an estimate if the noise of a new point is correlated between the axes.
+    """Rotate the axes of an estimate to axes along which the noise of a new point is uncorrelated.
 
     covariance: noise covariance (3, 3), m^2, of the new point.
     Returns the estimate and the noise variances (3,), m^2, along its axes.
@@ -551,5 +539,5 @@ TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
     "one_euro": OneEuroTracking,
     "adaptive": AdaptiveBank,
 }
-"""The functions that create the filter of each tracking method. Their argument is the maximum speed
+"""The functions that create the filter of each tracking method. The argument is the maximum speed
 of the finger (m/s)."""

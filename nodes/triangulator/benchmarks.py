@@ -31,9 +31,9 @@ MARKER_CASES = (
     *((radius_px, 1.0, 0.0, 3.0) for radius_px in (1.6, 3.2, 6.0)),
 )
 """The benchmarked cases: radius (px), noise (multiple of the sensor's noise), motion during the
-exposure (px) and background gradient (levels per px). A radius of 3 mm corresponds to 3.2 px at
-half a metre, 6 px at 0.27 m and 1.6 px at 1 m. A speed of 1 m/s corresponds to a motion of 4 px in
-4 ms. A finger that is lit from the side has a gradient of 2 or 3 levels per px."""
+exposure (px) and background gradient (levels per px). The radii correspond to 3 mm at 1, 0.5 and
+0.27 m. At 1 m/s, the motion is 4 px in 4 ms. A finger that is lit from the side has a gradient of 2
+or 3 levels per px."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +78,8 @@ def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Ima
 def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
     """Return the Cramer-Rao bound on the standard deviation (px per axis) of a disc's centre.
 
-    All parameters of the disc are treated as unknown. The derivatives are central differences. The
-    rounding of grey levels and the dependence of the noise on the parameters are neglected.
+    All parameters of the disc are unknown. The rounding of grey levels and the dependence of the
+    noise on the parameters are neglected.
     """
     levels = disc.levels()
     weights = 1.0 / (noise.read_levels**2 + levels / noise.photons_per_level)
@@ -170,17 +170,14 @@ def _marker_trial(
     in_range: bool,
     in_scene: bool,
 ) -> Trial:
-    appearance, refine = BlobFilter(), MARKER_METHODS[name]
+    refine = MARKER_METHODS[name]
 
     def markers_in(image: Image) -> list[Marker]:
-        blobs = detect_blobs(image, appearance)
-        return refine([image] * len(blobs), blobs, appearance, sensor)
+        blobs = detect_blobs(image, BlobFilter())
+        return refine([image] * len(blobs), blobs, sensor)
 
     def error_px(_: list[Marker]) -> Interval:
-        """Return the root mean square error (px) per axis.
-
-        The error in an image is the image size if no marker or several markers are found.
-        """
+        """Return the root mean square error (px) per axis, or the image size without a marker."""
         found = [markers_in(image) for image in images]
         off = [
             markers[0].centre - centre if len(markers) == 1 else np.full(2, float(IMAGE_PX))

@@ -1,11 +1,11 @@
 """Associate the markers of each image pair with the finger and with clutter.
 
-Clutter is every marker-like spot that is not the finger's marker. A marker outside the finger's
-gate (the region in which the finger is expected) is clutter. Clutter is tracked separately. It is
-therefore not confused with a finger that was hidden, or that was merged with clutter in the images.
-The most likely assignment of markers to tracks depends on position and brightness. It is found as
-the global nearest neighbour (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
-and Navigation). If another assignment is about as likely, no fingertip is reported.
+Clutter is every marker-like spot that is not the finger's marker, such as a marker outside the
+finger's gate (the region in which the finger is expected). Clutter is tracked too, so clutter is
+not confused with a finger that was hidden or merged with clutter. Markers are assigned to tracks by
+position and brightness with the global nearest neighbour method (Bar-Shalom, Li, Kirubarajan,
+Estimation with Applications to Tracking and Navigation). If another assignment is about as likely,
+no fingertip is reported.
 """
 
 from __future__ import annotations
@@ -35,12 +35,11 @@ POSITION_SIGMA_M = 0.0005
 velocity."""
 
 ACCELERATION_SIGMA_M_PER_S2 = 1.0
-"""The acceleration that determines how a marker's deviation from motion at constant velocity
-increases with time."""
+"""The acceleration of a marker, which increases its deviation from motion at constant velocity."""
 
 STUDENT_T_DOF = 2.0
-"""The degrees of freedom of Student's t distribution, by which a marker's deviation from motion at
-constant velocity is modelled."""
+"""The degrees of freedom of Student's t distribution for a marker's deviation from motion at
+constant velocity."""
 
 MERGE_DISTANCE_M = 0.002
 """The distance below which two detected markers are treated as the same marker."""
@@ -75,7 +74,7 @@ INFEASIBLE_COST = 1e9
 """The cost of assigning a marker to a track to which the marker cannot belong."""
 
 AMBIGUITY_MARGIN = 9.0
-"""The cost difference below which two assignments are ambiguous. It is the square of three standard
+"""The cost difference below which two assignments are ambiguous: the square of three standard
 deviations."""
 
 MAX_APPEARANCE_DIST_SQ = 16.0
@@ -112,8 +111,7 @@ SOLE_CANDIDATE_TIME_S = 1.0
 ambiguous."""
 
 CLUTTER_RELEASE_TIME_S = 5.0
-"""The time for which the finger must be lost before moving clutter may be selected as the
-finger."""
+"""The time since the finger's loss after which moving clutter may be selected as the finger."""
 
 
 @dataclass(slots=True)
@@ -214,8 +212,8 @@ class ClutterTrack(Track):
     def is_alive(self, at_ns: int) -> bool:
         """Return whether the track still exists at the time `at_ns`.
 
-        A track ends if its last detection is too old. It also ends if its last detection is in the
-        future, because the clock was then set back.
+        A track ends if the last detection is too old, or in the future (after a change of the
+        clock).
         """
         timeout_s = TRACK_TIMEOUT_S
         if self.is_stationary and self.status == "clutter":
@@ -226,7 +224,7 @@ class ClutterTrack(Track):
 
 
 class DataAssociation:
-    """A selector of the finger's marker in each image pair, which also tracks the clutter."""
+    """A selector of the finger's marker among the markers of each image pair."""
 
     def __init__(self) -> None:
         self.clutter_tracks: list[ClutterTrack] = []
@@ -259,9 +257,7 @@ class DataAssociation:
     ) -> tuple[FingertipReason, TriangulatedPoint | None]:
         """Select the finger in an image pair that is older than the newest image pair.
 
-        The selection uses only the distance from the finger, because past clutter is not stored.
-        After several consecutive late pairs the track restarts, because the clock was then set
-        back.
+        The selection uses the distance from the finger only, because past clutter is not stored.
         """
         markers = detection.markers
         if len(markers) > 1 and self._finger is not None:
@@ -426,8 +422,7 @@ class DataAssociation:
 def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
     """Return the cost of assigning a marker to a track.
 
-    The cost is twice the negative log likelihood of the marker's position and appearance, except
-    for a constant.
+    The cost is twice the negative log likelihood of position and appearance, up to a constant.
     """
     if one.at_ns == at_ns:  # The track was already updated by this image pair.
         return INFEASIBLE_COST
@@ -445,8 +440,7 @@ def assign_columns(costs: Floats) -> list[int]:
 
     costs: cost matrix (n, m) with n <= m.
     Returns the column of each row. The algorithm finds shortest augmenting paths (Jonker and
-    Volgenant, 1987). The equivalent function of SciPy is not used, because its import would delay
-    the start of the node by a third of a second.
+    Volgenant, 1987). Importing the equivalent function of SciPy would take a third of a second.
     """
     nearest: list[int] = costs.argmin(axis=1).tolist()
     if len(set(nearest)) == len(nearest):

@@ -1,15 +1,14 @@
 """Render the image of a blurred ellipse, such as a flat round marker that is seen at an angle.
 
 The ellipse is uniformly bright and blurred by a Gaussian with standard deviation `blur`. The light
-S at a pixel p (0 to 1) is the integral of the Gaussian over the ellipse's area. Green's theorem
-converts it to an integral along the edge, whose points are q with outward normals n:
+S (0 to 1) at a pixel p is the integral of the Gaussian over the ellipse's area. Green's theorem
+converts the area integral to an integral along the edge points q with outward normals n:
 
     S(p) = closed integral of (q - p) . n (1 - exp(-|q - p|^2 / 2 blur^2)) / (2 pi |q - p|^2).
 
-Its derivatives are integrals of the Gaussian along the edge. They are computed as sums over
-equidistant angles t, which converge exponentially, because the integrand is smooth and periodic.
-The result is exact for any ratio of blur and axes. The module `subpixel` uses a faster model, a
-function of the distance from the edge. That model requires a blur that is small relative to the
+The derivatives of S are integrals of the Gaussian along the edge. The integrals are computed as
+sums over equidistant angles t, which converge exponentially. The result is exact for any ratio of
+blur and axes. The faster model of the module `subpixel` requires a small blur relative to the
 radius.
 
 The edge is q = centre + A (cos t, sin t) with A = [[r + e, f], [f, r - e]]. The semi-axes are r

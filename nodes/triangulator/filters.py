@@ -16,9 +16,9 @@ from flexsheet.nodes.models.one_euro import OneEuro
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """The state of a filter at the time `at_ns`, with its covariance.
+    """The state of a filter at the time `at_ns`, and a covariance.
 
-    The tracking method determines the shapes of both arrays.
+    Each tracking method defines the shapes of both arrays.
     """
 
     at_ns: int

@@ -1,14 +1,14 @@
 """Detect the fingertip's marker in a stereo image pair.
 
-Bright blobs are detected in each image and matched to pairs. The markers of likely pairs are
-refined to subpixel accuracy and triangulated. If a pair cannot be the marker, its result contains a
-rejection reason.
+Bright blobs are detected in each image and matched to pairs. The centres of likely pairs are
+refined to subpixel accuracy and triangulated. Pairs that cannot be the marker receive a rejection
+reason.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -35,39 +35,35 @@ from flexsheet.nodes.triangulator.triangulation import (
     StereoGeometry,
     TriangulatedPoint,
     measure,
-    project_with_jacobian,
-    undistort_pixel,
 )
 
 Origin = tuple[int, int]
 
 SIZE_SIGMA = 0.2
-"""The standard deviation of the logarithm of a size ratio: the radius of a blob divided by the
-radius of a marker at the blob's depth."""
+"""The standard deviation of the logarithm of a blob's radius divided by the expected radius."""
 
 HEIGHT_SIGMA = 0.25
-"""The standard deviation of the logarithm of a brightness ratio: the brightness of a marker in the
-left view divided by its brightness in the right view."""
+"""The standard deviation of the logarithm of a marker's brightness in the left view divided by that
+in the right view."""
 
 MISFIT_SIGMA_PX = 0.5
-"""The standard deviation of the distance between the rays of a marker's two centres before
-refinement, projected into the images."""
+"""The standard deviation of the distance between the two rays of an unrefined marker, projected
+into the images."""
 
 MAX_SIZE_DEVIATION = 0.6
-"""The maximum absolute logarithm of a blob's radius divided by the expected radius. It permits 0.55
-to 1.8 times the expected radius."""
+"""The maximum absolute logarithm of a blob's radius divided by the expected radius: 0.55 to 1.8
+times the expected radius."""
 
 SIZE_SIGMAS = 3.5
 """The maximum deviation of a refined marker's radius from the expected radius, in standard
-deviations. A larger deviation indicates that the marker is partly occluded, or merged with another
-bright spot."""
+deviations. With a larger deviation, the marker is partly occluded or merged with a bright spot."""
 
 MARKER_SIZE_SIGMA = 0.035
 """The relative standard deviation of the radii of manufactured markers."""
 
 STEREO_SIZE_SIGMAS = 4.5
-"""The maximum difference of a marker's radius between both views, in standard deviations. A larger
-difference indicates that the marker is partly occluded in one view."""
+"""The maximum difference of a marker's radius between both views, in standard deviations. With a
+larger difference, the marker is partly occluded in one view."""
 
 MAX_MOTION_DIFFERENCE_PX = 2.5
 """The maximum difference between both views in a marker's motion during the exposure."""
@@ -79,12 +75,11 @@ GATE_RADIUS_SIGMAS = 4.0
 """The radius of a gate (see `tracking.Gate`), in standard deviations of the expected position."""
 
 MAX_FLAT_PAIRS = 4
-"""The maximum number of blob pairs that are refined as flat markers. The pairs with the lowest
-costs are selected."""
+"""The maximum number of blob pairs that are refined as flat markers."""
 
 AMBIGUITY_MARGIN = 9.0
-"""The minimum cost difference between the best and the second best pair, in squared standard
-deviations. With a smaller difference, the marker is ambiguous."""
+"""The cost difference between the best and the second best pair below which the marker is
+ambiguous, in squared standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +158,17 @@ class StereoDetection:
     markers: tuple[Candidate, ...] = ()
     clutter: tuple[Candidate, ...] = ()
 
+    def correct_points(
+        self, correct: Callable[[TriangulatedPoint], TriangulatedPoint]
+    ) -> StereoDetection:
+        """Return the same detection with a correction of all triangulated points."""
+        measured = None if self.measured is None else correct(self.measured)
+        markers, clutter = (
+            tuple(replace(one, measured=correct(one.measured)) for one in candidates)
+            for candidates in (self.markers, self.clutter)
+        )
+        return replace(self, measured=measured, markers=markers, clutter=clutter)
+
 
 @dataclass(frozen=True, slots=True)
 class DetectionInput:
@@ -191,50 +197,37 @@ def detect_all(
 
     left, right: images (height, width).
     volume: minimum and maximum corner (3,) m of the finger's working volume in the world frame.
-    gate: region to search. If it is None, both full images are searched, and they must contain only
-        one marker.
-    left_origin_px, right_origin_px: column and row of each image's first pixel on its sensor.
-
-    If the finger is not found inside its gate, the full images are searched for other markers.
+    gate: region to search; None to search both full images, which must contain only one marker.
+    left_origin_px, right_origin_px: column and row of each image's first pixel on the sensor.
+    If the finger is not found inside the gate, the full images are searched for other markers.
     """
+    if gate is not None and not np.isfinite(gate.point).all():
+        gate = None
     images, origins = (left, right), (left_origin_px, right_origin_px)
-    inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
+    inputs = DetectionInput(images, origins, geometry, config, volume, gate)
     windows = _search_windows(inputs)
-    found = _detect_in(inputs, windows)
-    if found.reason != "ok" and windows != (None, None):
-        found = replace(found, clutter=_match_in(inputs, (None, None)).clutter)
-    return found
-
-
-def _finite_gate(gate: Gate | None) -> Gate | None:
-    return gate if gate is not None and np.isfinite(gate.point).all() else None
-
-
-def _detect_in(
-    inputs: DetectionInput, windows: tuple[Window | None, Window | None]
-) -> StereoDetection:
     found = _match_in(inputs, windows)
-    if found.reason != "ok" and _is_overexposed(inputs, windows):
-        return replace(found, reason="saturated")
+    if found.reason != "ok":
+        if any(
+            is_overexposed(image) or is_overexposed(image, window)
+            for image, window in zip(images, windows, strict=True)
+        ):
+            found = replace(found, reason="saturated")
+        if windows != (None, None):
+            found = replace(found, clutter=_match_in(inputs, (None, None)).clutter)
     return found
 
 
 def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
-    """Return the window of each image that shows the gate.
-
-    The result is (None, None) if there is no gate, or if the gate is outside one of the images.
-    """
+    """Return the window of each image that shows the gate; (None, None) if there is no window."""
     if inputs.gate is None:
         return None, None
     geometry, found = inputs.geometry, list[Window]()
-    in_left = geometry.left_from_world[:3, :3] @ inputs.gate.point
-    in_left += geometry.left_from_world[:3, 3]
-    in_right = geometry.right_from_left[:3, :3] @ in_left + geometry.right_from_left[:3, 3]
-    for view, point in enumerate((in_left, in_right)):
+    for view, point in enumerate(geometry.transform_to_cameras(inputs.gate.point)):
         depth_m = float(point[2]) - inputs.gate.radius_m
         if depth_m <= 0:
             return None, None
-        pixel = project_with_jacobian(point, geometry.matrices[view], geometry.distortions[view])[0]
+        pixel = geometry.project_with_jacobian(view, point)[0]
         reach_px = _focal_px(geometry) * (
             (inputs.gate.radius_m + inputs.config.marker_radius_m) / depth_m
         )
@@ -247,13 +240,6 @@ def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | Non
             return None, None
         found.append(window)
     return found[0], found[1]
-
-
-def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window | None]) -> bool:
-    return any(
-        is_overexposed(image) or is_overexposed(image, window)
-        for image, window in zip(inputs.images, windows, strict=True)
-    )
 
 
 def _match_in(
@@ -293,17 +279,14 @@ def _match_in(
 def _match_blobs(
     inputs: DetectionInput, left: Sequence[Blob], right: Sequence[Blob]
 ) -> list[BlobPair]:
-    """Return all pairs of blobs whose rays meet in front of the cameras, with their costs.
+    """Return all pairs of blobs with rays that meet in front of the cameras.
 
-    A pair receives a rejection reason if it is outside the finger's working volume, or if its
-    radius does not match its depth.
+    A pair outside the finger's working volume, or with wrong radii, receives a rejection reason.
     """
     geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (
-        [undistort_pixel(np.add(blob.centre, origin), matrix, distortion) for blob in blobs]
-        for blobs, origin, matrix, distortion in zip(
-            (left, right), inputs.origins, geometry.matrices, geometry.distortions, strict=True
-        )
+        [geometry.undistort(view, np.add(blob.centre, inputs.origins[view])) for blob in blobs]
+        for view, blobs in enumerate((left, right))
     )
     focal_px, world = _focal_px(geometry), geometry.world_from_left
     approach = ClosestApproach.of(geometry.right_from_left)
@@ -356,8 +339,7 @@ class RefinedPair:
 def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
     """Select the finger's marker from pairs of blobs that are likely markers.
 
-    Pairs with similar costs are refined. Pairs that are not round markers are refined again as flat
-    markers that are seen at an angle.
+    Pairs that are not round markers are refined again as flat markers that are seen at an angle.
     """
     refined = _refine_and_rank(inputs, likely)
     rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + AMBIGUITY_MARGIN]
@@ -412,10 +394,8 @@ def _check_flat_pair(
     """Check whether two ellipses show one flat marker, and correct their centres for perspective.
 
     Returns both markers with corrected centres, and with the major semi-axis as radius. Returns
-    None if the ellipses do not show one flat marker.
-
-    An obstacle that covers a strip of the marker changes the semi-axis and the centre by the same
-    amount. The mismatch of both shapes is therefore added to the covariance.
+    None if the ellipses do not show one flat marker. The mismatch of the shapes is added to the
+    covariance, because an obstacle changes the semi-axis and the centre by the same amount.
     """
     measured = _triangulate(inputs, markers)
     if measured is None:
@@ -445,29 +425,23 @@ def _flat_pose(
     inputs: DetectionInput, point_world: Floats, markers: tuple[Marker, Marker]
 ) -> FlatPose:
     geometry = inputs.geometry
-    left_from_world, right_from_left = geometry.left_from_world, geometry.right_from_left
-    in_left = left_from_world[:3, :3] @ point_world + left_from_world[:3, 3]
-    in_right = right_from_left[:3, :3] @ in_left + right_from_left[:3, 3]
+    rotations = np.eye(3), geometry.right_from_left[:3, :3]
     views = []
-    for view, (turn, point) in enumerate(
-        ((np.eye(3), in_left), (right_from_left[:3, :3], in_right))
-    ):
-        matrix, distortion = geometry.matrices[view], geometry.distortions[view]
+    for view, point in enumerate(geometry.transform_to_cameras(point_world)):
         (e, f), radius = markers[view].elongation, markers[view].radius
         axes = np.array([[radius + e, f], [f, radius - e]])
-        jacobian = project_with_jacobian(point, matrix, distortion)[1]
-        views.append(DiscView(turn, point, jacobian, axes))
+        jacobian = geometry.project_with_jacobian(view, point)[1]
+        views.append(DiscView(rotations[view], point, jacobian, axes))
     return estimate_flat_pose(views, inputs.config.marker_radius_m)
 
 
 def _unique_candidates(
     inputs: DetectionInput, refined: Sequence[RefinedPair]
 ) -> tuple[Candidate, ...]:
-    """Return the markers of refined pairs that do not share blobs, sorted by cost.
+    """Return the markers of refined pairs, sorted by cost, without wrong pairs of two markers.
 
-    Blobs of two markers can form wrong pairs. A pair is therefore dropped if both its blobs belong
-    to pairs with lower costs. It is also dropped if one of its blobs belongs to a pair with a much
-    lower cost.
+    A pair is dropped if both blobs belong to pairs with lower costs, or if one blob belongs to a
+    pair with a much lower cost.
     """
     unique: list[RefinedPair] = []
     for one in sorted(
@@ -502,7 +476,7 @@ def _refine_markers(
     images = [image for _ in pairs for image in inputs.images]
     blobs = [blob for pair in pairs for blob in (pair.left, pair.right)]
     refine = config.refine if refine is None else refine
-    markers = refine(images, blobs, config.blob_filter, config.sensor)
+    markers = refine(images, blobs, config.sensor)
     return list(zip(markers[::2], markers[1::2], strict=True))
 
 
@@ -572,9 +546,9 @@ def _triangulate(
 def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
     """Estimate the variance (px^2) of a marker's centre that partial occlusion causes.
 
-    An obstacle that covers a strip of a disc shifts the disc's centre by half the strip's width. It
-    reduces the radius by the same amount. The variance is therefore the squared difference of the
-    radii in both views, minus the variance of the estimated radii.
+    An obstacle that covers a strip of a disc shifts the centre and reduces the radius by half the
+    strip's width. The variance is therefore the squared difference of the radii in both views,
+    minus the variance of the estimated radii.
     """
     one, other = markers
     noise_px = one.radius * math.hypot(one.radius_deviation, other.radius_deviation)

@@ -1,12 +1,10 @@
 """Check whether two ellipses show one flat round marker, and correct their centres.
 
-The correction is necessary because perspective shifts the centre of an ellipse.
-
-The image of a disc with radius R and normal n satisfies A A^T = R^2 J (I - n n^T) J^T. A is the
-matrix of the ellipse's edge (module `ellipse`), and J is the derivative of the pixel with respect
-to the point. Each ellipse permits two normals, mirrored about the line of sight. The other view
-determines which of them is correct. If a marker is partly covered, or merged with a bright spot,
-usually no normal agrees with both views.
+Perspective shifts the centre of an ellipse. The image of a disc with radius R and normal n
+satisfies A A^T = R^2 J (I - n n^T) J^T. A is the matrix of the ellipse's edge (module `ellipse`),
+and J is the derivative of the pixel with respect to the point. Each ellipse permits two normals,
+mirrored about the line of sight. The other view determines the correct normal. If a marker is
+partly covered, or merged with a bright spot, usually no normal agrees with both views.
 """
 
 from __future__ import annotations
@@ -52,7 +50,7 @@ class FlatPose:
 
 
 def estimate_flat_pose(views: Sequence[DiscView], radius_m: float) -> FlatPose:
-    """Find the orientation of a disc whose computed images best fit the ellipses of two views."""
+    """Find the orientation of a disc that best explains the ellipses in two views."""
     found = [list(_possible_normals(view, radius_m)) for view in views]
     normals = [normal for normals in found for normal in normals]
     for one in found[0]:
@@ -69,7 +67,7 @@ def estimate_flat_pose(views: Sequence[DiscView], radius_m: float) -> FlatPose:
 
 
 def _possible_normals(view: DiscView, radius_m: float) -> Iterator[Floats]:
-    """Yield the two normals (3,), in the left camera's axes, that one ellipse permits."""
+    """Yield the two normals (3,) of a disc, in the left camera's axes, that fit one ellipse."""
     sideways, triangle = np.linalg.qr(view.jacobian.T)
     back = np.linalg.solve(triangle.T, view.axes) / radius_m
     values, vectors = np.linalg.eigh(back @ back.T)

@@ -29,24 +29,22 @@ Window = tuple[slice, slice]
 """The rows and columns of a rectangular part of an image."""
 
 NEIGHBOURHOOD_PX = 31
-"""The side of the square around a pixel whose mean grey level is the local threshold."""
+"""The side of the square around a pixel. The mean grey level of the square is the threshold."""
 
 SURROUND_PX = 3
-"""The width of the border around a blob. The outermost pixels of this border determine the grey
-level of the blob's surroundings."""
+"""The width of the border around a blob. The outermost pixels determine the grey level of the
+blob's surroundings."""
 
 SURROUND_RANK = 0.75
-"""The quantile of the surrounding pixels' grey levels that is used as the level of the
-surroundings. A high quantile is necessary if one side of the marker is a bright finger, and the
-other side is dark."""
+"""The quantile of the surrounding pixels that is used as the grey level of the surroundings. A high
+quantile is necessary if only one side of the marker is a bright finger."""
 
 SKIRT_FRACTION = 0.1
 """The fraction of the marker's height (its grey levels above its surroundings) below which the
 light of a pixel is ignored as noise."""
 
 MAX_REGIONS = 64
-"""The maximum number of bright regions that are searched in an image. If an image contains more
-regions, the smallest regions are skipped."""
+"""The maximum number of bright regions that are searched in an image, largest first."""
 
 WHITE_LEVEL = 250
 """The grey level from which a pixel is white."""
@@ -57,26 +55,18 @@ WHITE_FRACTION = 0.2
 
 @dataclass(frozen=True, slots=True)
 class BlobFilter:
-    """The criteria for blobs that may be a marker, and for refined markers.
+    """The criteria for blobs that may be a marker.
 
     min_contrast: minimum difference of grey levels between a blob's brightest pixel and its
         surroundings.
     min_area_px, max_area_px: limits on the number of pixels above half the contrast.
     window_half_px: half the side of the smallest search window around an expected position.
-    max_motion_px: maximum motion during an exposure.
-    max_blur: maximum standard deviation of the blur of a marker's edge in focus, as a fraction of
-        the radius.
-    max_misfit: maximum root mean square residual of a fitted disc, as a fraction of the marker's
-        height.
     """
 
     min_contrast: float = 60.0
     min_area_px: int = 4
     max_area_px: int = 1500
     window_half_px: int = 16
-    max_motion_px: float = 9.0
-    max_blur: float = 0.5
-    max_misfit: float = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,9 +128,8 @@ class Marker:
     elongation: tuple[float, float] = (0.0, 0.0)
 
 
-Refine = Callable[[Sequence[Image], Sequence[Blob], BlobFilter, PixelNoise], list[Marker]]
-"""A function that refines blobs to markers. The blob with index i belongs to the image with index
-i."""
+Refine = Callable[[Sequence[Image], Sequence[Blob], PixelNoise], list[Marker]]
+"""A function that refines blobs to markers, from one image per blob."""
 
 
 def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
@@ -171,9 +160,8 @@ def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = 
     """Detect all blobs in an image, or in a window of it, that may be a marker.
 
     Regions that are brighter than the mean of their neighbourhood are searched. In each region, the
-    pixels above half the contrast form blobs. Both thresholds are necessary to find a marker on a
-    bright finger or next to a brighter spot. Blobs at the image border are dropped, because their
-    computed centres would be wrong.
+    pixels above half the contrast form blobs. The two thresholds find a marker on a bright finger
+    or next to a brighter spot. Blobs at the image border are dropped.
     """
     top, left = (0, 0) if window is None else (window[0].start, window[1].start)
     part = image if window is None else image[window]
@@ -262,7 +250,8 @@ def _make_blob(
     origin: row and column at which the part begins in the image.
     """
     rows, columns = window
-    found = _light_moments(cut, surround, peak)
+    skirt = np.float32(surround + SKIRT_FRACTION * (peak - surround))
+    found = cv2.moments(np.maximum(cut - skirt, np.float32(0.0)))
     light = found["m00"]
     a, b, c = found["mu20"] / light, found["mu11"] / light, found["mu02"] / light
     # A motion of length l at constant speed adds l^2 / 12 to the second moment along it.
@@ -285,15 +274,15 @@ def _make_blob(
     )
 
 
-def _light_moments(cut: Image, surround: float, peak: float) -> dict[str, float]:
-    """Return the image moments (`cv2.moments`) of the light above the noise threshold.
+MAX_MOTION_PX = 9.0
+"""The maximum motion of a marker during an exposure."""
 
-    cut: pixels of the blob's window. surround, peak: grey levels of the surroundings and of the
-        brightest pixel.
-    """
-    skirt = surround + SKIRT_FRACTION * (peak - surround)
-    return cv2.moments(np.maximum(cut - np.float32(skirt), np.float32(0.0)))
+MAX_BLUR = 0.5
+"""The maximum standard deviation of the blur of a marker's edge, as a fraction of the radius."""
 
+MAX_MISFIT = 0.04
+"""The maximum root mean square residual of a fitted disc, as a fraction of the marker's height (its
+grey levels above its surroundings)."""
 
 SHARP_PX = 1.2
 """The maximum standard deviation of the edge blur at which a marker is in focus."""
@@ -320,17 +309,13 @@ class SystematicError:
 
 
 BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
-"""The systematic error of the method `moments`. With this value, the errors in simulations divided
-by their predicted standard deviations have unit variance (`tests/test_marker.py`)."""
+"""The systematic error of the method `moments`, from simulations (`tests/test_marker.py`)."""
 
 BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
-"""The systematic error of the method `subpixel_fit`. With this value, the errors in simulations
-divided by their predicted standard deviations have unit variance (`tests/test_marker.py`)."""
+"""The systematic error of the method `subpixel_fit`, from simulations (`tests/test_marker.py`)."""
 
 
-def moments(
-    images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
-) -> list[Marker]:
+def moments(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
     """Refine blobs to the unweighted centroid of the pixels above half the marker's height."""
     markers = []
     for image, blob in zip(images, blobs, strict=True):
@@ -340,7 +325,7 @@ def moments(
         rejection_reason: MarkerRejection | None = None
         if blob.spread > MAX_SPREAD:
             rejection_reason = "blurred"
-        if math.hypot(*blob.motion) > blob_filter.max_motion_px:
+        if math.hypot(*blob.motion) > MAX_MOTION_PX:
             rejection_reason = "merged"
         rows, columns = blob.window
         x, y = found["m10"] / found["m00"], found["m01"] / found["m00"]
@@ -359,18 +344,15 @@ def moments(
     return markers
 
 
-def subpixel_fit(
-    images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
-) -> list[Marker]:
+def subpixel_fit(images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise) -> list[Marker]:
     """Refine blobs by a maximum-likelihood fit of a motion-blurred disc (module `subpixel`)."""
     return [
         _make_marker(
             blob,
             fit,
             fit.motion,
-            is_blurred=fit.blur > max(blob_filter.max_blur * fit.radius, SHARP_PX),
-            is_merged=fit.misfit > blob_filter.max_misfit
-            or math.hypot(*fit.motion) > blob_filter.max_motion_px,
+            is_blurred=fit.blur > max(MAX_BLUR * fit.radius, SHARP_PX),
+            is_merged=fit.misfit > MAX_MISFIT or math.hypot(*fit.motion) > MAX_MOTION_PX,
         )
         for blob, fit in zip(blobs, fit_discs(images, _fit_starts(blobs), noise), strict=True)
     ]
@@ -400,17 +382,16 @@ def _make_marker(
 
 
 MAX_ELLIPSE_MISFIT = 0.035
-"""The maximum root mean square residual of a fitted ellipse, as a fraction of the marker's height
-(its grey levels above its surroundings). It is smaller than the limit for a disc, because an
-ellipse also fits a partly covered disc well."""
+"""The maximum root mean square residual of a fitted ellipse, as a fraction of the marker's height.
+The limit is smaller than for a disc, because an ellipse fits a partly covered disc well."""
 
 MAX_ODD_MISFIT = 0.03
-"""The maximum of the part of the residuals that is odd about the centre of a fitted ellipse, as a
-fraction of the marker's height. An ellipse does not fit this part of a partly covered disc."""
+"""The maximum residual of a fitted ellipse that is odd about the centre, as a fraction of the
+marker's height. A partly covered disc has larger odd residuals."""
 
 
 def fit_flat_markers(
-    images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
+    images: Sequence[Image], blobs: Sequence[Blob], noise: PixelNoise
 ) -> list[Marker]:
     """Refine blobs by a maximum-likelihood fit of an ellipse without motion blur."""
     return [
@@ -419,9 +400,8 @@ def fit_flat_markers(
             fit,
             blob.motion,
             is_blurred=fit.blur
-            > max(blob_filter.max_blur * (fit.radius - math.hypot(*fit.elongation)), SHARP_PX),
-            is_merged=fit.misfit > min(blob_filter.max_misfit, MAX_ELLIPSE_MISFIT)
-            or fit.odd_misfit > MAX_ODD_MISFIT,
+            > max(MAX_BLUR * (fit.radius - math.hypot(*fit.elongation)), SHARP_PX),
+            is_merged=fit.misfit > MAX_ELLIPSE_MISFIT or fit.odd_misfit > MAX_ODD_MISFIT,
         )
         for blob, fit in zip(blobs, fit_ellipses(images, _fit_starts(blobs), noise), strict=True)
     ]
@@ -440,5 +420,5 @@ MARKER_METHODS: dict[str, Refine] = {
 }
 
 FLAT_METHODS: dict[Refine, Refine] = {subpixel_fit: fit_flat_markers}
-"""The method that refines flat markers for each method that refines round markers. Methods without
-an entry do not detect flat markers."""
+"""The refinement of flat markers for each method. Methods without an entry detect round markers
+only."""

@@ -39,14 +39,9 @@ from flexsheet.nodes.triangulator.fingertip import (
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 from flexsheet.nodes.triangulator.self_checks import CameraCheck
-from flexsheet.nodes.triangulator.skew import compensate_detection_skew
+from flexsheet.nodes.triangulator.skew import compensate_skew
 from flexsheet.nodes.triangulator.subpixel import PixelNoise
-from flexsheet.nodes.triangulator.tracking import (
-    PREDICTION_STEP_S,
-    Tracker,
-    TrackingSettings,
-    make_horizons_s,
-)
+from flexsheet.nodes.triangulator.tracking import Tracker, make_horizons_s
 from flexsheet.nodes.triangulator.triangulation import (
     StereoGeometry,
     TriangulatedPoint,
@@ -54,20 +49,18 @@ from flexsheet.nodes.triangulator.triangulation import (
 )
 
 TIMEOUT_PERIODS = 2.5
-"""The minimum timeout of a track, in periods of the camera. It permits one missing image pair."""
+"""The minimum timeout of a track, in periods of the camera, for one missing image pair."""
 
 
 SAME_POINT_M = 0.001
-"""The maximum distance between two measured positions of the same marker in one image pair. The
-positions come from two searches of the images."""
+"""The maximum distance between the positions of a marker from two searches of an image pair."""
 
 
 class Triangulator(Node):
     """A node that detects and tracks the fingertip in stereo image pairs.
 
     The cameras track a marker on the finger. The fingertip is the point of the finger's pad that
-    touches the sheet. The offset between marker and fingertip is assumed to be constant, because
-    the cameras cannot measure the finger's rotation.
+    touches the sheet. The offset between marker and fingertip is assumed to be constant.
     """
 
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame"})
@@ -132,12 +125,7 @@ class Triangulator(Node):
             sensor=PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level),
         )
         self.horizons_s = make_horizons_s(p.prediction_horizon_s)
-        self.tracking = TrackingSettings(
-            max_speed_m_per_s=scene.finger.max_speed_m_per_s,
-            max_acceleration_m_per_s2=p.max_acceleration_m_per_s2,
-            track_timeout_s=p.track_timeout_s,
-            confirm_frames=p.confirm_frames,
-        )
+        self.tracking = p.tracking_settings(scene.finger.max_speed_m_per_s)
         touch_point = p.touch_point_world_m
         self._check = CameraCheck(
             np.array(p.reference_marks_world_m, dtype=np.float64),
@@ -181,15 +169,30 @@ class Triangulator(Node):
         found = detect_pair(gate=gate)
         detection = self._check.exclude_marks(found, tracked=gate is not None)
         if pair.skew_s != 0.0:
-            motion = self.tracker.velocity_at(at_ns)
-            detection = compensate_detection_skew(detection, self.geometry, pair.skew_s, *motion)
+            velocity, covariance = self.tracker.velocity_at(at_ns)
+            correct = partial(
+                compensate_skew,
+                geometry=self.geometry,
+                skew_s=pair.skew_s,
+                velocity=velocity,
+                velocity_covariance=covariance,
+            )
+            detection = detection.correct_points(correct)
         is_late = self.tracker.is_late(at_ns)
         reason, measured = self.association.select_finger(at_ns, detection, self.tracker)
         if is_late and reason != "ok":  # a newer fingertip was published already
             self.late += 1
         else:
             self.reasons[reason] += 1
-            self.fingertip.publish(self._message(at_ns, reason, measured), source_ns=at_ns)
+            fingertip = self.tracker.make_fingertip(
+                at_ns,
+                reason,
+                None if measured is None else measured.point_world,
+                horizons_s=self.horizons_s,
+                reprojection_px=0.0 if measured is None else measured.reprojection_px,
+                offset_m=self.pad_to_marker_m,
+            )
+            self.fingertip.publish(fingertip, source_ns=at_ns)
         if reason == "ok" and self.association.is_clutter_search_due(at_ns):
             # Search after publishing, since no other node waits for the clutter.
             found = detect_pair(gate=None)
@@ -223,24 +226,3 @@ class Triangulator(Node):
     def _note(self) -> None:
         counts = ", ".join(f"{count} {reason}" for reason, count in self.reasons.items())
         self.note = f"{counts}; {self.late} late; by {self.methods}"
-
-    def _message(
-        self, at_ns: int, reason: FingertipReason, measured: TriangulatedPoint | None
-    ) -> Fingertip:
-        tracker = self.tracker
-        track = tracker.predict_at(at_ns, self.horizons_s)
-        pad = track.position - self.pad_to_marker_m
-        return Fingertip(
-            valid=reason == "ok",
-            state=tracker.state(at_ns),
-            reason=reason,
-            position_world_m=pad,
-            velocity_world_m_per_s=track.velocity,
-            covariance=track.covariance,
-            predicted_path_world_m=track.path - self.pad_to_marker_m,
-            prediction_step_s=PREDICTION_STEP_S,
-            measured_world_m=pad
-            if measured is None
-            else measured.point_world - self.pad_to_marker_m,
-            reprojection_px=0.0 if measured is None else measured.reprojection_px,
-        )

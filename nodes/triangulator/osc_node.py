@@ -31,7 +31,7 @@ from flexsheet.nodes.triangulator.external_fingertip import ExternalFingertip
 from flexsheet.nodes.triangulator.osc_packet import read_packet
 
 MAX_PACKET_BYTES = 2048
-"""The maximum size of a packet. The limit also bounds the nesting of bundles."""
+"""The maximum size of a packet, which also bounds the nesting of bundles."""
 
 POSITION, POSE = 3, 7
 """The numbers of values in a position message, and in a pose message (position and quaternion)."""
@@ -45,10 +45,7 @@ IDENTITY: tuple[Row, Row, Row] = (
 
 
 class OscStream(LimitedModel):
-    """An OSC address whose messages contain positions.
-
-    The settings include the transform of these positions to the world frame.
-    """
+    """An OSC address with positions, and the transform of the positions to the world frame."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -126,8 +123,8 @@ class OscInputParameters(NodeParameters):
 class OscInput(Node):
     """A node that publishes the positions of the eyes and the fingertip that it receives by OSC.
 
-    A tracking program sends the positions. If no messages arrive, the node publishes invalid eyes
-    and fingertips. The renderer then uses the eye positions in the scene.
+    If no messages arrive, the node publishes invalid eyes and fingertips. The renderer then uses
+    the eye positions in the scene.
     """
 
     opens_devices: ClassVar[bool] = True

@@ -10,6 +10,7 @@ from flexsheet.messages.methods import MarkerMethod, TrackingMethod
 from flexsheet.messages.scene import Finite, Positive
 from flexsheet.nodes.node import NodeParameters
 from flexsheet.nodes.parameter_marks import CameraCalibrationFile, MarkerCalibrationFile
+from flexsheet.nodes.triangulator.tracking import TrackingSettings
 
 
 class TriangulatorParameters(NodeParameters):
@@ -83,3 +84,12 @@ class TriangulatorParameters(NodeParameters):
         description="world position, m, of a known point at which the fingertip may rest, to check "
         "the marker's offset",
     )
+
+    def tracking_settings(self, max_speed_m_per_s: float) -> TrackingSettings:
+        """Return the settings of a tracker for a finger with the given maximum speed."""
+        return TrackingSettings(
+            max_speed_m_per_s=max_speed_m_per_s,
+            max_acceleration_m_per_s2=self.max_acceleration_m_per_s2,
+            track_timeout_s=self.track_timeout_s,
+            confirm_frames=self.confirm_frames,
+        )

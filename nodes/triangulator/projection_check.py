@@ -1,10 +1,10 @@
 """Compare the positions of projected marks on the sheet with their expected positions.
 
-A mark lies on the ray of its projector pixel, independently of the sheet's position. Its distance
-from this ray therefore indicates errors of the projector and the camera. Its distance from the
-expected surface of the sheet indicates errors of the arms and the camera. Near a finger that pushes
-the sheet, the surface moves in a known ratio to the true finger pad. The marks there indicate
-errors of the pad's measured depth.
+A mark is on the ray of its projector pixel for any position of the sheet. The distance from this
+ray therefore indicates errors of the projector and the camera. The distance from the expected
+surface of the sheet indicates errors of the arms and the camera. Near a finger that pushes the
+sheet, the surface moves in a known ratio to the finger pad, so the marks indicate errors of the
+pad's depth.
 """
 
 from __future__ import annotations
@@ -24,51 +24,47 @@ RAY_THRESHOLD_M = 7e-4
 standard deviation of 0.12 mm per axis, and a calibrated projector 0.03 mm."""
 
 SURFACE_THRESHOLD_M = 1.2e-3
-"""The maximum mean distance of the marks from the sheet's surface, which is about five standard
-deviations. The camera contributes 0.12 mm. The base and clamp of each arm contribute 0.2 mm, and
-the zero positions of its joints contribute 0.2 mm (docs/apparatus.md)."""
+"""The maximum mean distance of the marks from the sheet's surface: about five standard deviations.
+The camera contributes 0.12 mm. Per arm, base and clamp contribute 0.2 mm, and joint zero positions
+0.2 mm (docs/apparatus.md)."""
 
 FINGER_THRESHOLD_M = 2e-3
 """The maximum error of the finger's depth in the sheet. The marker's offset contributes a standard
 deviation of 0.3 mm, the camera 0.12 mm, the arms 0.25 mm, and noise 0.2 mm."""
 
 LATENCY_THRESHOLD_S = 0.01
-"""The maximum deviation of the display latency from its configured value. It equals ten standard
-deviations of a measurement by photodiode (1 ms)."""
+"""The maximum deviation of the display latency from its configured value: ten standard deviations
+of a measurement by photodiode (1 ms)."""
 
 LATENCY_MEMORY_S = 4.0
-"""The time constant for averaging the latency. It is long because only a few images show a wrong
-latency: the images taken while the projector still shows the previous frame."""
+"""The time constant for averaging the latency. Only images that show the previous frame contain
+information, and these images are rare."""
 
 MATCH_RADIUS_M = 0.012
-"""The maximum distance between a detected point and the expected position of a mark at which both
-are matched."""
+"""The maximum distance between a detected point and the expected position of its mark."""
 
 MAX_SPREAD_M = 0.004
-"""The maximum difference between the offset of a mark from its expected position and the median
-offset of all marks. A point with a larger difference is not a mark."""
+"""The maximum difference between the offset of a mark and the median offset of all marks."""
 
 MAX_AGE_NS = 300_000_000
-"""The maximum age of the newest frame at the exposure. If the newest frame is older, frames are
-missing."""
+"""The maximum age of the newest frame at the exposure."""
 
 STILL_M_PER_S, MOVING_M_PER_S = 0.005, 0.015
-"""The speed of the marks below which their positions are checked, and the speed above which the
-latency is checked."""
+"""The speed of the marks below which positions are checked, and above which latency is checked."""
 
 MAX_DRIFT_M = 3e-4
-"""The maximum motion of a mark along the sheet's normal between the frame and the exposure. With a
-larger motion, the heights of the marks above the expected surface are not checked."""
+"""The maximum motion of a mark along the sheet's normal between frame and exposure for a check of
+the heights."""
 
 MAX_GAIN = 4.0
-"""The maximum ratio of the standard deviation of the finger's estimated depth to that of a mark's
-height. Marks that are far from the finger cause a larger ratio. The depth is then not estimated."""
+"""The maximum ratio of the standard deviations of the finger's estimated depth and a mark's height.
+With a larger ratio, the marks are too far from the finger, and the depth is not estimated."""
 
 
 class ProjectionCheck:
-    """The self-checks of projector, arms and finger marker by means of projected marks.
+    """The self-checks of projector, arms and finger marker by projected marks.
 
-    projector: projector of the scene. Without a projector or without marks, nothing is checked.
+    projector: projector of the scene; None if there is no projector.
     """
 
     def __init__(self, projector: Projector | None) -> None:
@@ -180,8 +176,7 @@ class ProjectionCheck:
     def results(self, *, camera_checked: bool) -> dict[SuspectedCause, SelfCheck]:
         """Return the results of all checks that have enough data, by suspected cause.
 
-        camera_checked: whether the shift of the camera is measured by reference marks. Errors of
-            the camera are then distinguished from errors of the projector and the arms.
+        camera_checked: whether reference marks measure the shift of the camera.
         """
         ray, surface = self._ray, self._surface
         found: dict[SuspectedCause, SelfCheck] = {}
@@ -191,31 +186,32 @@ class ProjectionCheck:
             cause: SuspectedCause = (
                 "projector_moved" if camera_checked else "camera_or_projector_moved"
             )
-            found[cause] = _make_check(cause, ray, suspected=ray.suspected and not is_camera)
+            found[cause] = make_check(cause, ray, suspected=ray.suspected and not is_camera)
         if surface.has_data:
             cause = "arm_base_moved" if camera_checked else "camera_or_arm_base_moved"
-            found[cause] = _make_check(
-                cause, surface, suspected=surface.suspected and not is_camera
-            )
+            found[cause] = make_check(cause, surface, suspected=surface.suspected and not is_camera)
         if is_camera:
-            found["camera_moved"] = _make_check("camera_moved", ray, suspected=True)
+            found["camera_moved"] = make_check("camera_moved", ray, suspected=True)
         if self._finger.has_data:
-            found["marker_offset"] = _make_check(
-                "marker_offset", self._finger, suspected=self._finger.suspected
-            )
+            found["marker_offset"] = make_check("marker_offset", self._finger)
         if self._latency.has_data:
-            found["display_latency"] = _make_check(
-                "display_latency", self._latency, suspected=self._latency.suspected
-            )
+            found["display_latency"] = make_check("display_latency", self._latency)
         return found
 
 
-def _make_check(cause: SuspectedCause, monitor: ResidualMonitor, *, suspected: bool) -> SelfCheck:
+def make_check(
+    cause: SuspectedCause, monitor: ResidualMonitor, *, suspected: bool | None = None
+) -> SelfCheck:
+    """Make the result of a self-check from the monitor of a residual.
+
+    suspected: whether the cause is suspected; None if the monitor decides.
+    """
+    is_latency = cause == "display_latency"
     return SelfCheck(
         cause=cause,
-        unit="s" if cause == "display_latency" else "m",
-        value=float(monitor.mean[0]) if cause == "display_latency" else monitor.deviation,
+        unit="s" if is_latency else "px" if cause == "cameras_misaligned" else "m",
+        value=float(monitor.mean[0]) if is_latency else monitor.deviation,
         expected=0.0,
         threshold=monitor.threshold,
-        suspected=suspected,
+        suspected=monitor.suspected if suspected is None else suspected,
     )

@@ -1,9 +1,8 @@
 """Check the stereo camera and the marker by residuals of triangulated points.
 
-Three residuals are monitored. The reprojection error increases if one camera has moved relative to
-the other camera. The positions of fixed reference marks change if the whole stereo camera has
-moved. The position of a finger that rests at a known point changes if the marker has moved on the
-finger.
+The reprojection error increases if one camera has moved relative to the other camera. The positions
+of fixed reference marks change if the stereo camera has moved. The position of a finger at a known
+point changes if the marker has moved on the finger.
 """
 
 from __future__ import annotations
@@ -15,39 +14,35 @@ from dataclasses import replace
 import numpy as np
 
 from flexsheet.messages.scene import Projector
-from flexsheet.messages.types import Frame, SelfCheck, SuspectedCause
+from flexsheet.messages.types import Frame, SelfCheck
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.residuals import ResidualMonitor
 from flexsheet.nodes.triangulator.fingertip import StereoDetection
-from flexsheet.nodes.triangulator.projection_check import ProjectionCheck
+from flexsheet.nodes.triangulator.projection_check import ProjectionCheck, make_check
 
 REPROJECTION_THRESHOLD_PX = 0.2
-"""The maximum mean reprojection error. The error is 0.024 px after a calibration, and about 0.1 px
-after a drift of the right camera by 0.2 mrad. A vertical shift of one camera by 1 mm causes 0.5 px
-if the finger is at half a metre."""
+"""The maximum mean reprojection error. After a calibration, the error is 0.024 px. A drift of one
+camera by 0.2 mrad causes 0.1 px, and a vertical shift by 1 mm causes 0.5 px at half a metre."""
 
 MARK_THRESHOLD_M = 6e-4
-"""The maximum shift of the reference marks, which equals five standard deviations. After a
-calibration, the standard deviation per axis is 0.12 mm (docs/apparatus.md)."""
+"""The maximum shift of the reference marks: five standard deviations after a calibration
+(docs/apparatus.md)."""
 
 MARKER_THRESHOLD_M = 1.5e-3
-"""The maximum distance of a resting finger from the known point, which is more than four standard
-deviations. The calibrated marker offset contributes 0.3 mm per axis, the camera 0.12 mm, and noise
-0.1 mm."""
+"""The maximum distance of a resting finger from the known point: more than four standard
+deviations. The marker offset contributes 0.3 mm per axis, the camera 0.12 mm, and noise 0.1 mm."""
 
 MARK_RADIUS_M = 0.008
-"""The maximum distance between a detected point and a reference mark at which both are matched."""
+"""The maximum distance between a detected point and its reference mark."""
 
 TOUCH_RADIUS_M = 0.012
-"""The maximum distance of a finger from the known point at which the finger is assumed to touch
-this point."""
+"""The distance of a finger from the known point below which the finger touches the point."""
 
 STILL_S = 0.7
 """The time for which a finger must be at rest before its position is checked."""
 
 STILL_M = 2.5e-4
-"""The maximum standard deviation of the position of a resting finger. A finger that hovers moves
-more."""
+"""The maximum standard deviation of a resting finger's position. A hovering finger moves more."""
 
 
 class CameraCheck:
@@ -104,8 +99,7 @@ class CameraCheck:
     def exclude_marks(self, detection: StereoDetection, *, tracked: bool) -> StereoDetection:
         """Remove the fixed marks and the projected marks from a detection.
 
-        tracked: whether the finger was searched in a gate. Markers inside the gate then remain,
-            because they may be the finger's marker.
+        tracked: whether the finger was searched in a gate. Markers inside the gate then remain.
         """
         marks = np.concatenate([self._marks, self._projection.expected_world_m])
         if not len(marks):
@@ -146,31 +140,11 @@ class CameraCheck:
         by_marks = self._projection.results(camera_checked=self._camera.has_data)
         found = []
         if self._reprojection.has_data:
-            found.append(
-                SelfCheck(
-                    cause="cameras_misaligned",
-                    unit="px",
-                    value=self._reprojection.deviation,
-                    expected=0.0,
-                    threshold=REPROJECTION_THRESHOLD_PX,
-                    suspected=self._reprojection.suspected,
-                )
-            )
+            found.append(make_check("cameras_misaligned", self._reprojection))
         if self._camera.has_data:
-            found.append(_distance_check("camera_moved", self._camera))
+            found.append(make_check("camera_moved", self._camera))
         if self._marker.has_data:
             # The known point shows the offset in all directions, the sheet only along its normal.
-            found.append(_distance_check("marker_offset", self._marker))
+            found.append(make_check("marker_offset", self._marker))
             by_marks.pop("marker_offset", None)
         return (*found, *by_marks.values())
-
-
-def _distance_check(cause: SuspectedCause, monitor: ResidualMonitor) -> SelfCheck:
-    return SelfCheck(
-        cause=cause,
-        unit="m",
-        value=monitor.deviation,
-        expected=0.0,
-        threshold=monitor.threshold,
-        suspected=monitor.suspected,
-    )

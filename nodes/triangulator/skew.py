@@ -7,12 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.triangulator.fingertip import StereoDetection
-from flexsheet.nodes.triangulator.triangulation import (
-    StereoGeometry,
-    TriangulatedPoint,
-    project_with_jacobian,
-)
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint
 
 
 def compensate_skew(
@@ -26,22 +21,15 @@ def compensate_skew(
 
     skew_s: time of the right exposure minus the time of the left exposure.
     velocity: velocity (3,), m/s, of the finger in the world, with its covariance (3, 3).
-
-    The corrected point is the finger's position at the mean time of both exposures.
-
-    To first order, a finger with velocity v is measured with the error M v, where M = s (A_r J_r -
-    I/2). Here s is the skew, J_r the Jacobian of the right pixel, and A_r the derivative of the
-    triangulated point with respect to that pixel. The error is mainly in depth, and its size is
-    speed * skew * depth / baseline. The uncertainty of v is added to the covariance.
+    The corrected point is the finger's position at the mean time of both exposures. To first order,
+    a finger with velocity v is measured with the error M v, where M = s (A_r J_r - I/2). Here s is
+    the skew, J_r the Jacobian of the right pixel, and A_r the derivative of the triangulated point
+    with respect to the right pixel. The uncertainty of v is added to the covariance.
     """
     world = geometry.world_from_left[:3, :3]
-    in_left = geometry.left_from_world[:3, :3] @ measured.point_world
-    in_left = in_left + geometry.left_from_world[:3, 3]
-    rig = geometry.right_from_left
-    in_right = rig[:3, :3] @ in_left + rig[:3, 3]
-    left = project_with_jacobian(in_left, geometry.matrices[0], geometry.distortions[0])[1]
-    right = project_with_jacobian(in_right, geometry.matrices[1], geometry.distortions[1])[1]
-    right = right @ rig[:3, :3]
+    in_left, in_right = geometry.transform_to_cameras(measured.point_world)
+    left = geometry.project_with_jacobian(0, in_left)[1]
+    right = geometry.project_with_jacobian(1, in_right)[1] @ geometry.right_from_left[:3, :3]
     # The singular case was rejected when the point was triangulated.
     right_weight = np.linalg.solve(left.T @ left + right.T @ right, right.T @ right)
     error = skew_s * (world @ right_weight @ world.T - 0.5 * np.eye(3))
@@ -49,32 +37,4 @@ def compensate_skew(
         measured,
         point_world=measured.point_world - error @ velocity,
         covariance=measured.covariance + error @ velocity_covariance @ error.T,
-    )
-
-
-def compensate_detection_skew(
-    detection: StereoDetection,
-    geometry: StereoGeometry,
-    skew_s: float,
-    velocity: Floats,
-    velocity_covariance: Floats,
-) -> StereoDetection:
-    """Correct all detections of an image pair for the time between both exposures.
-
-    skew_s: time of the right exposure minus the time of the left exposure.
-    velocity: velocity (3,), m/s, of the finger in the world, with its covariance (3, 3).
-    """
-
-    def corrected(measured: TriangulatedPoint) -> TriangulatedPoint:
-        return compensate_skew(measured, geometry, skew_s, velocity, velocity_covariance)
-
-    return replace(
-        detection,
-        measured=None if detection.measured is None else corrected(detection.measured),
-        markers=tuple(
-            replace(marker, measured=corrected(marker.measured)) for marker in detection.markers
-        ),
-        clutter=tuple(
-            replace(marker, measured=corrected(marker.measured)) for marker in detection.clutter
-        ),
     )

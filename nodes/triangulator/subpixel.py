@@ -1,23 +1,23 @@
 """Estimate a marker's centre by maximum likelihood: fit a motion-blurred disc to its pixels.
 
-The image of a marker is a uniform disc on a background with a constant gradient, which is called
-ground. The lens, the pixel's area and the motion during the exposure blur the disc. At the distance
-d outside the disc's edge, a pixel has the grey level
+The model of the image is a uniform disc on a background ("ground") with a constant gradient. The
+lens, the pixel's area and the motion during the exposure blur the disc. At the distance d outside
+the disc's edge, a pixel has the grey level
 
     level = ground (1 - S) + marker S,    S = mean over the motion of Phi(-d / blur).
 
 Here ground and marker are grey levels, S is the fraction of the pixel that the disc covers, and Phi
 is the normal cumulative distribution. A Gauss-Newton method fits all parameters at once, with each
-pixel weighted by its noise. The covariance of the result is the inverse of the Fisher information,
-which is the Cramer-Rao bound for images that follow the model. For other images, the covariance is
-increased by the part of the residuals that is odd (antisymmetric) about the centre.
+pixel weighted by its noise. The covariance of the result is the inverse of the Fisher information
+(Cramer-Rao bound). If the image deviates from the model, the odd (antisymmetric) part of the
+residuals about the centre increases the covariance.
 
-A flat marker that is seen at an angle is an ellipse. `fit_ellipses` fits the two parameters of its
-elongation instead of the motion. The module `ellipse` computes its exact image.
+A flat marker that is seen at an angle is an ellipse. `fit_ellipses` fits the elongation instead of
+the motion. The module `ellipse` computes the exact image of an ellipse.
 
 The derivatives of the image with respect to the centre and the ground's gradient are odd about the
-centre. All other derivatives are even. A wrong radius, blur, level or motion therefore changes only
-the covariance, not the centre.
+centre, and all other derivatives are even. Errors of radius, blur, level or motion therefore do not
+change the centre.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ otherwise 0."""
 
 WHITE = 255
 MARGIN_PX = 3.0
-"""The width of the surroundings of a disc at rest that the fit uses. It is large enough to estimate
-the background, and excludes the finger's edge, where the background is not linear."""
+"""The width of the surroundings of a disc at rest that the fit uses. The finger's edge, where the
+background is not linear, is farther away."""
 
 MIN_MARGIN_PX = 1.25
 """The minimum width of the surroundings of a moving disc that the fit uses."""
@@ -59,8 +59,8 @@ the exposure."""
 PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
-"""The inverse variances of the parameters' starting values. They only affect parameters about which
-the pixels contain no information, such as the level of a saturated marker."""
+"""The inverse variances of the parameters' starting values. The starting values only affect
+parameters without information in the pixels, such as the level of a saturated marker."""
 
 MIN_SHAPE = np.array([0.5, 0.3])
 """The lower bounds (px) on the radius and the blur of a fitted disc."""
@@ -76,8 +76,7 @@ START_ELONGATION = 0.45
 """The maximum ratio of an ellipse's elongation to its radius in the starting values of the fit."""
 
 ELLIPSE_BLUR_PX = 0.8
-"""The starting value for the blur of an ellipse. The spread of a blob cannot provide this value,
-because the spread also depends on the elongation."""
+"""The starting value for the blur of an ellipse, which the spread of a blob does not reveal."""
 
 MOTION_STEP_PX = 1.8
 """The maximum distance between the positions over which the image of a moving disc is averaged."""
@@ -90,7 +89,7 @@ PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 ITERATIONS = 8
 CONVERGED_STEP_PX = np.array([0.02, 0.02, 0.05, 0.05])
 """The last steps of centre (x, y), radius and blur below which a fit has converged. The remaining
-error is about the squared step divided by the blur, which is less than 0.001 px."""
+error (squared step divided by blur) is less than 0.001 px."""
 
 CONVERGED_ELONGATION_PX = 0.05
 """The last step of the elongation below which the fit of an ellipse has converged."""
@@ -192,8 +191,8 @@ def fit_ellipses(
 
     starts: starting values of moving discs. Each ellipse starts with the second moments of its
         disc.
-    The ellipses are fitted one after the other, because the computing time increases with the third
-    power of the largest ellipse's size.
+    The ellipses are fitted one by one, because the computing time increases with the third power of
+    the largest ellipse's size.
     """
     found = []
     for image, one in zip(images, starts, strict=True):
@@ -285,8 +284,8 @@ def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]
 
     The numbers are the weighted sum of squared residuals, the number of pixels, the sum of weights,
     and a variance ratio. The ratio is the variance of the odd part of the residuals divided by the
-    variance of the sensor noise. The odd part is the difference between pixels that are mirrored
-    about the centre. Only this part affects the fitted centre.
+    variance of the sensor noise. The odd part consists of differences between pixels mirrored about
+    the centre.
     """
     residuals, weights, gains = solved.residuals, solved.weights, solved.gains
     squares = np.einsum("ni,ni,ni->n", residuals, residuals, weights) - gains.sum(axis=1)
@@ -482,7 +481,7 @@ def _make_fit(
     is_ellipse: bool,
     converged: bool,
 ) -> DiscFit:
-    """Make the result of one fit, and increase its covariance if the residuals exceed the noise.
+    """Make the result of one fit, with a larger covariance if the residuals exceed the noise.
 
     found: fitted parameters. corner: column and row of the cut-out's first pixel.
     fitness: one element of the result of `_fit_residuals`.

@@ -1,7 +1,7 @@
-"""Decide which measured points belong to the finger's track, and when a track starts or is lost.
+"""Track the finger: accept or reject measured points, and predict the motion.
 
 A track is the sequence of accepted points. A filter (module `filters` or `adaptive`) estimates the
-motion from these points. The gate is the region in which the next point is expected.
+motion. The gate is the region in which the next point is expected.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from flexsheet.messages.types import FingertipState
+from flexsheet.messages.types import Fingertip, FingertipReason, FingertipState
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.triangulator.filters import Estimate, Filter
 
@@ -23,11 +23,13 @@ too_fast: the point is farther away than a finger can move.
 unconfirmed: the point may start a new track, or the point arrived late."""
 
 PREDICTION_STEP_S = 0.01
-"""The time between two points of the predicted path. It is a tenth of the period of a tremor with
-10 Hz."""
+"""The time between two points of the predicted path: a tenth of the period of a 10 Hz tremor."""
+
+HISTORY_NS = 250_000_000
+"""The maximum age of a late point that can be inserted into the track."""
 
 GATE_SIGMAS = 5.0
-"""The margin of the gate for measurement errors and prediction errors, in standard deviations."""
+"""The margin of the gate for measurement and prediction errors, in standard deviations."""
 
 
 def make_horizons_s(longest_s: float) -> Floats:
@@ -43,14 +45,12 @@ class TrackingSettings:
         limits are rejected.
     track_timeout_s: maximum time without a point before the track is lost.
     confirm_frames: number of consecutive consistent points that start or replace a track.
-    history_s: maximum age of a late point that can be inserted.
     """
 
     max_speed_m_per_s: float
     max_acceleration_m_per_s2: float = 60.0
     track_timeout_s: float = 0.1
     confirm_frames: int = 3
-    history_s: float = 0.25
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +62,9 @@ class PositionMeasurement:
     covariance: Floats
 
     def can_reach(self, later: PositionMeasurement, max_speed: float) -> bool:
-        """Return whether a finger can move from this point to a later point.
+        """Return whether a finger can move from this point to a later point, despite noise.
 
         max_speed: maximum speed of the finger, m/s.
-        The noise of both points is taken into account.
         """
         distance = float(np.linalg.norm(later.measured - self.measured))
         noise = float(np.sqrt(np.trace(self.covariance) + np.trace(later.covariance)))
@@ -80,10 +79,7 @@ class Gate:
     radius_m: float
 
     def contains(self, measurement: PositionMeasurement) -> bool:
-        """Return whether a measured point can be the finger's marker.
-
-        The noise of the point increases the size of the gate.
-        """
+        """Return whether a measured point, with its noise, can be inside the gate."""
         noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
         return float(np.linalg.norm(measurement.measured - self.point)) <= self.radius_m + noise_m
 
@@ -106,7 +102,7 @@ INITIAL_COVARIANCE = np.diag([1.0] * 3 + [10.0] * 3)
 
 
 class Tracker:
-    """A tracker of one finger, which accepts or rejects measured points and predicts the motion."""
+    """A tracker of one finger."""
 
     def __init__(self, filter_: Filter, settings: TrackingSettings) -> None:
         self.filter, self.settings = filter_, settings
@@ -116,7 +112,7 @@ class Tracker:
 
     @property
     def estimate(self) -> Estimate | None:
-        """Return the newest estimate, also if the track is lost; None before the first point."""
+        """Return the newest estimate, even if the track is lost; None before the first point."""
         return self._history[-1][1] if self._history else None
 
     def is_late(self, at_ns: int) -> bool:
@@ -157,7 +153,7 @@ class Tracker:
         """Predict position, velocity and path at the time `at_ns`, not before the newest point.
 
         horizons_s: times (n,) of the path's points after `at_ns`; the first time must be 0.
-        If the track is lost, all points of the predicted path are the last position.
+        If the track is lost, the predicted path stays at the last position.
         """
         estimate = self.estimate
         if estimate is None:
@@ -172,6 +168,36 @@ class Tracker:
         since_s = (at_ns - estimate.at_ns) * 1e-9
         ahead = self.filter.predict(estimate, since_s + horizons_s)
         return TrackPrediction(ahead[0], velocity, covariance, ahead)
+
+    def make_fingertip(
+        self,
+        at_ns: int,
+        reason: FingertipReason,
+        measured: Floats | None,
+        *,
+        horizons_s: Floats,
+        reprojection_px: float = 0.0,
+        offset_m: Floats | float = 0.0,
+    ) -> Fingertip:
+        """Make the message about the fingertip at the time `at_ns`.
+
+        measured: measured position (3,), m, of the tracked point; None if nothing was measured.
+        horizons_s: horizons (n,) of the predicted path.
+        offset_m: offset (3,) from the fingertip to the tracked point.
+        """
+        track = self.predict_at(at_ns, horizons_s)
+        return Fingertip(
+            valid=reason == "ok",
+            state=self.state(at_ns),
+            reason=reason,
+            position_world_m=track.position - offset_m,
+            velocity_world_m_per_s=track.velocity,
+            covariance=track.covariance,
+            predicted_path_world_m=track.path - offset_m,
+            prediction_step_s=PREDICTION_STEP_S,
+            measured_world_m=(track.position if measured is None else measured) - offset_m,
+            reprojection_px=reprojection_px,
+        )
 
     def velocity_at(self, at_ns: int) -> tuple[Floats, Floats]:
         """Return the velocity (3,), m/s, and its covariance (3, 3), m^2/s^2, at the time `at_ns`.
@@ -216,16 +242,15 @@ class Tracker:
                 newest, measurement.at_ns, measurement.measured, measurement.covariance
             )
         )
-        oldest_ns = measurement.at_ns - round(self.settings.history_s * 1e9)
+        oldest_ns = measurement.at_ns - HISTORY_NS
         self._history = [entry for entry in self._history if entry[0].at_ns >= oldest_ns]
         self._history.append((measurement, estimate))
 
     def _extend_tentative_track(
         self, measurement: PositionMeasurement, unconfirmed_result: GateResult
     ) -> GateResult:
-        """Add a point to the tentative track.
+        """Add a point to the tentative track, which replaces the track when it is long enough.
 
-        When the tentative track is long enough, it replaces the track.
         unconfirmed_result: result while the tentative track is too short.
         """
         self._tentative_track = self._consistent_run(self._tentative_track, measurement)
@@ -236,11 +261,7 @@ class Tracker:
     def _consistent_run(
         self, previous: list[PositionMeasurement], measurement: PositionMeasurement
     ) -> list[PositionMeasurement]:
-        """Append a point to a sequence of points, or start a new sequence with the point.
-
-        A new sequence is started if the finger cannot have moved from the last point to the new
-        point.
-        """
+        """Append a point to a sequence of points that the finger can follow, or start a new one."""
         last = previous[-1] if previous else None
         if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
             return [measurement]
@@ -258,19 +279,20 @@ class Tracker:
     def _insert_late(self, measurement: PositionMeasurement) -> GateResult:
         """Insert a late point into the history, and filter all later points again.
 
-        After several consecutive late points the track restarts, because the clock was then set
-        back. A late point is dropped if it is older than the history, a duplicate or outside the
-        gate. It is also dropped if the history is complete at its time.
+        Several consecutive late points restart the track, because the clock was then set back.
+        Other late points are dropped if no point is missing at their time, or if they do not fit.
         """
         self._late = self._consistent_run(self._late, measurement)
         if len(self._late) >= self.settings.confirm_frames:
             return self._restart_with(self._late)
         index = sum(entry[0].at_ns < measurement.at_ns for entry in self._history)
         later = [entry[0] for entry in self._history[index:]]
+        times_ns = np.array([entry[0].at_ns for entry in self._history])
         fits = (
             index > 0
             and later[0].at_ns != measurement.at_ns
-            and self._is_missing_between(index - 1, index)
+            # A point is missing between the two points of the history.
+            and times_ns[index] - times_ns[index - 1] > 1.5 * np.median(np.diff(times_ns))
             and self._gate_after(*self._history[index - 1], measurement.at_ns).contains(measurement)
             and measurement.can_reach(later[0], self.settings.max_speed_m_per_s)
         )
@@ -279,12 +301,3 @@ class Tracker:
             for entry in (measurement, *later):
                 self._append(entry)
         return "unconfirmed"
-
-    def _is_missing_between(self, previous: int, after: int) -> bool:
-        """Return whether a point is missing between two points of the history.
-
-        previous, after: indices of the two points.
-        """
-        times_ns = np.array([entry[0].at_ns for entry in self._history])
-        usual_ns = float(np.median(np.diff(times_ns)))
-        return float(times_ns[after] - times_ns[previous]) > 1.5 * usual_ns

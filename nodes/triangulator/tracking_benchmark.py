@@ -19,24 +19,21 @@ TruePath = Callable[[float], Floats]
 """A function that returns the true fingertip position (3,), m, in the world at a given time (s)."""
 
 MARKER_NOISE_PX = 0.01
-"""The standard deviation of a marker's centre at a distance of half a metre. It was measured for
-the subpixel fit by `flexsheet chart marker`."""
+"""The standard deviation of a marker's centre at half a metre (from `flexsheet chart marker`)."""
 
 HORIZON_MS = "horizon_ms"
 """The key for the prediction horizon of a benchmark case."""
 
 HORIZONS_S = (0.0, 0.02, 0.05)
-"""The prediction horizons after the exposure. They correspond to no prediction, to the display of
-the frame, and to the motion of the arms."""
+"""The prediction horizons after the exposure: no prediction, display of the frame, motion of the
+arms."""
 
 WARM_UP_S = 0.4
 SPEED_STEP_S = 0.02
 SPEED_MARGIN = 1.5
-"""The ratio of a path's speed to the scene's speed up to which the path is in the scene's range. It
-allows for tremor and acceleration."""
+"""The maximum ratio of a path's speed to the scene's speed. The ratio permits tremor."""
 WITHOUT_VELOCITY = ("none",)
-"""The methods that do not estimate a velocity. They are suitable for a resting finger, and for a
-moving finger only without prediction."""
+"""The methods without an estimate of velocity, which cannot predict a moving finger."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,6 @@
 """Triangulate a marker from two images, and compute the covariance of its position.
 
-A triangulation method receives undistorted normalized coordinates (n, 2) of both views and the
-transform `right_from_left`. It returns points (n, 3), m, in the left camera's frame. For parallel
-rays, the points contain infinite or NaN elements, which the caller must reject.
+Undistorted normalized coordinates are pixels without lens distortion, divided by the focal length.
 """
 
 from __future__ import annotations
@@ -22,16 +20,14 @@ from flexsheet.nodes.models import camera, rigid
 
 NEWTON_STEPS = 12
 MIN_DISTORTION_SLOPE = 0.05
-"""The minimum determinant of the distortion's Jacobian. If the determinant is near zero, the lens
-model is not invertible, because two rays have the same pixel."""
+"""The minimum determinant of the distortion's Jacobian. Near zero, the lens model is not
+invertible."""
 
 MIN_SINE = 1e-6
-"""The minimum sine of the angle between two rays. With a smaller sine, the rays are treated as
-parallel."""
+"""The sine of the angle between two rays below which the rays are treated as parallel."""
 
 MAX_DISTANCE_M = 1e4
-"""The maximum depth of a point. The rays to more distant points are parallel within rounding
-errors."""
+"""The maximum depth of a point. Rays to more distant points are parallel within rounding errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +49,8 @@ class StereoGeometry:
     ) -> StereoGeometry:
         """Make the geometry of the scene's stereo camera.
 
-        calibration: source of the lens parameters; None to use the values of the scene. The pose of
-            the stereo camera always comes from the scene.
+        calibration: source of the lens parameters; None to use the values of the scene. The pose
+            always comes from the scene.
         Raises CalibrationMismatchError if the calibration belongs to another camera.
         """
         optics: StereoCamera | StereoCalibration = scene_camera
@@ -73,13 +69,31 @@ class StereoGeometry:
             left_from_world=rigid.inverse(world_from_left),
         )
 
+    def transform_to_cameras(self, points_world: Floats) -> tuple[Floats, Floats]:
+        """Return the coordinates of world points (..., 3), m, in the left and the right camera."""
+        in_left = rigid.apply(self.left_from_world, points_world)
+        return in_left, rigid.apply(self.right_from_left, in_left)
+
+    def project_with_jacobian(self, view: int, point: Floats) -> tuple[Floats, Floats]:
+        """Return the pixel (2,) of a point (3,), m, in the camera's frame, and its Jacobian (2, 3).
+
+        view: 0 for the left camera, 1 for the right camera.
+        """
+        return project_with_jacobian(point, self.matrices[view], self.distortions[view])
+
+    def undistort(self, view: int, pixel: Floats) -> tuple[float, float] | None:
+        """Return the undistorted normalized coordinates of a pixel (2,); None if it is invalid.
+
+        view: 0 for the left camera, 1 for the right camera.
+        """
+        return undistort_pixel(pixel, self.matrices[view], self.distortions[view])
+
     def project(self, points_world: Floats) -> tuple[Floats, Floats]:
         """Project world points (..., 3), m, to pixels (..., 2) of both views.
 
         The points must be in front of both cameras.
         """
-        in_left = rigid.apply(self.left_from_world, points_world)
-        in_right = rigid.apply(self.right_from_left, in_left)
+        in_left, in_right = self.transform_to_cameras(points_world)
         return (
             camera.project(in_left, self.matrices[0], self.distortions[0]),
             camera.project(in_right, self.matrices[1], self.distortions[1]),
@@ -105,7 +119,7 @@ class ImageMismatchError(FlexsheetError, ValueError):
 
 
 def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:
-    """Check whether images can come from this stereo camera; if not, raise ImageMismatchError.
+    """Raise ImageMismatchError if images cannot come from this stereo camera.
 
     pair: full or cropped images.
     """
@@ -131,8 +145,7 @@ class ClosestApproach:
 
     rotation_rows: rows of the rotation from the right to the left camera's axes.
     origin: position of the right camera in the left camera's frame, m.
-    The geometry is stored as Python numbers, because computing with them is faster than with small
-    arrays.
+    The geometry is stored as Python numbers, which are faster than small arrays.
     """
 
     rotation_rows: tuple[tuple[float, float, float], ...]
@@ -191,8 +204,7 @@ def project_with_jacobian(
 ) -> tuple[Floats, Floats]:
     """Return the pixel (2,) of a point (3,), m, in the camera's frame, and its Jacobian.
 
-    The Jacobian is (2, 3), px/m. The computation uses Python numbers, which are ten times as fast
-    as arrays with two elements.
+    The Jacobian is (2, 3), px/m. Python numbers are ten times as fast as arrays with two elements.
     """
     px, py, pz = point.tolist()
     fx, fy, cx, cy = _intrinsics(matrix)
@@ -264,8 +276,7 @@ class TriangulatedPoint:
     """A triangulated marker: position (3,), m, covariance (3, 3), m^2, and reprojection error (px).
 
     The reprojection error is a root mean square. The covariance is computed to first order from the
-    covariances of the centres in both images. For nearly parallel rays, it increases with the
-    fourth power of the depth.
+    covariances of the centres in both images.
     """
 
     point_world: Floats
@@ -297,8 +308,7 @@ def measure(
     Returns None if the point is not in front of both cameras, or if a pixel is invalid for the lens
     model.
     """
-    left = undistort_pixel(left_px, geometry.matrices[0], geometry.distortions[0])
-    right = undistort_pixel(right_px, geometry.matrices[1], geometry.distortions[1])
+    left, right = geometry.undistort(0, left_px), geometry.undistort(1, right_px)
     if left is None or right is None:
         return None
     rig = geometry.right_from_left
@@ -306,12 +316,8 @@ def measure(
     in_right = rig[:3, :3] @ point + rig[:3, 3]
     if not (0.0 < point[2] < MAX_DISTANCE_M and 0.0 < in_right[2] < MAX_DISTANCE_M):
         return None
-    left_projected, left_slope = project_with_jacobian(
-        point, geometry.matrices[0], geometry.distortions[0]
-    )
-    right_projected, right_slope = project_with_jacobian(
-        in_right, geometry.matrices[1], geometry.distortions[1]
-    )
+    left_projected, left_slope = geometry.project_with_jacobian(0, point)
+    right_projected, right_slope = geometry.project_with_jacobian(1, in_right)
     slope = np.concatenate((left_slope, right_slope @ rig[:3, :3]))
     is_regular, information = cv2.invert(slope.T @ slope)
     if not is_regular:  # The rays are parallel within rounding errors.
