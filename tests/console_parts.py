@@ -1,4 +1,4 @@
-"""Provide a scene, and messages as values and as frames, for the tests of the console."""
+"""Provide messages, as values and as frames, for the tests of the console."""
 
 from __future__ import annotations
 
@@ -6,16 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.scene import Scene
 from flexsheet.messages.wire import encode
-from tests.scenes import load_cylinder
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-def cylinder() -> Scene:
-    """Load the first scene of the demo."""
-    return load_cylinder()
 
 
 class FixedMessages:

@@ -25,8 +25,9 @@ from flexsheet.nodes.console.history import History
 from flexsheet.nodes.console.page import Page
 from tests.arm_states import arm_state
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
-from tests.console_parts import FixedMessages, cylinder
+from tests.console_parts import FixedMessages
 from tests.fingertips import fingertip
+from tests.scenes import load_cylinder
 from tests.test_console_words import port, status
 from tests.waiting import DEADLINE_S
 
@@ -75,7 +76,7 @@ async def browser_tab() -> AsyncIterator[BrowserTab]:
 
 async def show_names_with_markup(page: Page, tab: BrowserTab, found: PageVisit) -> None:
     """Put markup into every name and text that others define."""
-    scene = cylinder().model_copy(update={"name": MARKUP})
+    scene = load_cylinder().model_copy(update={"name": MARKUP})
     faulty = {"left": arm_state("left", mode="fault", faults=(MARKUP,), reason=MARKUP)}
     page.touch.show_scene(scene, scene, (MARKUP, "other"), Sliders.from_scene(scene))
     page.show_problem(MARKUP)

@@ -27,14 +27,14 @@ from flexsheet.nodes.console.controller import (
     EyeViewState,
 )
 from flexsheet.nodes.console.finger import FingerController
-from tests.console_parts import cylinder
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return cylinder()
+    return load_cylinder()
 
 
 def test_looking_puts_back_what_another_had_set(scene: Scene) -> None:

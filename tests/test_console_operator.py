@@ -26,8 +26,8 @@ from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.latest_messages import LatestMessages
 from flexsheet.nodes.console.operator import Operator
-from flexsheet.nodes.console.touch_tab import LIFT, LOWER
-from tests.console_parts import cylinder
+from flexsheet.nodes.console.tabs import LIFT, LOWER
+from tests.scenes import load_cylinder
 
 EYE = np.array([0.1, 0.05, 0.5])
 TICK_S = 0.04
@@ -88,7 +88,7 @@ class Bench:
 @pytest.fixture
 async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     (tmp_path / "plan.json").write_text(
-        json.dumps({"scene": json.loads(cylinder().model_dump_json())})
+        json.dumps({"scene": json.loads(load_cylinder().model_dump_json())})
     )
     files = ConsoleFiles(
         tmp_path / "plan.json", tmp_path, tmp_path / "bags", tmp_path / "kept.json"
@@ -196,8 +196,8 @@ async def test_notes_come_from_the_nodes_of_the_plan_with_any_names(bench: Bench
     for name, note in (("tape", "recording to a.mcap"), ("body", "meshes, 3 s left")):
         bench.operator.on_message(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
     bench.run(0.5)
-    assert "recording to a.mcap" in bench.operator._page.record._text._shown
-    assert "meshes, 3 s left" in bench.operator._page._state._shown
+    assert "recording to a.mcap" in bench.operator._page.record._text.content
+    assert "meshes, 3 s left" in bench.operator._page._state.content
 
 
 def status(node: str, note: str) -> Status:

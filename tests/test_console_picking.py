@@ -20,19 +20,22 @@ from flexsheet.messages.types import (
 from flexsheet.nodes.console.controller import SceneController
 from flexsheet.nodes.console.finger import FingerController, FingerIntent, Ray
 from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
-from tests.console_parts import cylinder
 from tests.plans import scene_with
+from tests.scenes import load_cylinder
 from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
 
 
-AIMS = [SurfacePicker(cylinder()), SurfacePicker(scene_with({"shape": "sphere", "radius_m": 0.04}))]
+AIMS = [
+    SurfacePicker(load_cylinder()),
+    SurfacePicker(scene_with({"shape": "sphere", "radius_m": 0.04})),
+]
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return cylinder()
+    return load_cylinder()
 
 
 def test_the_mouse_means_a_point_below_the_surface_or_beside_it(scene: Scene) -> None:

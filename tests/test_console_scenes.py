@@ -26,8 +26,9 @@ from flexsheet.nodes.console.controller import (
 )
 from flexsheet.nodes.console.finger import FingerController, FingerIntent
 from flexsheet.nodes.console.picking import SurfacePicker
-from tests.console_parts import ROOT, cylinder
+from tests.console_parts import ROOT
 from tests.plans import scene_with
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 SCENES = ROOT / "launch" / "scenes"
@@ -35,7 +36,7 @@ SCENES = ROOT / "launch" / "scenes"
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return cylinder()
+    return load_cylinder()
 
 
 SOLIDS: list[dict[str, Any]] = [

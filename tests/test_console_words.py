@@ -12,10 +12,9 @@ from flexsheet.messages.types import ArmState, PortStatus, Status
 from flexsheet.nodes.console import banner, html_head, panels
 from flexsheet.nodes.console.banner import BannerState, GraphState
 from flexsheet.nodes.console.controller import EyeViewState
-from flexsheet.nodes.console.graph_tab import max_latency_ms
 from flexsheet.nodes.console.history import SERIES, WINDOW_S, History, widen_isolated
 from flexsheet.nodes.console.page import STOP_COLOR
-from flexsheet.nodes.console.record_tab import RECORDING_COLOR
+from flexsheet.nodes.console.tabs import RECORDING_COLOR, max_latency_ms
 from tests.arm_states import arm_state
 from tests.colours import luminance
 from tests.console_parts import FixedMessages

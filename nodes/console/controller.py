@@ -75,8 +75,7 @@ class Sliders:
 
 
 class SceneController:
-    """A controller of the graph's scene. Viewers of the page select a scene, or change it by
-    sliders."""
+    """Select and change the scene of the graph as viewers of the page request."""
 
     def __init__(
         self,
@@ -106,15 +105,15 @@ class SceneController:
         self._send(self.base)
 
     def slide(self, now_s: float, **changes: float) -> None:
-        """Store new slider positions, which `apply_sliders` applies to the scene later.
+        """Store new slider positions by name. `apply_sliders` changes the scene later.
 
-        now_s: current time. changes: new slider positions by name.
+        now_s: current time.
         """
         self.sliders = replace(self.sliders, **changes)
         self._due_s = now_s + SETTLE_S
 
     def apply_sliders(self, now_s: float) -> bool:
-        """Publish the changed scene and return True, if the sliders have stopped moving.
+        """Change the scene if the sliders have stopped moving, and return whether it changed.
 
         Raises SceneChoiceError for invalid slider positions.
         """
@@ -137,10 +136,10 @@ class SceneController:
         self._publish(self.scene)
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
-        """Prepare the selection of points on the object in a background thread.
+        """Compute, in a background thread, what the mouse needs to select points on the object.
 
-        failed: function that receives the cause if the object permits no selection.
-        By selecting points, viewers move the finger.
+        finger: controller that moves the finger to the selected points. failed: function that
+        receives an error text if the object permits no selection.
         """
         if self._picker_task is not None:
             self._picker_task.cancel()
@@ -170,13 +169,11 @@ class EyeViewState(Enum):
 
 
 class EyeViewRequester:
-    """A requester of eye views, which are images from the position of the user's eye.
+    """Request eye views, one at a time, because ray tracing takes a second of processor time.
 
-    For each view, the requester orders one frame with pixels from the renderer, which the simulated
-    eye then traces. Only one image is requested at a time, because tracing takes a second of
-    processor time. When the simulated eye has all its inputs, the previous display settings are
-    restored. If no other node has sent display settings, the image correction of the scene or of
-    the console is restored.
+    For each view, the renderer draws one frame with pixels. From this frame, the simulated eye
+    computes the view. Afterwards, the previous display settings are restored. If no other node has
+    sent display settings, the image correction of the scene or of the console is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
@@ -260,7 +257,10 @@ class EyeViewRequester:
             self._enter(EyeViewState.TRACING, now_s)
 
     def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """Process a ray-traced image, and return whether this console has requested it."""
+        """End the request to which an image belongs.
+
+        Return whether this console has requested the image.
+        """
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
         return eye.label in self._labels
@@ -353,10 +353,10 @@ class ReleaseError(FlexsheetError, ValueError):
 
 
 class ConsoleController:
-    """The main controller of the console, which also publishes e-stops, recordings and bookmarks.
+    """Publish e-stops, recordings and bookmarks, and save the state of the console.
 
-    warn: function that receives the cause if the saved state cannot be used.
-    After a restart, the console continues with the saved scene, sliders and recording.
+    warn: function that receives an error text if the saved state cannot be used. After a restart,
+    the console continues with the saved scene, sliders, finger and recording.
     """
 
     def __init__(

@@ -38,7 +38,7 @@ MODES = {
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The line style of a series in a chart.
+    """The style of a line in a chart.
 
     color: colour that is visible on light and dark pages. dash: lengths of dashes and gaps, px.
     """

@@ -20,11 +20,7 @@ from flexsheet.nodes.console.arms import (
 )
 from flexsheet.nodes.console.creases import split_creases
 from flexsheet.nodes.console.sheet import COLUMNS, ROWS, TRIANGLES, compute_sheet_points
-from flexsheet.nodes.console.snapshot import (
-    SceneSnapshot,
-    rays,
-    select_ray_vertices,
-)
+from flexsheet.nodes.console.snapshot import SceneSnapshot, rays, select_ray_vertices
 from flexsheet.nodes.models.rigid import (
     apply,
     pose_matrix,
@@ -83,15 +79,18 @@ are the origin (3,), m, and the direction (3,) of the ray."""
 class SceneView:
     """The 3D view of the scene, which is the same for all viewers."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server, self._scene = server, server.scene
+    def __init__(self, server: viser.ViserServer, touched: Drag) -> None:
+        """Set the lights and the first camera position.
+
+        touched: callback for each position of the pointer while it is pressed on the object.
+        """
+        self._server, self._scene, self._touched = server, server.scene, touched
         self._shown = dict.fromkeys(LAYERS, True)
         self._layers: dict[str, list[Any]] = {}
         self._links: dict[str, list[Any]] = {}
         self._posed: set[str] = set()
         self._of_scene: Scene | None = None
         self._skin_shape: tuple[int, ...] | None = None
-        self._finger_color = FINGER
         self._scene.set_up_direction("+y")
         # Without a graphics card, shadows would take most of the drawing time.
         self._scene.configure_default_lights(cast_shadow=False)
@@ -159,13 +158,6 @@ class SceneView:
         self._skin_shape, self._ray_vertices = rest.shape, select_ray_vertices(rest)
         self._make_touchable(self._object)
 
-    def on_touch(self, touched: Drag, released: Callable[[], None]) -> None:
-        """Set the callbacks for touching the object with the pointer.
-
-        touched: called while the pointer is pressed or dragged. released: called at the end.
-        """
-        self._touched, self._released = touched, released
-
     def draw(self, snapshot: SceneSnapshot) -> None:
         """Update all poses and meshes of the 3D view to the state in `snapshot`."""
         scene = self._of_scene
@@ -187,9 +179,7 @@ class SceneView:
                 self._object.vertices = _f32(snapshot.skin[self._skin_source])
             if snapshot.finger is not None:
                 self._finger.position = snapshot.finger
-                color = FINGER if snapshot.finger_valid else FINGER_LOST
-                if self._finger_color != color:
-                    self._finger_color = self._finger.color = color
+                self._finger.color = FINGER if snapshot.finger_valid else FINGER_LOST
             self._draw_rays(scene, snapshot)
 
     def _draw_rays(self, scene: Scene, snapshot: SceneSnapshot) -> None:
@@ -287,7 +277,6 @@ class SceneView:
             self._scene.add_mesh_simple("/finger", _f32(vertices), triangles, color=FINGER),
         )
         self._finger.position = (0.0, 0.0, 0.08)
-        self._finger_color = FINGER
 
     def _add_devices(self, scene: Scene) -> None:
         camera = scene.camera
@@ -377,15 +366,12 @@ class SceneView:
     def _make_touchable(self, handle: Any) -> None:
         # Coroutines run in the server's own event loop, which keeps the order of the mouse events.
         async def dragged(event: Any) -> None:
-            if event.phase == "end":
-                self._released()
-                return
-            eye = np.array(event.client.camera.position)
-            self._touched(eye, np.array(event.end_position) - eye)
+            if event.phase != "end":
+                eye = np.array(event.client.camera.position)
+                self._touched(eye, np.array(event.end_position) - eye)
 
         async def clicked(event: Any) -> None:
             self._touched(np.array(event.ray_origin), np.array(event.ray_direction))
-            self._released()
 
         handle.on_drag("left")(dragged)
         handle.on_click(clicked)
