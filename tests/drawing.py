@@ -17,11 +17,7 @@ Floats = NDArray[np.float64]
 def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> SheetPose:
     """Return the scene's sheet, slightly stretched, with its middle at a pose (4, 4)."""
     sheet = estimate_sheet(
-        *edge_poses(pose, 1.05 * scene.sheet.width_m),
-        height_m=scene.sheet.height_m,
-        twist_world=np.zeros(6),
-        ahead_s=0.0,
-        finger_tip=tip,
+        *edge_poses(pose, 1.05 * scene.sheet.width_m), height_m=scene.sheet.height_m, finger_tip=tip
     )
     assert sheet is not None
     return sheet

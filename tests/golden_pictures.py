@@ -80,7 +80,6 @@ def draw(
         target_mark=stage.surface_point(np.array([-0.02, 0.012, 0.01])) if marked else None,
     )
     picture = stage.draw(display, sheet, look, read=True)
-    stage.release()
     assert picture is not None
     return picture
 

@@ -90,4 +90,3 @@ def test_the_renderer_paints_what_the_twin_reads() -> None:
     x, y = mean_error_mm(0.01)
     assert x == pytest.approx(0.0, abs=0.05)
     assert y == pytest.approx(-2.5, abs=0.3)
-    stage.release()

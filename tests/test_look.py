@@ -87,7 +87,6 @@ def test_an_image_is_laid_over_the_front(context: moderngl.Context) -> None:
     image[2:, :4], image[2:, 4:] = (0, 0, 255), (255, 255, 0)
     stage = SceneRenderer(painted(texture="image", image=image), context, spacing_m=0.004)
     picture = drawn(stage).astype(int)
-    stage.release()
     row, column = MIDDLE
     # As the projector shows it: left is right, seen through the sheet.
     assert picture[row - 20, column + 60].argmax() == 0
@@ -106,7 +105,6 @@ def test_a_texture_moves_with_the_skin(context: moderngl.Context, texture: str) 
     # 4 mm to the right in the world is 8 pixels to the left.
     follow(stage, np.tile([0.004, 0.0, 0.0], (len(stage._surface.rest_world_m), 1)))
     after = drawn(stage)[patch].astype(int)
-    stage.release()
     assert np.abs(after[:, :-8] - before[:, 8:]).mean() < 2.0
     assert np.abs(after - before).mean() > 10.0
 

@@ -30,7 +30,12 @@ from flexsheet.nodes.renderer.correction import (
 )
 from flexsheet.nodes.renderer.gl import Canvas, DrawStyle, EyeView, NoOpenGLError, headless_context
 from flexsheet.nodes.renderer.node import Renderer, RendererParameters
-from flexsheet.nodes.renderer.object_surface import VertexNormals, cylinder_surface, transfer_matrix
+from flexsheet.nodes.renderer.object_surface import (
+    ObjectSurface,
+    VertexNormals,
+    cylinder_surface,
+    transfer_matrix,
+)
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import estimate_sheet
 from tests.arm_states import arm_state
@@ -117,7 +122,6 @@ def test_nearest_surface_hides_what_is_behind(
     context: moderngl.Context, stage: SceneRenderer
 ) -> None:
     """The squares cross: depth decides, independent of the order of the triangles."""
-    canvas = Canvas(context, 80, 60)
     square = np.array([[-0.05, -0.05, 0.0], [0.05, -0.05, 0], [0.05, 0.05, 0], [-0.05, 0.05, 0]])
     far = square + np.array([0.0, 0.0, -0.05])
     near = 0.4 * square + np.array([0.0, 0.0, 0.02])
@@ -128,13 +132,17 @@ def test_nearest_surface_hides_what_is_behind(
     lit, dark = np.tile(gl.LIGHT, (4, 1)), np.tile(-gl.LIGHT, (4, 1))
     for order in (1, -1):
         positions = np.concatenate([far, near][::order])
-        canvas.set_mesh(positions, np.concatenate([triangles, triangles + 4]).astype(np.int32))
-        canvas.set_shape(positions, np.concatenate([dark, lit][::order]))
-        canvas.draw(view, DrawStyle(flat=False, pattern="object"))
+        surface = ObjectSurface(
+            positions,
+            np.concatenate([dark, lit][::order]),
+            np.concatenate([triangles, triangles + 4]).astype(np.int32),
+        )
+        canvas = Canvas(context, (80, 60), surface, stage._material())
+        canvas.draw_unresolved(view, DrawStyle(flat=False, pattern="object"))
+        canvas.resolve()
         picture = canvas.read()
         assert picture[30, 40, 0] > 200
         assert 30 < picture[30, 50, 0] < 100
-    canvas.release()
 
 
 def test_black_and_grid_patterns(stage: SceneRenderer) -> None:
@@ -311,8 +319,6 @@ def test_finger_pushes_only_below_and_over_the_sheet(
         left,
         right,
         height_m=0.24,
-        twist_world=np.zeros(6),
-        ahead_s=0.0,
         finger_tip=np.array(tip),
     )
     assert sheet is not None

@@ -62,12 +62,10 @@ def test_what_is_behind_the_eye_is_not_drawn(context: moderngl.Context) -> None:
     behind = SceneRenderer(with_object_at(0.6), context, spacing_m=0.006)
     for correction in CORRECTIONS:
         assert drawn(behind, correction, behind.sheet_at_rest()).max() == 0
-    behind.release()
     # Half of it behind: the rest is there, ahead of the eye it fills the view.
     half = SceneRenderer(with_object_at(0.39), context, spacing_m=0.006)
     for correction in CORRECTIONS:
         assert drawn(half, correction, half.sheet_at_rest()).max() in (0, 255)
-    half.release()
 
 
 def test_a_point_in_front_of_the_sheet_is_seen_at_its_position(stage: SceneRenderer) -> None:

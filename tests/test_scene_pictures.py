@@ -91,7 +91,6 @@ def case(request: pytest.FixtureRequest, context: moderngl.Context) -> Case:
     # As a solver's skin: coarser, on the true surface, its facets inside.
     coarse = SceneRenderer(scene, context, spacing_m=0.006)
     surface = coarse._surface
-    coarse.release()
     skin = Skin(
         mesh_id="m",
         vertices_world_m=surface.rest_world_m.astype(np.float32),

@@ -483,8 +483,6 @@ class OfflineEvaluator:
         believed = estimate_sheet(
             *edges,
             height_m=self._scene.sheet.height_m,
-            twist_world=np.zeros(6),
-            ahead_s=0.0,
             finger_tip=None if tip is None else tip + tip_error,
         )
         assert believed is not None
@@ -529,13 +527,7 @@ class OfflineEvaluator:
         )
         targets = np.array([contact.point for contact in contacts])
         edges = self._edges(self._touch(0.0))
-        believed = estimate_sheet(
-            *edges,
-            height_m=self._scene.sheet.height_m,
-            twist_world=np.zeros(6),
-            ahead_s=0.0,
-            finger_tip=None,
-        )
+        believed = estimate_sheet(*edges, height_m=self._scene.sheet.height_m, finger_tip=None)
         assert believed is not None
         mesh = self._renderer.sheet_mesh(believed)
         corners = mesh.vertices[mesh.triangles].astype(np.float64)

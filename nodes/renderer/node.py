@@ -75,9 +75,7 @@ class Renderer(Node):
         self._output.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
-        if self._frame_renderer is not None:
-            self._frame_renderer.scene_renderer.release()
-            self._frame_renderer = None
+        self._frame_renderer = None
         if scene.projector is None:
             self.note = "no image: the scene has no projector"
             return

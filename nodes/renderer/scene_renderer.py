@@ -131,11 +131,10 @@ class SceneRenderer:
         if first_pass is None:
             first_pass = 0 if is_software(context) else SAMPLES
         samples = SAMPLES if samples is None else samples
-        self.canvas = Canvas(context, projector.width_px, projector.height_px, samples=samples)
-        self.canvas.set_mesh(
-            self._surface.rest_world_m, self._surface.triangles, self._surface.normals_world
-        )
-        self.canvas.set_material(self._material())
+        # Release the graphics objects of earlier scene renderers that no longer exist.
+        context.gc_mode = "context_gc"
+        context.gc()
+        self.canvas = Canvas(context, size, self._surface, self._material(), samples=samples)
         self.basis, self.sheet_shape, self.note = basis, sheet_shape, ""
         self.occluded_fraction = 0.0
         self.check_marks = NO_MARKS
@@ -150,10 +149,7 @@ class SceneRenderer:
         self.mesh_id: str | None = None
 
     def _material(self) -> SurfaceMaterial:
-        appearance, object_from_world = (
-            self.scene.object.appearance,
-            inverse(self._world_from_object),
-        )
+        appearance, object_from_world = self.scene.object.appearance, self._object_from_world
         front = apply(object_from_world, self._surface.rest_world_m)[:, :2]
         low, extent = front.min(axis=0), np.ptp(front, axis=0)
         image_from_object = np.diag([*(1.0 / extent), 1.0, 1.0])
@@ -182,7 +178,7 @@ class SceneRenderer:
         if body is self._drawn_body:
             return
         if body is None:
-            self.canvas.set_shape(self._surface.rest_world_m, self._surface.normals_world)
+            self.canvas.set_shape(self._surface.interleaved)
             self._box_world = _box_around(self._surface.rest_world_m)
         elif self._deformation is None:
             raise ValueError(
@@ -191,7 +187,7 @@ class SceneRenderer:
             )
         else:
             moved = self._deformation.apply(body.displacement_world_m)
-            self.canvas.set_moved(moved)
+            self.canvas.set_shape(moved)
             self._box_world = _box_around(moved[:, :3])
         self._drawn_body = body
 
@@ -430,11 +426,6 @@ class SceneRenderer:
         low = np.floor(low / WINDOW_STEP_M) * WINDOW_STEP_M
         high = np.ceil(high / WINDOW_STEP_M) * WINDOW_STEP_M
         return ScreenRectangle(float(low[0]), float(low[1]), *(float(side) for side in high - low))
-
-    def release(self) -> None:
-        """Release all graphics objects, but not the OpenGL context."""
-        self.canvas.release()
-        self._projection.release()
 
 
 def _box_around(points: NDArray[np.floating]) -> Floats:

@@ -22,6 +22,7 @@ MAX_TRIANGLES_DEPTH_M = 0.0035
 """The maximum push depth (m) for a sheet mesh of four triangles. At this depth, the rms error of
 the image is half a millimetre."""
 
+HALVINGS = 5
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
 """The vertex indices of the triangles between adjacent corners (0 to 3) and the pushed point (4).
 """
@@ -56,15 +57,13 @@ def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)
 
 
-def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
-    """Divide the triangles of a mesh without changing its surface.
+def refine_mesh(mesh: SheetMesh) -> SheetMesh:
+    """Halve the edges of a mesh `HALVINGS` times without changing its surface.
 
     The lens distortion is applied only at vertices, so a finer mesh is more accurate.
-
-    halvings: number of times that each edge is halved.
     """
     vertices, triangles = mesh.vertices, mesh.triangles
-    for _ in range(halvings):
+    for _ in range(HALVINGS):
         edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         unique, of_edge = np.unique(edges, axis=0, return_inverse=True)
         a, b, c = triangles.T
@@ -78,8 +77,7 @@ def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
 
 
 _grid_triangles = cache(triangulate_grid)
-"""A variant of `triangulate_grid` with a cache. Equal grids share one array, which makes
-comparisons fast."""
+"""A variant of `triangulate_grid` with a cache."""
 
 
 def deflected_mesh(
