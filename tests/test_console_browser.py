@@ -20,9 +20,9 @@ from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.console import panels
 from flexsheet.nodes.console.access_control import AccessControl, start_server
 from flexsheet.nodes.console.banner import GraphState
-from flexsheet.nodes.console.controller import Sliders
 from flexsheet.nodes.console.history import History
 from flexsheet.nodes.console.page import Page
+from flexsheet.nodes.console.state_file import Sliders
 from tests.arm_states import arm_state
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
 from tests.console_parts import FixedMessages

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.types import Display, FingerPath, Recording, Status
+from flexsheet.messages.types import Display, FingerPath, Recording
 from flexsheet.nodes.console.access_control import AccessControl, start_server
 from flexsheet.nodes.console.controller import (
     MAX_DRAWING_S,
@@ -27,6 +27,7 @@ from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.latest_messages import LatestMessages
 from flexsheet.nodes.console.operator import Operator
 from flexsheet.nodes.console.tabs import LIFT, LOWER
+from tests.console_parts import status_of
 from tests.scenes import load_cylinder
 
 EYE = np.array([0.1, 0.05, 0.5])
@@ -194,24 +195,9 @@ async def test_own_display_messages_are_known_by_their_writer(
 
 async def test_notes_come_from_the_nodes_of_the_plan_with_any_names(bench: Bench) -> None:
     for name, note in (("tape", "recording to a.mcap"), ("body", "meshes, 3 s left")):
-        bench.operator.on_message(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
+        bench.operator.on_message(
+            status_of(name, note=note), Header(1, 1, 1, "clock", name, 1), 0.0
+        )
     bench.run(0.5)
     assert "recording to a.mcap" in bench.operator._page.record._text.content
     assert "meshes, 3 s left" in bench.operator._page._state.content
-
-
-def status(node: str, note: str) -> Status:
-    return Status(
-        node=node,
-        state="running",
-        pid=1,
-        uptime_s=1.0,
-        cpu_ratio=0.0,
-        resident_bytes=0,
-        inputs=(),
-        outputs=(),
-        errors=0,
-        last_error="",
-        note=note,
-        plan_hash="",
-    )

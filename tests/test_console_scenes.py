@@ -26,6 +26,7 @@ from flexsheet.nodes.console.controller import (
 )
 from flexsheet.nodes.console.finger import FingerController, FingerIntent
 from flexsheet.nodes.console.picking import SurfacePicker
+from flexsheet.nodes.console.state_file import ConsoleState, Sliders, load_state, save_state
 from tests.console_parts import ROOT
 from tests.plans import scene_with
 from tests.scenes import load_cylinder
@@ -116,6 +117,15 @@ async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path)
     with pytest.raises(scenes.SceneChoiceError):
         controller.apply_sliders(31.0)
     assert len(sent) == 2
+
+
+def test_the_sliders_of_a_rigid_object_are_saved(scene: Scene, tmp_path: Path) -> None:
+    rigid = scene.model_copy(update={"object": scene.object.model_copy(update={"material": None})})
+    state = ConsoleState(base=rigid, sliders=Sliders.from_scene(rigid))
+    save_state(tmp_path / "state.json", state)
+    loaded = load_state(tmp_path / "state.json")
+    assert loaded is not None
+    assert loaded.sliders == state.sliders
 
 
 def test_a_restarted_console_restores_its_state(scene: Scene, tmp_path: Path) -> None:

@@ -66,8 +66,8 @@ class ConsoleError(FlexsheetError, RuntimeError):
 def read_token(path: Path) -> str:
     """Read the access token from a file.
 
-    Raises ConsoleError if the file cannot be read, or if other users can read it. Also raise it if
-    the token is too short or contains characters other than letters and digits.
+    Raises ConsoleError if the file cannot be read, if other users can read the file, or if the
+    token is too short or contains characters other than letters and digits.
     """
     try:
         mode, text = path.stat().st_mode, path.read_text().strip()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import Enum, auto
 from pathlib import Path
 from typing import Literal
@@ -27,7 +27,7 @@ from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.picking import SurfacePicker
 from flexsheet.nodes.console.replay import Timeline, list_bags
-from flexsheet.nodes.console.state_file import ConsoleState, load_state, save_state
+from flexsheet.nodes.console.state_file import ConsoleState, Sliders, load_state, save_state
 
 Publish = Callable[[Message], None]
 
@@ -48,30 +48,6 @@ MAX_TRACING_S = 120.0
 DEFAULT_BOOKMARK = "bookmark"
 MAX_LABELS = 64
 """The number of newest requests whose images are shown even if they arrive late."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sliders:
-    """The positions of the sliders on the console page.
-
-    young_modulus_pa: Young's modulus of the object; None for a rigid object.
-    stretch_ratio: minimum stretch ratio of the sheet.
-    size_ratio: size of the object, relative to its size in the scene file.
-    """
-
-    young_modulus_pa: float | None
-    stretch_ratio: float
-    size_ratio: float
-
-    @staticmethod
-    def from_scene(scene: Scene) -> Sliders:
-        """Return the slider positions that correspond to an unchanged scene."""
-        material = scene.object.material
-        return Sliders(
-            None if material is None else material.young_modulus_pa,
-            max(scene.sheet.min_stretch_ratio, scenes.MIN_STRETCH_RATIO),
-            1.0,
-        )
 
 
 class SceneController:
@@ -369,9 +345,8 @@ class ConsoleController:
     ) -> None:
         self._files, self.facts = files, facts or GraphFacts()
         state = load_first_state(files, warn)
-        self.recording, sliders = state.recording, state.sliders
-        previous = None if sliders is None else Sliders(*sliders)
-        self.scenes = SceneController(self._send_scene, files.scenes, state.base, previous)
+        self.recording = state.recording
+        self.scenes = SceneController(self._send_scene, files.scenes, state.base, state.sliders)
         self.finger = finger
         if state.finger is not None:
             finger.restore(state.finger)
@@ -429,7 +404,7 @@ class ConsoleController:
         scenes = self.scenes
         state = ConsoleState(
             base=scenes.base,
-            sliders=astuple(scenes.sliders) if scenes.moved else None,
+            sliders=scenes.sliders if scenes.moved else None,
             recording=self.recording,
             finger=self.finger.intent if self.finger.commanded else None,
         )

@@ -135,7 +135,6 @@ class SceneView:
         self._add_sheet(scene)
         self._add_finger(scene.finger.radius_m)
         self._add_devices(scene)
-        self._add_names(scene)
         ends = np.zeros((1, 2, 3))
         self._rays = [
             self._add("Rays", self._lines("/rays/eye", ends, TO_EYE, 1.6)),
@@ -240,6 +239,7 @@ class SceneView:
         self._scene.add_mesh_simple(
             f"/{side}/clamp/bar", _f32(vertices), triangles, color=ARM_DARK, flat_shading=True
         )
+        self._add_name(f"/names/{side}", f"{side} arm", arm.world_from_base.position_m)
         return [*frames, clamp]
 
     def _add_sheet(self, scene: Scene) -> None:
@@ -268,6 +268,8 @@ class SceneView:
         segments = make_line_segments(lift_sheet(points, LINES_LIFT_M))
         lines = self._lines("/sheet_lines", segments, SHEET_LINES, 1.0)
         self._sheet_lines = self._add("Sheet", lines)
+        top_m = 0.5 * scene.sheet.height_m + 0.012
+        self._add_name("/right/clamp/name", "rubber sheet", (0.0, top_m, 0.0))
         self._make_touchable(self._sheet)
 
     def _add_finger(self, radius_m: float) -> None:
@@ -277,6 +279,7 @@ class SceneView:
             self._scene.add_mesh_simple("/finger", _f32(vertices), triangles, color=FINGER),
         )
         self._finger.position = (0.0, 0.0, 0.08)
+        self._add_name("/finger/name", "finger", FINGER_NAME_M)
 
     def _add_devices(self, scene: Scene) -> None:
         camera = scene.camera
@@ -289,44 +292,32 @@ class SceneView:
             [(0.0, 0.0, 0.0), (baseline_m, 0.0, 0.0)],
             0.011,
         )
+        centre = apply(left, np.array([0.5 * baseline_m, 0.0, 0.0]))
+        self._add_name("/names/camera", "stereo camera", centre + NAME_ABOVE_M)
         if scene.projector is not None:
+            pose = pose_matrix(scene.projector.world_from_projector)
             self._add_device(
                 "/devices/projector",
-                pose_matrix(scene.projector.world_from_projector),
+                pose,
                 ((0.16, 0.07, 0.12), (0.0, 0.0, -0.065)),
                 [(0.0, 0.0, -0.005)],
                 0.02,
             )
+            self._add_name("/names/projector", "projector", pose[:3, 3] + NAME_ABOVE_M)
+        eyes_m = scene.eyes.centre_world_m
+        self._add_name("/names/eyes", "user's eyes", eyes_m + 0.4 * NAME_ABOVE_M)
         half = 0.5 * scene.eyes.interocular_m
         for name, offset in (("left", -half), ("right", half)):
             eye = self._scene.add_icosphere(
                 f"/devices/eye_{name}",
                 radius=0.011,
                 color=EYE,
-                position=scene.eyes.centre_world_m + np.array([offset, 0.0, 0.0]),
+                position=eyes_m + np.array([offset, 0.0, 0.0]),
             )
             self._add("Devices", eye)
             self._scene.add_icosphere(
                 f"/devices/eye_{name}/pupil", radius=0.006, color=TO_EYE, position=(0, 0, -0.0065)
             )
-
-    def _add_names(self, scene: Scene) -> None:
-        camera = scene.camera
-        baseline_m = -float(camera.right_from_left[0, 3])
-        centre = apply(pose_matrix(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0]))
-        named: dict[str, tuple[str, Any]] = {
-            "/names/camera": ("stereo camera", centre + NAME_ABOVE_M),
-            "/names/eyes": ("user's eyes", scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M),
-            "/names/left": ("left arm", scene.arms.left.world_from_base.position_m),
-            "/names/right": ("right arm", scene.arms.right.world_from_base.position_m),
-            "/finger/name": ("finger", FINGER_NAME_M),
-            "/right/clamp/name": ("rubber sheet", (0.0, 0.5 * scene.sheet.height_m + 0.012, 0.0)),
-        }
-        if scene.projector is not None:
-            position_m = np.asarray(scene.projector.world_from_projector.position_m)
-            named["/names/projector"] = ("projector", position_m + NAME_ABOVE_M)
-        for node, (text, position) in named.items():
-            self._add_name(node, text, position)
 
     def _add_name(self, node: str, text: str, position: Any) -> None:
         label = self._scene.add_label(

@@ -19,11 +19,12 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console import panels
-from flexsheet.nodes.console.controller import Replay, Sliders
+from flexsheet.nodes.console.controller import Replay
 from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.history import SERIES, WINDOW_S, widen_isolated
 from flexsheet.nodes.console.scene_view import LAYERS, VIEWPOINTS, SceneView
 from flexsheet.nodes.console.scenes import MIN_STRETCH_RATIO, max_stretch_ratio
+from flexsheet.nodes.console.state_file import Sliders
 
 MAX_OFFSET_MM = 80.0
 MAX_DEPTH_MM = 50.0
