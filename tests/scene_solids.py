@@ -9,7 +9,8 @@ import numpy as np
 import trimesh
 
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.fem_solver.mesh import SolidMesh, mesh_scene
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh, mesh_spec
+from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from tests.scenes import load_values
 
 SPACINGS_M = {"plane": 0.0075}
@@ -48,4 +49,4 @@ def scene_solid(shape: str) -> SolidMesh:
     body.pop("support_angle_rad", None)
     body["geometry"] = geometry(shape)
     body["support"] = {"kind": "strip", "angle_rad": 1.5}
-    return mesh_scene(Scene.model_validate(content), SPACINGS_M.get(shape, 0.006))
+    return build_mesh(mesh_spec(Scene.model_validate(content), SPACINGS_M.get(shape, 0.006)))

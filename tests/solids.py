@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.fem_solver.mesh import EDGES
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -18,7 +18,7 @@ import pytest
 
 from flexsheet.nodes.cache import CheckpointStore
 from flexsheet.nodes.fem_solver.dask_executor import SchedulerError, connect_workers
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from flexsheet.nodes.fem_solver.precompute_table import LostWorkersError, solve_all
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
 from tests.solids import box

@@ -17,7 +17,7 @@ from flexsheet.nodes.fem_solver.closest_contact import (
 )
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom
-from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.precompute import (
     SoftBodyModel,
     compute,

@@ -21,7 +21,7 @@ from benchmarks.soft_body_limits import (
 from flexsheet.messages.scene import BaseSupport, Sphere
 from flexsheet.nodes.fem_solver.body import state_force_error_ratio
 from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
-from flexsheet.nodes.fem_solver.mesh import MeshSpec
+from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec
 from flexsheet.nodes.models import rigid
 from tests.soft_bodies import cylinder_spec
 

@@ -150,15 +150,6 @@ async def test_a_finger_in_the_air_sees_the_body_at_rest_and_its_stiffness(bench
     assert 20.0 < answer.stiffness_n_per_m < 80.0
 
 
-async def test_fifty_millimetres_are_flagged_and_bounded(bench: Bench) -> None:
-    for depth in np.linspace(0.0, 0.05, 26):
-        answer = await bench.push(fingertip((0.0, 0.001, -float(depth))))
-    assert not answer.in_range
-    assert answer.push_depth_m == pytest.approx(0.05, abs=0.001)
-    assert np.linalg.norm(answer.displacement_world_m, axis=1).max() < 0.0102
-    assert 1.0 < answer.force_world_n[2] < 10.0
-
-
 async def test_a_lost_finger_is_held_and_then_the_body_springs_back(bench: Bench) -> None:
     lost = fingertip((0.0, 0.0, -0.004), valid=False)
     untouched = await bench.push(lost)
@@ -280,7 +271,7 @@ async def test_a_newer_scene_interrupts_the_precomputation(
         meshed.wait()
         try:
             while True:
-                progress(0, 1, precompute.ResponseBudget(1, 1, 1, 1))
+                progress(0, 1, "")
                 time.sleep(0.001)
         finally:
             ended.set()

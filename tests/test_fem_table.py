@@ -23,7 +23,8 @@ from flexsheet.nodes.cache import load_cached, save_cached
 from flexsheet.nodes.fem_solver import precompute_table, snapshots
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import CURVE_FRACTIONS, Response, SkinResponse
-from flexsheet.nodes.fem_solver.mesh import build_mesh, cylinder
+from flexsheet.nodes.fem_solver.mesh import cylinder
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.precompute import Interrupted, SoftBodyModel, compute
 from flexsheet.nodes.fem_solver.precompute_table import (
     TableSpec,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ellipk, ellipkinc
 
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from tests.examples import long_except
 from tests.fem_fields import dofs_of, equilibrium, lame, relative_errors, surface_loads
 from tests.fem_verification import Record, at_most, between, near

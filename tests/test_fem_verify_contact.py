@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flexsheet.nodes.fem_solver import newton
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from tests.examples import long_except
 from tests.fem_fields import dofs_of
 from tests.fem_verification import Record, at_most, between, near

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.arrays import Bools, Floats, Ints
-from flexsheet.nodes.fem_solver.mesh import EDGES
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 MAX_POISSON_RATIO = 0.4999
 """The maximum Poisson's ratio. For larger ratios, rounding errors make the solution useless."""
@@ -82,7 +82,7 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     """Return Jacobian matrices (e, q, 3, 3) and their determinants (e, q).
 
     The matrices belong to the map from the unit tetrahedron to each element. nodes (n, 3), m,
-    elements (e, 10): mesh. local (q, 10, 3): gradients of the shape functions at q points. Raise
+    elements (e, 10): mesh. local (q, 10, 3): gradients of the shape functions at q points. Raises
     SolidMeshError if an element is inverted or flat, or if the coordinates of a node are not
     finite.
     """

@@ -24,7 +24,7 @@ from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.contact import POINT_SPACING_RATIO, sample_triangle
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import FACES, SUBTRIANGLES, nodes_in_planes, skin_faces
+from flexsheet.nodes.fem_solver.mesh.solid import FACES, SUBTRIANGLES, nodes_in_planes, skin_faces
 from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, NestedDissection
 
 PENALTY_RATIO = 200.0

@@ -184,7 +184,9 @@ def fill_table(
         )
         fields[number] = moved[1:]
         sound_m = depths[first + filled.valid[at] - 1]
-        reach[number] = min(_reach_m(filled.reached[at], depths[first:]), sound_m)
+        # The number of converged depths may be fractional.
+        levels = np.arange(1, len(depths) - first + 1)
+        reach[number] = min(float(np.interp(filled.reached[at], levels, depths[first:])), sound_m)
     return Table(depths, fields, force * factors[:, None], reach)
 
 
@@ -274,14 +276,6 @@ def _blend_levels(
     return moved, force
 
 
-def _reach_m(reached: float, depths: Floats) -> float:
-    """Return the maximum depth (m) with a valid interpolated solution.
-
-    reached: number of converged depths, which may be fractional. depths (k,): depths, m.
-    """
-    return float(np.interp(reached, np.arange(1, len(depths) + 1), depths))
-
-
 class CubicInterpolator:
     """An interpolator over increasing depths by cubic polynomials with a continuous slope.
 
@@ -316,8 +310,7 @@ class CubicInterpolator:
 
 
 def count_valid_levels(rest: Floats, moved: Singles, triangles: NDArray[np.int32]) -> int:
-    """Return the number of depths before the first depth with an invalid interpolated skin
-    displacement.
+    """Count the successive depths at which the interpolated displacement is valid.
 
     rest (s, 3): undeformed skin nodes, m. moved (L, s, 3): displacement at each depth, m. triangles
     (t, 3): skin triangles. A displacement is invalid if a triangle is rotated by more than the
@@ -412,9 +405,6 @@ class TableSoftBody:
         self._reach_and_bound = np.column_stack([self.reach_m, np.minimum(bound_distance, 1.0)])
 
     def respond(self, query: ContactQuery) -> Response:
-        """Compute the displacement of the skin and the contact force for a contact with the
-        finger.
-        """
         nodes, weights, off = self.project_to_surface(query.surface)
         curve = self._curve_at(nodes, weights)
         stiffness = float(curve[len(CURVE_FRACTIONS), 1]) / self._linear
@@ -475,16 +465,9 @@ class TableSoftBody:
         return self._faces[best], weights, 0.0
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return the force divided by depth (N/m) at the depth `linear_depth_m` near a surface
-        point (3,).
-        """
         return float(self.force_curve(surface)[len(CURVE_FRACTIONS), 1]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force-depth curve (n, 2) near a surface point (3,).
-
-        The columns are depth (m) and force (N).
-        """
         nodes, weights, _ = self.project_to_surface(surface)
         return self._curve_at(nodes, weights)
 

@@ -17,19 +17,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexsheet.nodes.arrays import Floats, Ints
+from flexsheet.nodes.fem_solver.mesh.grading import BACK_COARSENING, DEPTH_GROWTH, RAMP_RAD
 from flexsheet.nodes.fem_solver.mesh.solid import (
     EDGES,
     SAME_M,
     SUBTRIANGLES,
     SolidMesh,
     add_midside_nodes,
+    orient_tetrahedra,
     skin_faces,
 )
 
-BACK_COARSENING = 2.0
-DEPTH_GROWTH = 0.35
-"""The increase of the element size per depth below the curved side (m/m)."""
-RAMP_RAD = 0.6
 FOCUS_GROWTH = 0.35
 """The increase of the element size per distance (m/m) from the focus, which is the point of the
 push."""
@@ -315,11 +313,7 @@ def _extrude(points: Floats, triangles: Ints, x: Floats, swapped: int) -> tuple[
                 ]
             )
         )
-    elements = np.concatenate(tetrahedra)
-    sides = corners[elements[:, 1:]] - corners[elements[:, :1]]
-    negative = np.linalg.det(sides) < 0
-    elements[negative] = elements[negative][:, [0, 2, 1, 3]]
-    return corners, elements
+    return corners, orient_tetrahedra(corners, np.concatenate(tetrahedra))
 
 
 def _finish_mesh(

@@ -191,7 +191,7 @@ def make_solid_mesh(
 def restrict_touchable(mesh: SolidMesh, touchable: Bools) -> SolidMesh:
     """Return a copy of the mesh that has fewer touchable nodes.
 
-    touchable (n,): whether each node may remain touchable. Fixed nodes are always excluded. Raise
+    touchable (n,): whether each node may remain touchable. Fixed nodes are always excluded. Raises
     UnfitMeshError if no touchable face remains.
     """
     good = (touchable & ~mesh.fixed)[mesh.contact_nodes]
