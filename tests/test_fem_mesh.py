@@ -21,7 +21,6 @@ from flexsheet.messages.scene import Mesh, Scene
 from flexsheet.nodes.fem_solver.elasticity import (
     jacobians,
     quadrature,
-    require_support,
     shape_gradients,
 )
 from flexsheet.nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
@@ -52,6 +51,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     number_slabs,
     orient_tetrahedra,
 )
+from flexsheet.nodes.fem_solver.mesh.supports import require_fixation
 from flexsheet.nodes.models.shapes import make_shape
 from tests.examples import examples, long_except
 from tests.scenes import load_values
@@ -197,7 +197,7 @@ def require_sound(solid: SolidMesh) -> None:
     assert not solid.fixed[solid.contact_nodes].any()
     assert (np.unique(solid.contact_faces) == np.arange(len(solid.contact_nodes))).all()
     assert np.abs(np.linalg.norm(solid.contact_normals, axis=1) - 1).max() < 1e-9
-    require_support(solid.nodes, solid.fixed)
+    require_fixation("", solid.nodes, solid.fixed)
 
 
 @pytest.mark.parametrize("name", SHAPES)

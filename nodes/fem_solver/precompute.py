@@ -161,13 +161,12 @@ def compute(
     each touchable node.
 
     checkpoints: store of finished parts, from which an interrupted computation can continue. Raises
-    SolidMeshError for a body without sufficient support, ValueError for an invalid material or
+    UnfitMeshError for an object that cannot be meshed, ValueError for an invalid material or
     size, and MemoryError if the free memory is insufficient.
     """
     from flexsheet.nodes.fem_solver.elasticity import (
         element_stiffness,
         lame_constants,
-        require_support,
     )
     from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
 
@@ -176,7 +175,6 @@ def compute(
     progress(0, need.loads + MESH_STEPS + FACTOR_STEPS, need.text())
     need.require_memory(spec.mesh.skin_spacing_m)
     mesh = build_mesh(spec.mesh)
-    require_support(mesh.nodes, mesh.fixed)
     order = NestedDissection(mesh.nodes, mesh.elements, mesh.fixed)
     need = compute_budget(mesh, order, spec.loads_per_node)
     need.require_memory(spec.mesh.skin_spacing_m)
@@ -324,7 +322,7 @@ def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
 def load_or_compute(spec: SoftBodySpec, cache_dir: Path, progress: Progress) -> SoftBodyModel:
     """Load the cached model, or compute and store it.
 
-    Raises SolidMeshError for a body without sufficient support, ValueError for an invalid material
+    Raises UnfitMeshError for an object that cannot be meshed, ValueError for an invalid material
     or size, and MemoryError if the free memory is insufficient.
     """
     entry = response_cache(spec)

@@ -72,7 +72,7 @@ class SoftBodyFactory:
     ) -> list[body.SceneBody]:
         """Build the soft body of a scene for each available method, starting with the best method.
 
-        Raises SolidMeshError for a body without sufficient support, ValueError for an invalid
+        Raises UnfitMeshError for an object that cannot be meshed, ValueError for an invalid
         material, size or depth, and MemoryError if the free memory is insufficient.
         """
         spec = body.make_soft_body_spec(

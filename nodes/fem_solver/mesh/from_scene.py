@@ -36,7 +36,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     make_solid_mesh,
     restrict_touchable,
 )
-from flexsheet.nodes.fem_solver.mesh.supports import select_fixed
+from flexsheet.nodes.fem_solver.mesh.supports import require_fixation, select_fixed
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.models.shapes import GEOMETRIES, Shape, make_shape
 from flexsheet.nodes.models.shapes.triangles import volume_m3
@@ -274,9 +274,10 @@ def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
         touch_angle_rad=spec.touch_angle_rad,
         skin_spacing_m=spec.skin_spacing_m,
     )
-    if strip:
-        return mesh
     points = mesh.nodes[mesh.skin]
+    if strip:
+        require_fixation(spec.support.kind, points, mesh.fixed[mesh.skin])
+        return mesh
     normals = np.column_stack([np.zeros(len(points)), points[:, 1:] / cylinder.radius_m])
     fixed = np.zeros(len(mesh.nodes), dtype=bool)
     fixed[mesh.skin] = _select_fixed(spec, points, normals)
