@@ -25,10 +25,10 @@ from flexsheet.nodes.console.page import Page
 from flexsheet.nodes.console.state_file import Sliders
 from tests.arm_states import arm_state
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
-from tests.console_parts import FixedMessages
+from tests.console_parts import FixedMessages, status_of
 from tests.fingertips import fingertip
 from tests.scenes import load_cylinder
-from tests.test_console_words import port, status
+from tests.test_console_words import port
 from tests.waiting import DEADLINE_S
 
 pytestmark = BROWSER_MARKS
@@ -82,7 +82,7 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: PageVisit) 
     page.show_problem(MARKUP)
     page.record.show_bags((f"{MARKUP}.mcap",))
     page.record.show_state(panels.recorder(MARKUP, (MARKUP,)), recording=True)
-    broken = status(MARKUP, note=MARKUP, errors=1, last_error=MARKUP, outputs=(port("stereo"),))
+    broken = status_of(MARKUP, note=MARKUP, errors=1, last_error=MARKUP, outputs=(port("stereo"),))
     statuses = {MARKUP: (broken, 0.0)}
     tables = panels.make_topics_table(statuses) + panels.make_nodes_table(statuses)
     page.graph.show(tables, History().columns())

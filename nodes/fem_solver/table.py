@@ -126,11 +126,6 @@ def interpolate_nodes(job: FillJob) -> FilledNodes:
     )
 
 
-Interpolate = Callable[[Sequence[FillJob]], Iterable[FilledNodes]]
-"""A function that interpolates snapshots at the nodes of jobs, in this process or in other
-processes. It returns the results in the order of the jobs."""
-
-
 def fill_table(
     response: SkinResponse,
     triangles: NDArray[np.int32],
@@ -138,13 +133,16 @@ def fill_table(
     source: SnapshotSet,
     *,
     fine: tuple[SamplePoint, Snapshot] | None = None,
-    interpolate: Interpolate = lambda jobs: map(interpolate_nodes, jobs),
+    interpolate: Callable[[Sequence[FillJob]], Iterable[FilledNodes]] = lambda jobs: map(
+        interpolate_nodes, jobs
+    ),
 ) -> Table:
     """Compute the nonlinear table of a body from snapshots.
 
     triangles (t, 3): triangles of the skin. linear: linear method for the same response and a
     modulus of 1 Pa. Its linear range must contain the depths `BLEND_M`. fine: push on a fine mesh
-    with which all forces are corrected, or None. interpolate: function that processes the jobs.
+    with which all forces are corrected, or None. interpolate: function that interpolates the
+    snapshots at the nodes of jobs, and returns the results in the order of the jobs.
     """
     interpolator = source.make_interpolator()
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
