@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 class FixedMessages:
-    """Source whose messages the test sets."""
+    """A message source whose messages the test sets."""
 
     def __init__(self, **messages: Message) -> None:
         self.held = {

@@ -24,7 +24,7 @@ def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> SheetPose
 
 
 def follow(stage: SceneRenderer, displacement: Floats | None) -> None:
-    """Deform the scene renderer by a displacement (vertices, 3) of its own surface, or reset it."""
+    """Deform the drawn object by a displacement (vertices, 3) of its surface, or reset it."""
     if displacement is None:
         stage.deform(None)
         return
@@ -47,8 +47,7 @@ def body_of(displacement: Floats) -> SoftBody:
 
 
 def dent(stage: SceneRenderer, depth_m: float, place: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Return a displacement (vertices, 3) of the surface pushed from the front, with a fixed
-    back."""
+    """Return a displacement (vertices, 3) of the surface by a push from the front."""
     points = stage._surface.rest_world_m
     away = np.linalg.norm(points[:, :2] - np.array(place), axis=1)
     facing = np.clip(1.0 + points[:, 2] / 0.05, 0.0, 1.0)

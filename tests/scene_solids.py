@@ -19,7 +19,7 @@ SHAPES = ("cylinder", "sphere", "ellipsoid", "rounded_box", "plane", "mesh")
 
 
 def geometry(shape: str) -> dict[str, Any]:
-    """Return an object of this shape, of a hand's size or smaller."""
+    """Return the geometry of an object with the size of a hand or smaller."""
     match shape:
         case "cylinder":
             return {"shape": shape, "radius_m": 0.0353553, "length_m": 0.06}
@@ -43,7 +43,7 @@ def geometry(shape: str) -> dict[str, Any]:
 
 @cache
 def scene_solid(shape: str) -> SolidMesh:
-    """Mesh the object as the solver does, with the support of the scene."""
+    """Return the mesh of a scene's object, as the solver makes it."""
     content = load_values()
     body = content["object"]
     body.pop("support_angle_rad", None)

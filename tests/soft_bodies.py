@@ -1,4 +1,4 @@
-"""Soft bodies for tests: specifications without a scene, and an executor without processes."""
+"""Provide specifications of soft bodies, and an executor without processes, for tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test the console's 3D view: arms, sheet, rays, and the image of a bookmark."""
+"""Test the 3D view of the console: arms, sheet, rays, and object."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_rays_meet_the_flat_sheet_where_the_plane_is(scene: Scene, x: float, y: 
 
 @pytest.mark.parametrize("tilt_rad", [-1.0, 0.0, 1.0])
 def test_the_sheet_is_drawn_before_the_object_that_it_touches(tilt_rad: float) -> None:
-    """In one plane with a flat object, sheet and object were drawn in patches."""
+    """A flat object in the plane of the sheet would flicker."""
     turned = transform(rotation_from_vector(np.array([tilt_rad, 0.0, 0.0])), (0.0, 0.0, 0.0))
     points = compute_sheet_points(
         *(turned @ edge for edge in edges()),
@@ -138,7 +138,7 @@ def test_the_sheet_is_drawn_before_the_object_that_it_touches(tilt_rad: float) -
 
 
 def test_sharp_edges_are_split_and_smooth_ones_are_not() -> None:
-    """Smooth normals of shared vertices drew artefacts along the edges of a plane and a box."""
+    """A single normal at a sharp edge would cause wrong shading."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
     box = np.array(
         [

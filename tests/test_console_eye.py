@@ -1,4 +1,4 @@
-"""Test the view from the user's eye, and its reset."""
+"""Test the requests for eye views, and the display settings after them."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def frame(label: str, *, pixels: bool = True) -> Frame:
 
 
 def test_a_slow_image_is_still_shown(scene: Scene) -> None:
-    """On a busy computer each image came after the next request, and none was shown."""
+    """On a busy computer, an image may arrive after the next request."""
     sent: list[Message] = []
     eye_view = EyeViewRequester(sent.append, scene)
     eye_view.enabled = True

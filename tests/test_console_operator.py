@@ -1,4 +1,4 @@
-"""Test that the page agrees with the node's state after any request."""
+"""Test that the page shows the state of the node after each request."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TICK_S = 0.04
 
 @dataclass
 class Bench:
-    """Page without a viewer, and the messages of its node."""
+    """A page without a viewer, and the messages that its node has sent."""
 
     operator: Operator
     bags: Path
@@ -52,7 +52,7 @@ class Bench:
         return self.operator._page.record._bag
 
     def run(self, seconds: float = 20.0) -> None:
-        """Let time pass as the node does."""
+        """Advance the time in steps of the node's period."""
         end_s = self.now_s + seconds
         while self.now_s < end_s:
             self.now_s += TICK_S
@@ -60,7 +60,7 @@ class Bench:
         self.operator.refresh_tables(self.now_s)
 
     async def change_scene(self, name: str, value: float) -> None:
-        """Move one of the scene's sliders, and wait until the new object is ready."""
+        """Move a slider of the scene, and wait until the new object is ready."""
         self.operator.handle_request("slide", name, value)
         self.run(2.0 * SETTLE_S)
         await self.know_object()

@@ -1,4 +1,4 @@
-"""Test the page in a browser by real clicks, drags and keys, and the graph's reaction."""
+"""Test the page and the graph by clicks, drags and keys in a browser."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ pytestmark = BROWSER_MARKS
 
 @dataclass
 class ReceivedMessages:
-    """Messages of the graph by topic, in order."""
+    """The received messages of the graph by topic, in order."""
 
     messages: dict[str, list[Any]] = field(default_factory=dict)
     fingers_on_first_object: int = 0
@@ -95,7 +95,7 @@ def free_port() -> int:
 
 @dataclass
 class PageVisit:
-    """Results of one visit to the page."""
+    """The results of one visit to the page."""
 
     inbox: ReceivedMessages
     bag: Path
@@ -105,7 +105,7 @@ class PageVisit:
 
 
 async def refused(port: int, **headers: str) -> str:
-    """Return the answer to a connection to the page's socket with such headers."""
+    """Return the response to a WebSocket request with the given headers."""
     try:
         async with websockets.connect(
             f"ws://127.0.0.1:{port}", additional_headers=headers, open_timeout=DEADLINE_S
@@ -116,7 +116,7 @@ async def refused(port: int, **headers: str) -> str:
 
 
 async def slide(page: Page, label: str, value: str) -> None:
-    """Enter the number beside a slider by keyboard."""
+    """Enter a value in the number field of a slider."""
     box = page.get_by_role("textbox", name=label)
     await box.fill(value)
     await box.press("Enter")
@@ -253,7 +253,7 @@ def engaged(inbox: ReceivedMessages) -> str | None:
 
 @pytest.fixture(scope="module")
 def session() -> Any:
-    """Visit the page once for all tests, since a browser starts slowly."""
+    """Visit the page once for all tests, because a browser starts slowly."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(runs.ROOT_VARIABLE, str(folder / "runs"))

@@ -85,7 +85,7 @@ def test_values_that_make_no_scene_are_rejected(scene: Scene, name: str, value: 
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_the_tension_ends_where_the_arms_would_stop(path: Path) -> None:
-    """At more than 8 % the arms of the demo stopped, and the scene's own limit was raised."""
+    """At more than 8 % of stretch, the edge force would exceed the limit of the arms."""
     scene = load_scene(path)
     limit = scenes.max_stretch_ratio(scene)
     tight = scenes.edit_scene(

@@ -1,4 +1,4 @@
-"""Test the computation of a table by workers of a scheduler: real processes on loopback."""
+"""Test the computation of a table by the workers of a dask scheduler in real processes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class Lab:
-    """Scheduler of `distributed`, with workers that are started one by one."""
+    """A scheduler of `distributed`, with workers that are started one by one."""
 
     def __init__(self) -> None:
         with socket.socket() as probe:

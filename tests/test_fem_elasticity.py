@@ -108,8 +108,9 @@ def test_a_rigid_motion_costs_nothing() -> None:
 
 
 def test_error_falls_with_the_third_power_of_the_element_size() -> None:
-    """The boundary values are those of a smooth equilibrium field: the gradient of a harmonic
-    potential."""
+    """Prescribe the gradient of a harmonic potential, which is an equilibrium field, at the
+    boundary.
+    """
     errors = []
     for n in (3, 6):
         nodes, elements = box((n, n, n), (1.0, 1.0, 1.0))

@@ -101,7 +101,7 @@ def test_a_stiffness_that_does_not_resist_is_an_error() -> None:
 
 
 def test_nonlinear_forces_tangent_and_solution_equal_those_of_scikit_fem() -> None:
-    """A block fixed at its bottom is deformed sideways by its weight at large strains."""
+    """Deform a block, fixed at its bottom, sideways by body forces at large strains."""
     import skfem
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve

@@ -72,7 +72,7 @@ CYLINDER = {"shape": "cylinder", "radius_m": 0.0353553, "length_m": 0.12}
 
 
 def egg_mesh() -> dict[str, Any]:
-    """Return an ellipsoid as triangles."""
+    """Return the triangle mesh of an ellipsoid."""
     ball = trimesh.creation.icosphere(subdivisions=3)
     vertices = np.ascontiguousarray(ball.vertices * EGG_AXES_M, dtype=np.float64)
     return {
@@ -98,7 +98,7 @@ CLOSED = ("sphere", "ellipsoid", "rounded_box", "mesh")
 
 
 def scene(geometry: dict[str, Any], **changes: Any) -> Scene:
-    """Return the cylinder's scene with another object."""
+    """Return the scene of the paper with another object."""
     content = load_values()
     body = content["object"]
     del body["support_angle_rad"]
@@ -146,7 +146,9 @@ def hull_area(solid: SolidMesh, faces: Ints) -> float:
 
 
 def expected(geometry: dict[str, Any]) -> tuple[float, float]:
-    """Return volume and area in closed form, or of a mesh's triangles."""
+    """Return the volume (m^3) and the area (m^2) of an object in closed form, or of a triangle
+    mesh.
+    """
     match geometry["shape"]:
         case "sphere":
             r = geometry["radius_m"]
@@ -178,7 +180,7 @@ def expected(geometry: dict[str, Any]) -> tuple[float, float]:
 
 
 def require_sound(solid: SolidMesh) -> None:
-    """Assert valid elements, a closed hull with the sphere's topology, and consistent parts."""
+    """Assert that the elements are valid, the hull is closed, and the parts of the mesh agree."""
     assert radius_ratios(solid.nodes, solid.elements).min() > MIN_RADIUS_RATIO
     assert np.degrees(min_dihedral_rad(solid.nodes, solid.elements).min()) > 8
     assert min_jacobian_ratios(solid.nodes, solid.elements).min() > 0.99 * MIN_JACOBIAN_RATIO
@@ -285,7 +287,7 @@ def test_symmetric_shapes_have_symmetric_meshes(name: str, axis: int) -> None:
 
 @pytest.mark.parametrize("angle_rad", [0.1, 1.2])
 def test_about_a_focus_a_cylinders_mesh_leans_to_no_side(angle_rad: float) -> None:
-    """Nodes and edges are mirrored; otherwise a pressed finger would be pushed sideways."""
+    """Compare nodes with their mirror images. An asymmetric mesh would push the finger sideways."""
     radius_m, near_m = CYLINDER["radius_m"], 0.011
     mesh = cylinder_mesh(
         radius_m=radius_m,

@@ -1,4 +1,4 @@
-"""Test the soft body node with the runner's calls."""
+"""Test the soft-body node by the calls of the runner."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ another whose force is 20 % larger."""
 
 
 def scene(**changes: Any) -> Scene:
-    """Return the cylinder scene; `changes` are applied to its object."""
+    """Return the paper's scene with changes of its object."""
     content = load_values()
     content["object"].update(changes)
     return Scene.model_validate(content)
@@ -63,7 +63,7 @@ def fingertip(
 
 
 class Named:
-    """Method under another name."""
+    """A soft-body method under another name."""
 
     def __init__(self, method: Any, name: str) -> None:
         self._method, self.name = method, name
@@ -73,7 +73,7 @@ class Named:
 
 
 class Bench(NodeHarness[FemSolver, VirtualClock]):
-    """Solver that receives fingertips from the test."""
+    """A soft-body node that receives fingertips from the test."""
 
     def __init__(self, **parameters: Any) -> None:
         given = FemSolverParameters(
@@ -263,7 +263,7 @@ async def test_closing_interrupts_the_precomputation(tmp_path: Path) -> None:
 async def test_a_newer_scene_interrupts_the_precomputation(
     cache: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A cached scene waited for minutes of computation for the scene that it replaced."""
+    """Earlier, a cached scene waited for the computation of the scene that it replaced."""
     begun, meshed, ended = threading.Event(), threading.Event(), threading.Event()
 
     def endless(spec: Any, progress: Any, parts: Any = None) -> Any:
@@ -372,7 +372,7 @@ async def test_the_table_is_made_while_the_linear_method_answers(
 
 
 class Scaled(Named):
-    """Method under another name whose force is a multiple of the original."""
+    """A soft-body method under another name, with scaled forces and displacements."""
 
     def __init__(self, method: Any, name: str, ratio: float) -> None:
         super().__init__(method, name)

@@ -1,4 +1,4 @@
-"""Test the precomputation and its cache: correct and atomic."""
+"""Test the precomputed response and its cache."""
 
 from __future__ import annotations
 
@@ -235,7 +235,7 @@ def test_the_cache_follows_the_desktop_standard(
 
 
 def test_the_node_module_is_light_to_import() -> None:
-    """No part of scipy is loaded before a scene needs it, since processes must start quickly."""
+    """Processes must start quickly, so no part of scipy is loaded before a scene needs it."""
     code = (
         "import sys, json, flexsheet.nodes.fem_solver.node;"
         "print(json.dumps([m for m in sys.modules if m.split('.')[0] in ('scipy', 'matplotlib')]))"

@@ -1,4 +1,4 @@
-"""Test the parts of the soft body's quick start: order of pushes, force correction, transitions."""
+"""Test what makes the first table early: order of the pushes, symmetry, and force correction."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def test_the_shipped_pushes_of_the_demo_are_current() -> None:
 
 
 def test_forces_are_corrected_to_those_of_an_infinitely_fine_mesh() -> None:
-    """The table's excess is 12 % in proportion to the square of the element size."""
+    """Use a table whose forces are 12 % too large, in proportion to the squared element size."""
     depths = np.array([0.0, 0.0007, 0.0015, 0.005, 0.010, 0.020])
     exact = 1e-3 * (depths / 0.01) ** 1.5
     sample = SamplePoint(0.03 * UP, UP)

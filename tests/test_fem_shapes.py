@@ -1,4 +1,4 @@
-"""Test that every shape of a scene deforms smoothly under the finger, within bounds."""
+"""Test that objects of every shape deform smoothly under the finger, within bounds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BASE = {"kind": "base", "height_m": 0.01}
 
 
 def scene(geometry: dict[str, Any], height_m: float, support: dict[str, Any]) -> Scene:
-    """Return the demo's scene with another object, its front at the world's origin."""
+    """Return the demo's scene with another object, whose front is at the origin."""
     content = load_values()
     del content["object"]["support_angle_rad"]
     content["object"] |= {
@@ -71,7 +71,7 @@ def soft(request: pytest.FixtureRequest) -> SceneBody:
 
 
 def pushed(soft: SceneBody, x: float, y: float, depth: float) -> tuple[Response, Floats]:
-    """Return the result for a finger at a depth below the surface near (x, y), and the normal."""
+    """Return the response at a depth below the surface near (x, y), and the normal there."""
     found = soft.shape.closest(soft.front + np.array([x, y, 0.0]))
     point = found.point - depth * found.normal
     return soft.respond(rigid.apply(soft.world_from_mesh, point), None)[0], found.normal

@@ -138,7 +138,7 @@ def touches(penalty: tuple[float, float]) -> list[Touch]:
 
 
 def sunk_at(r: float, patch: float, force: float) -> float:
-    """Return Hertz's surface outside the contact."""
+    """Return the displacement of the surface outside the contact by Hertz's theory."""
     pressure = 3 * force / (2 * np.pi * patch**2)
     share = patch / r
     bend = (2 * patch**2 - r**2) * np.arcsin(share) + r * patch * np.sqrt(1 - share**2)

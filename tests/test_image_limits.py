@@ -1,4 +1,4 @@
-"""Test the limits of the image: dark, or the last valid plane, but never wrong."""
+"""Test the image on sheets at extreme poses: it is dark or correct, but never wrong."""
 
 from __future__ import annotations
 
@@ -51,8 +51,7 @@ def stage() -> Iterator[SceneRenderer]:
 
 
 def plane_through(point: Floats) -> Floats:
-    """Return world_from_sheet at the world's origin, rotated about x until it contains the
-    point."""
+    """Return the pose (4, 4) of a sheet about the x axis whose plane contains a point."""
     angle = float(np.arctan2(point[1], point[2])) - 0.5 * np.pi
     return transform(rotation_from_vector([-angle, 0.0, 0.0]), np.zeros(3))
 
@@ -132,8 +131,7 @@ def test_a_push_out_of_range_is_drawn_and_reported(
 def test_a_fold_that_keeps_the_light_away_is_dark_and_the_rest_is_right(
     stage: SceneRenderer,
 ) -> None:
-    """The indentation of a downward sheet blocks the light: the lit part is correct, the rest is
-    dark."""
+    """The indentation of a tilted sheet shades a part of the image."""
     place = np.array([0.0, 0.05, 0.0])
     pose = roll_sheet(SCENE, np.radians(40.0), (0.0, 0.05))
     tip = pose[:3, 3] + pose[:3, :3] @ (place - [0.0, 0.0, DEEPEST_M])

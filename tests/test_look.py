@@ -130,7 +130,7 @@ POSES = [
 def test_an_even_patch_has_no_seam(
     plain: SceneRenderer, correction: Correction, pose: Floats
 ) -> None:
-    """There is no dark line between triangles, of the sheet or of the object."""
+    """No dark line may appear between triangles of the sheet or of the object."""
     tip = (pose @ [0.02, -0.03, -0.03, 1.0])[:3]
     picture = drawn(
         plain, DrawStyle(False, "white"), correction=correction, sheet=sheet_at(SCENE, pose, tip)
@@ -147,7 +147,7 @@ def test_an_even_patch_has_no_seam(
 
 @pytest.mark.parametrize("correction", ["none", "four_triangles", "two_pass"])
 def test_edges_are_soft(plain: SceneRenderer, correction: Correction) -> None:
-    """Outlines have intermediate levels, since they are multisampled."""
+    """Multisampled outlines have intermediate brightness."""
     picture = drawn(plain, DrawStyle(True, "object"), correction=correction)[..., 0]
     between = (picture > 16) & (picture < 240)
     assert between.sum() > 200

@@ -1,5 +1,4 @@
-"""Test the limits of drawing: behind the eye, in front of the sheet, degenerate, folded,
-infinite."""
+"""Test drawing at its limits: points behind the eye, folded sheets, and values like NaN."""
 
 from __future__ import annotations
 
@@ -69,7 +68,7 @@ def test_what_is_behind_the_eye_is_not_drawn(context: moderngl.Context) -> None:
 
 
 def test_a_point_in_front_of_the_sheet_is_seen_at_its_position(stage: SceneRenderer) -> None:
-    """A sheet 25 mm behind the object's front is valid for the equations and two passes."""
+    """Place the sheet 25 mm behind the front of the object."""
     pose = transform(np.eye(3), np.array([0.0, 0.0, -0.025]))
     spec = SCENE.sheet
     rubber = TrueRubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
@@ -110,7 +109,7 @@ def test_light_lost_at_folds_is_measured() -> None:
 def test_a_folded_sheet_is_drawn_and_reported(
     stage: SceneRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The projector lights the nearest point; of two points on its ray one gets the light."""
+    """The projector lights only the nearer of two points on one ray."""
     monkeypatch.setattr(stage, "sheet_mesh", lambda sheet: folded(0.03))
     stage.note = ""
     picture = drawn(stage, "two_pass", stage.sheet_at_rest())
