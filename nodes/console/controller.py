@@ -166,7 +166,7 @@ class EyeViewRequester:
 
     @property
     def label(self) -> str:
-        """Return the label of the newest request, which the requested frame also contains."""
+        """Return the label of the newest request. The requested frame has the same label."""
         return f"console {self._number}"
 
     @property
@@ -189,7 +189,7 @@ class EyeViewRequester:
             self._restore_display()
 
     def on_others_display(self, display: Display) -> None:
-        """Store the display settings of another node, to restore them after an eye view."""
+        """Store the display settings of another node, which an eye view must restore."""
         self._others_display, self._owns_display = display, False
 
     def advance(self, now_s: float) -> None:
@@ -257,7 +257,7 @@ class EyeViewRequester:
 
 
 class Replay:
-    """The replay of a bag on the console page, which publishes no messages.
+    """The replay of a bag on the console page. A replay publishes no messages.
 
     timeline: opened bag, or None. playing: whether the replay advances. rate: ratio of recorded
         time to real time.

@@ -24,7 +24,7 @@ class MessageSource(Protocol):
 
 
 class LatestMessages:
-    """A store of the latest message of each topic, which decodes a message when it is first read.
+    """Store the latest message of each topic, and decode a message only when it is read.
 
     refused: function that receives the topic and the error if a message cannot be decoded.
     """

@@ -202,7 +202,7 @@ def _finger(fingertip: Fingertip | None) -> str:
 def eye(
     *, possible: bool, enabled: bool, state: EyeViewState, waited_s: float, ago_s: float | None
 ) -> str:
-    """Describe as HTML the state of the eye view, which is the image that the user sees.
+    """Describe as HTML the state of the eye view, the image that the user sees.
 
     possible: whether the graph has a simulated eye.
     enabled: whether viewers have requested images.

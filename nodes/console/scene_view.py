@@ -77,7 +77,7 @@ are the origin (3,), m, and the direction (3,) of the ray."""
 
 
 class SceneView:
-    """The 3D view of the scene, which is the same for all viewers."""
+    """The 3D view of the scene. All viewers see the same view."""
 
     def __init__(self, server: viser.ViserServer, touched: Drag) -> None:
         """Set the lights and the first camera position.

@@ -64,9 +64,9 @@ def film(
 
     x, y: coordinates (n,) of the points, m. finger: position (x, y), m. size_m: width and height.
     The result is relative to the depth of the finger, and it is 1 within `radius_m` of the finger.
-    It solves Laplace's equation for a point force in an infinite strip, whose Green's function is
-    known from a conformal map. Mirror images of the finger model the free edges at y = +-height /
-    2.
+    The deflection solves Laplace's equation for a point force in an infinite strip. Its Green's
+    function follows from a conformal map. Mirror images of the finger model the free edges at y =
+    +-height / 2.
     """
     width_m, height_m = size_m
     finger_x, finger_y = finger

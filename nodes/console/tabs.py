@@ -234,7 +234,7 @@ def _scales(top_ms: float) -> dict[str, Any]:
 
 
 def max_latency_ms(columns: tuple[Floats, ...]) -> float:
-    """Return the upper limit of the chart's scale (ms), which is one of 1, 2, 5, 10 and so on.
+    """Return the upper limit of the chart's scale, ms: 1, 2, 5, 10 and so on.
 
     columns: times (n,), s, and latency series (n,), ms.
     """
@@ -245,7 +245,7 @@ def max_latency_ms(columns: tuple[Floats, ...]) -> float:
 
 
 class EyeTab:
-    """The tab with the images of the simulated eye, which are hidden until an image exists."""
+    """The tab with the images of the simulated eye. An image is hidden until it exists."""
 
     def __init__(self, gui: Any, request: Request) -> None:
         self._enabled = gui.add_checkbox(

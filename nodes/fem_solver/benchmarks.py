@@ -1,10 +1,10 @@
 """Measure the error and the time of the soft-body methods for `flexsheet chart soft-body`.
 
-The methods are the linear method, the nonlinear table, and Newton's method. They are compared with
-references, which are full Newton solutions of one push on separate, finer meshes. At each push
-depth the reference is the finest mesh whose solution converged there. The difference from the
-second finest mesh is taken as the uncertainty of the reference. Where no solution converged, the
-chart shows only the time and the maximum displacement of the skin (the surface of the body).
+The methods are the linear method, the nonlinear table, and Newton's method. The references are full
+Newton solutions of one push on separate, finer meshes. At each push depth, the reference is the
+finest mesh with a converged solution. The difference from the second finest mesh is taken as the
+uncertainty of the reference. Where no solution converged, the chart shows only the time and the
+maximum displacement of the skin (the surface of the body).
 """
 
 from __future__ import annotations

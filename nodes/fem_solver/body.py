@@ -268,8 +268,8 @@ def blend_responses(old: Response, new: Response, weight: float) -> Response:
 def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:
     """Return the response at the time `lost_s` after the last measurement of the finger.
 
-    response: last response before the finger was lost. It is unchanged for the time `hold_s`, and
-        then decays exponentially with the time constant `relax_s`.
+    response: last response before the finger was lost. The response is unchanged for the time
+    `hold_s`, and then decays with the time constant `relax_s`.
     """
     if lost_s <= hold_s:
         return response

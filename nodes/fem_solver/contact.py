@@ -33,8 +33,8 @@ FLANK_RATIO = 0.9
 """The distance from the push axis, in finger radii, beyond which the spherical fingertip is
 approximated by a tangent cone."""
 FACING = (0.2, 0.6)
-"""The range of the cosine of the angle between skin normal and contact normal in which the weight
-of the penetration rises from 0 to 1."""
+"""The range in which the weight of the penetration rises from 0 to 1. The values are cosines of the
+angle between skin normal and contact normal."""
 PAD_RATIO = 1.1
 """The half width of the contact patch at the end of the linear range, in finger radii."""
 TANGENTIAL_COMPLIANCE_RATIO = 0.004
@@ -375,7 +375,7 @@ def _search_step(
 
 
 class LinearSoftBody:
-    """The linear soft-body method, which superposes precomputed responses to unit forces.
+    """The linear soft-body method: a superposition of precomputed responses to unit forces.
 
     Pushes deeper than `linear_depth_m` are reported as out of range. For these pushes, the force is
     proportional to the depth, and the displacement grows up to the depth `max_depth_m` only.

@@ -80,7 +80,7 @@ class NeoHookeanSolid:
         return gradient, determinants(gradient)
 
     def energy(self, displacement: Floats) -> float:
-        """Return the elastic energy in joules, which is infinite if an element is inverted.
+        """Return the elastic energy in joules, or infinity if an element is inverted.
 
         displacement (n, 3): displacement of the nodes, m.
         """
@@ -93,7 +93,7 @@ class NeoHookeanSolid:
         return float((self._volumes * density).sum())
 
     def forces(self, displacement: Floats) -> Floats:
-        """Return the elastic nodal forces (n, 3), N, which are the gradient of the energy.
+        """Return the elastic nodal forces (n, 3), N: the gradient of the energy.
 
         displacement (n, 3): displacement of the nodes, m. Raises InvertedElementError if an element
         is inverted.

@@ -137,8 +137,7 @@ class FingerObstacle:
         return float(self._penalty[inner] @ density)
 
     def forces(self, positions: Floats, centre: Floats) -> Floats:
-        """Return the force (n, 3), N, of each node on the finger, which is the gradient of the
-        energy.
+        """Return the force (n, 3), N, of each node on the finger: the gradient of the energy.
 
         positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
         """
@@ -195,7 +194,7 @@ class FingerObstacle:
 
 
 class NeoHookeanBody:
-    """A neo-Hookean (hyperelastic) body with fixed nodes, which a finger pushes."""
+    """A solver for a neo-Hookean (hyperelastic) body with fixed nodes and a pushing finger."""
 
     def __init__(
         self,
@@ -304,8 +303,8 @@ class NeoHookeanBody:
     ) -> tuple[Floats, Factors | None]:
         """Find the equilibrium with the sphere at `centre` (3,) by Newton's method.
 
-        The iteration starts at `displacement` or `guess` (n, 3), m. It uses the start with less
-        energy. Return the displacement (n, 3) at equilibrium and the last factors of the tangent
+        The iteration starts at `displacement` or `guess` (n, 3), m. The start with less energy is
+        used. Return the displacement (n, 3) at equilibrium and the last factors of the tangent
         stiffness. Raises NewtonNotConvergedError if the iteration does not converge.
         """
         nodes = self.solid.nodes

@@ -94,7 +94,7 @@ class FemSolver(Node):
             self.note = f"soft body by {self._describe(bodies[0])}"
 
     def _describe(self, current: body.SceneBody) -> str:
-        """Return the method in use, its force error and its number of skin nodes as a text."""
+        """Return a text with the current method, the force error, and the number of skin nodes."""
         nodes = len(current.skin.vertices_world_m)
         bodies = (current, *(old for old, _ in self._replaced))
         errors = " and ".join(

@@ -75,7 +75,7 @@ class SoftBodySpec:
         return [VERSION, self.mesh.key(), self.poisson_ratio, self.sticking]
 
     def key(self) -> str:
-        """Return a digest of the inputs and of `VERSION`, which identifies the result."""
+        """Return a digest of the inputs and of `VERSION`, as an identifier of the result."""
         return make_digest(self.depends_on())
 
 

@@ -157,9 +157,9 @@ def compute_table(
     """Load the cached table, or compute and store it.
 
     model: linear response of the same body. workers: number of workers of the executor on this
-    computer. on_quick: function that receives a coarse table, which is ready much earlier than the
-    complete table; None to omit the coarse table. Raises MemoryError if this computer has too
-    little memory. Raises LostWorkersError if the executor loses its workers.
+    computer. on_quick: function that receives a coarse table long before the complete table is
+    ready; None to omit the coarse table. Raises MemoryError if this computer has too little memory.
+    Raises LostWorkersError if the executor loses its workers.
     """
     entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)

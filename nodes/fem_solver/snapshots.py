@@ -48,9 +48,10 @@ QUICK_COUNT = 9
 contains its push depths."""
 FINE_DEPTHS_M = (0.0007, 0.0015, 0.003, 0.005, 0.010)
 FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
-"""The parameters of the fine mesh that corrects the forces. They are the ratio of its skin spacing
-to that of a snapshot, the radius of its fine region (finger radii), and its growth of the element
-size per distance (m/m). `FINE_DEPTHS_M` contains the push depths."""
+"""The parameters of the fine mesh that corrects the forces. The first is the ratio of the skin
+spacing to that of a snapshot. The second is the radius of the fine region, in finger radii. The
+third is the growth of the element size per distance (m/m). `FINE_DEPTHS_M` contains the push
+depths."""
 SAME_RATIO = 1e-6
 
 

@@ -51,7 +51,7 @@ def choose_method(
 
 @dataclass(slots=True)
 class SoftBodyFactory:
-    """A factory of soft bodies, which stores the last precomputed model in memory.
+    """Build soft bodies, and store the last precomputed model in memory.
 
     workers: number of processes that compute a table; 0 means one per core. scheduler: address of a
     dask scheduler whose workers compute the table instead. If the cache in `cache_dir` is empty,

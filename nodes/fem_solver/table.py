@@ -3,8 +3,8 @@
 For pushes at every touchable node to several depths, the table contains the force and the
 displacement of the skin (the surface of the body). Shape functions of the mesh interpolate between
 nodes. Cubic polynomials with a continuous slope interpolate between depths. Therefore the response
-is a continuous function of the finger's position. One response reads 24 rows of the table, which
-belong to six nodes at four depths.
+is a continuous function of the finger's position. One response reads 24 rows of the table, for six
+nodes at four depths.
 
 The table is filled with solutions of Newton's method, called snapshots, at several tens of sample
 points. The module `snapshot_interpolator` interpolates them to the other nodes. At small depths the
@@ -195,8 +195,8 @@ def find_mirror_images(
 
     points (n, 3): contact nodes, m. rest (s, 3): undeformed skin nodes, m. mirrors: vectors (3,) of
     signs, one for each mirror symmetry of the body. Symmetries that do not map all skin nodes to
-    skin nodes are ignored. For each contact node found, return the index of the earlier node, the
-    signs, and the index of the mirror image of each skin node (s,).
+    skin nodes are ignored. Return, by contact node, the index of the earlier node, the signs, and
+    the indices (s,) of the mirror images of the skin nodes.
     """
     from scipy.spatial import cKDTree
 

@@ -3,8 +3,8 @@
 The measured time is the time for drawing a stereo frame, without reading its pixels. The method
 `floor` gives a lower bound of this time. This method clears the frame and draws the same triangles
 once for each eye, with the same number of samples. The error is measured at each point that the eye
-sees on a reference sheet. The caller provides this reference, which is computed independently of
-the renderer.
+sees on a reference sheet. The caller provides this reference, computed independently of the
+renderer.
 """
 
 from __future__ import annotations
@@ -195,9 +195,7 @@ def _make_situation(
 
 
 def draw_stereo(scene_renderer: SceneRenderer, method: str, sheet: SheetPose) -> None:
-    """Draw one stereo frame by a correction method, or by the method `FLOOR`, which gives a lower
-    bound of the time.
-    """
+    """Draw one stereo frame by a correction method, or by `FLOOR`, the lower bound of the time."""
     display = Display(correction=CORRECTION_OF[method], stereo="side_by_side")
     look = DrawStyle(flat=False, pattern="object")
     if method == FLOOR:

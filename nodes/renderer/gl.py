@@ -243,7 +243,7 @@ class Canvas:
             self.context.copy_framebuffer(self.resolved, self._frame)
 
     def read(self) -> Image:
-        """Return the last image (height, width, 3), which starts with the top row."""
+        """Return the last image (height, width, 3), starting with the top row."""
         data = self.resolved.read(components=3, alignment=1)
         rows = np.frombuffer(data, np.uint8).reshape(self.height_px, self.width_px, 3)
         return np.ascontiguousarray(rows[::-1])

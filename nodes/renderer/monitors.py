@@ -112,7 +112,7 @@ def refresh_period_s(monitor: Any) -> float:
 
 
 def hidden_window() -> Any:
-    """Return an invisible window, whose OpenGL context is used for drawing.
+    """Return an invisible window with an OpenGL context for drawing.
 
     Raises WindowError if the window cannot be opened.
     """

@@ -93,7 +93,7 @@ def open_output(
 
 
 class ProjectorWindow:
-    """A full-screen window on the projector's monitor, which shows images from a separate thread.
+    """A full-screen window on the projector's monitor. A separate thread shows the images.
 
     All methods must be called on the main thread.
     """

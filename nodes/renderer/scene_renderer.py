@@ -63,9 +63,8 @@ projector, with and without multisampling. On a software driver, the variant wit
 needs a quarter less time for equally smooth edges."""
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
-"""The margin (m) of the rectangle around the object in the eye's image, and the step (m) to which
-the edges of the rectangle are rounded. Rounding prevents flicker of the outline when the object
-moves."""
+"""The margin (m) around the object in the eye's image, and the step (m) to which the edges of the
+image are rounded. Rounding prevents flicker of the outline when the object moves."""
 MAX_WINDOW_M = 0.3
 """The maximum distance of the edges of the drawn rectangle from the centre of the screen."""
 MIN_REPORTED_FRACTION = 0.005
@@ -164,7 +163,7 @@ class SceneRenderer:
         )
 
     def set_skin(self, skin: Skin) -> None:
-        """Set the surface mesh of the soft-body solver, whose displacement deforms the object."""
+        """Set the surface mesh whose displacement by the soft-body solver deforms the object."""
         vertices = skin.vertices_world_m.astype(np.float64)
         self._deformation = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
@@ -253,9 +252,9 @@ class SceneRenderer:
         """Draw the projector's image, and return it (height, width, 3) if `read` is true.
 
         eyes (1 or 2, 3): positions, world frame, m; None for the eyes of the scene. Two eyes share
-        the image, except in the mode frame_sequential. This mode has two images, of which the image
-        of the left eye is returned. drawn: function that receives the index of each image when the
-        image is in `canvas.resolved`. Raises ValueError if the sheet's pose is not finite.
+        the image, except in the mode frame_sequential. This mode has two images. The image of the
+        left eye is returned. drawn: function that receives the index of each image when the image
+        is in `canvas.resolved`. Raises ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite; check the poses of the arms")

@@ -89,7 +89,7 @@ def estimate_sheet(
 def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
     """Return the shape of the sheet for which a method corrects the image.
 
-    Return None for the methods none and two_pass, which need no such screen.
+    Return None for the methods none and two_pass, because these methods need no screen.
     """
     if method in ("none", "two_pass"):
         return None

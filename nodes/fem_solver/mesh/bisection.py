@@ -52,9 +52,9 @@ def bisect(
     """Bisect tetrahedra (e, 4) until none of them is too large.
 
     too_large: function that returns whether each tetrahedron is too large, for given vertices (n,
-    3) and tetrahedra. Adjacent tetrahedra are also bisected, so that they share whole faces. Raises
-    UnfitMeshError if more than `MAX_TETRAHEDRA` tetrahedra or edges shorter than 1/64 of a cell are
-    required.
+    3) and tetrahedra. Adjacent tetrahedra are also bisected, because neighbours must share whole
+    faces. Raises UnfitMeshError if more than `MAX_TETRAHEDRA` tetrahedra or edges shorter than 1/64
+    of a cell are required.
     """
     while True:
         if len(tetrahedra) > MAX_TETRAHEDRA:
