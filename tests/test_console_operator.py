@@ -155,16 +155,6 @@ async def test_after_a_rejected_command_the_page_shows_what_holds(bench: Bench) 
     assert bench.touch._depth.value == 6.0
 
 
-async def test_the_hint_of_the_reset_button_says_why_it_is_disabled(bench: Bench) -> None:
-    button = bench.operator._page._release
-    bench.run(0.5)
-    assert button.disabled
-    assert "no e-stop is engaged" in button.hint
-    bench.operator.handle_request("stop", "test")
-    assert not button.disabled
-    assert "must be at rest" in button.hint
-
-
 async def test_the_bag_that_was_recorded_is_chosen(bench: Bench) -> None:
     old = bench.bags / "old.mcap"
     old.write_bytes(b"")

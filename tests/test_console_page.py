@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import shutil
 import socket
 import tempfile
@@ -209,11 +210,14 @@ async def change_the_scene(page: Page, inbox: ReceivedMessages) -> None:
 
 
 async def stop_and_release(page: Page, inbox: ReceivedMessages) -> None:
+    reset = page.get_by_role("button", name="Reset the fault")
+    await expect(reset).to_have_attribute("title", re.compile("^Disabled, because no e-stop"))
     await page.get_by_role("button", name="E-STOP").click()
     await inbox.until(lambda: engaged(inbox) == "pressed at the console", "an e-stop")
     await expect(page.get_by_role("status")).to_contain_text("E-STOP is engaged")
     release = page.get_by_role("button", name="Release")
     await expect(release).to_be_enabled()
+    await expect(release).to_have_attribute("title", re.compile("The arms must be at rest"))
     await release.press("Enter")
     await inbox.until(lambda: engaged(inbox) is None, "a release")
     # viser heeds no hotkey while a text box has the focus.

@@ -16,8 +16,6 @@ from flexsheet.nodes.console.tabs import EyeTab, GraphTab, RecordTab, Request, T
 BRAND = (14, 92, 132)
 STOP_COLOR = (185, 28, 28)
 RELEASE, RESET = "Release the stop", "Reset the fault"
-DISABLED_HINT = "Disabled, because no e-stop is engaged and no arm reports a fault"
-ENABLED_HINT = "Reset the e-stop and the faults of the arms. The arms must be at rest"
 MAIN_WIDTH, STOP_WIDTH = 380, 320
 
 
@@ -61,11 +59,9 @@ class Page:
     def _add_stop(self) -> None:
         panel = self._gui.add_panel()
         with panel.add_tab("Stop", viser.Icon.HAND_STOP):
-            stop = self._gui.add_button(
-                "E-STOP  (Esc)", color=STOP_COLOR, hint="Stop both arms immediately. Key: Escape"
-            )
+            stop = self._gui.add_button("E-STOP  (Esc)", color=STOP_COLOR)
             self._state = self._gui.add_html("")
-            self._release = self._gui.add_button(RESET, disabled=True, hint=DISABLED_HINT)
+            self._release = self._gui.add_button(RESET, disabled=True)
         # Place the window at the bottom, because viser shows its own notices at the top.
         panel.float(x=14, y=-14, width=STOP_WIDTH)
         # Expand the window, because viser folds panels on small screens.
@@ -92,7 +88,6 @@ class Page:
         self._state.content = banner.render(state)
         # The button is always visible, so that no other control moves under the mouse pointer.
         self._release.disabled = not state.resettable
-        self._release.hint = ENABLED_HINT if state.resettable else DISABLED_HINT
         label = RESET if state.stopped is None else RELEASE
         if self._others_may:
             label = f"{label}: on {' or '.join(self._others_may)}"

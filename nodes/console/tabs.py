@@ -105,11 +105,7 @@ class TouchTab:
             0.0,
             hint="Distance of the finger above the centre of the screen",
         )
-        self._lift = gui.add_button(
-            LOWER,
-            hint="Move the fingertip to the depth of the slider Push, or 30 mm off the object's "
-            "surface. Key: L",
-        )
+        self._lift = gui.add_button(LOWER)
         on_value(self._depth, lambda value: request("push", 1e-3 * value))
         for slider in (self._across, self._up):
             on_value(
@@ -285,7 +281,7 @@ class RecordTab:
         with gui.add_folder("Record"):
             self._record = gui.add_button("Start recording", icon=viser.Icon.PLAYER_RECORD)
             self._label = gui.add_text("Name", "", hint="Label of the next bookmark")
-            bookmark = gui.add_button("Add a bookmark (M)", hint="Key: M")
+            bookmark = gui.add_button("Add a bookmark (M)")
             self._text = gui.add_html("")
         with gui.add_folder("Replay"):
             self._bag = gui.add_dropdown("Bag", (NO_BAG,), hint="Newest first")
