@@ -1,4 +1,4 @@
-"""Define the element sizes of a mesh: small at touchable skin, and larger at the back and inside."""
+"""Define the element sizes of a mesh: small at touchable skin, larger at the back and inside."""
 
 from __future__ import annotations
 
