@@ -35,7 +35,8 @@ from flexsheet.nodes.fem_solver.body import SceneBody
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody, saturate_depth
 from flexsheet.nodes.fem_solver.elasticity import quadrature
-from flexsheet.nodes.fem_solver.mesh import EDGES, SolidMesh, build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES, SolidMesh
 from flexsheet.nodes.methods import Trial, measure
 from tests.linear_elasticity import stiffness_matrix
 
@@ -131,7 +132,7 @@ def scikit_fem(body: SceneBody, scene: Scene) -> ExternalSolver | None:
 
     mesh = build_mesh(body.spec.mesh)
     loads = ContactLoads(body, mesh)
-    basis, order = _scikit_basis(skfem, mesh)
+    basis, order = scikit_basis(skfem, mesh.nodes, mesh.elements)
     material = require_material(scene)
     law = linear_elasticity(*lame_parameters(material.young_modulus_pa, material.poisson_ratio))
     matrix = skfem.asm(law, basis)
@@ -158,21 +159,26 @@ def _stiffness(mesh: SolidMesh, scene: Scene) -> Any:
     )
 
 
-def _scikit_basis(skfem: Any, mesh: SolidMesh) -> tuple[Any, Ints]:
-    """Return scikit-fem's basis on the curved mesh, and indices of its degrees of freedom."""
+def scikit_basis(skfem: Any, nodes: Floats, elements: Ints) -> tuple[Any, Ints]:
+    """Return scikit-fem's basis on a curved mesh, and the index of each degree of freedom here.
+
+    The quadrature is that of the solver, so that only the assembly differs.
+    """
     from scipy.spatial import cKDTree
 
-    corners = np.unique(mesh.elements[:, :4])
-    straight = mesh.nodes.copy()
-    straight[mesh.elements[:, 4:]] = mesh.nodes[mesh.elements[:, EDGES]].mean(axis=2)
-    tetrahedra = np.searchsorted(corners, mesh.elements[:, :4])
+    corners = np.unique(elements[:, :4])
+    straight = nodes.copy()
+    straight[elements[:, 4:]] = nodes[elements[:, EDGES]].mean(axis=2)
+    tetrahedra = np.searchsorted(corners, elements[:, :4])
     external = skfem.MeshTet2.from_mesh(skfem.MeshTet(straight[corners].T, tetrahedra.T))
-    _, nearest = cKDTree(straight).query(external.doflocs.T)
-    external = skfem.MeshTet2(mesh.nodes[nearest].T, external.t)
+    distance, nearest = cKDTree(straight).query(external.doflocs.T)
+    assert distance.max() < 1e-12
+    external = skfem.MeshTet2(nodes[nearest].T, external.t)
     points, weights = quadrature()
     element = skfem.ElementVector(skfem.ElementTetP2())
     basis = skfem.Basis(external, element, quadrature=(points.T, weights))
-    _, node = cKDTree(mesh.nodes).query(basis.doflocs.T)
+    distance, node = cKDTree(nodes).query(basis.doflocs.T)
+    assert distance.max() < 1e-9
     axis = np.empty(len(node), dtype=np.int64)
     for names in (basis.nodal_dofs, basis.edge_dofs):
         for number, dofs in enumerate(names):

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.messages.types import Display, Skin, SoftBody
-from flexsheet.nodes.fem_solver.mesh.from_scene import mesh_scene, world_from_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh, mesh_spec, world_from_mesh
 from flexsheet.nodes.models.rigid import apply
 from flexsheet.nodes.models.sheet import edge_poses
 from flexsheet.nodes.renderer import deflection_cache
@@ -136,7 +136,7 @@ def make_scene_renderer(scene: Scene, triangles: int) -> SceneRenderer:
 
 def compute_skin(scene: Scene) -> Skin:
     """Compute the solver's skin with the demo's spacing."""
-    mesh = mesh_scene(scene, SKIN_SPACING_M)
+    mesh = build_mesh(mesh_spec(scene, SKIN_SPACING_M))
     points = apply(world_from_mesh(scene), mesh.nodes[mesh.skin])
     return Skin(
         mesh_id="bench",
@@ -166,13 +166,7 @@ def bodies(skin: Skin) -> Iterator[SoftBody]:
 def predict_sheet(scene: Scene, edges: tuple[Floats, Floats], number: int) -> SheetPose:
     """Return the predicted sheet between two edges; `number` determines the pushed point."""
     tip = np.array([0.02 * np.sin(0.1 * number), 0.02 * np.cos(0.1 * number), -0.015])
-    sheet = estimate_sheet(
-        *edges,
-        height_m=scene.sheet.height_m,
-        twist_world=np.zeros(6),
-        ahead_s=0.0,
-        finger_tip=tip,
-    )
+    sheet = estimate_sheet(*edges, height_m=scene.sheet.height_m, finger_tip=tip)
     assert sheet is not None
     return sheet
 

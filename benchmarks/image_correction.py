@@ -78,13 +78,7 @@ class CorrectionBench:
         """Return the predicted sheet and the true sheet."""
         sheet = self.scene.sheet
         edges = edge_poses(world_from_sheet, sheet.width_m * (stretch or self.stretch))
-        predicted = estimate_sheet(
-            *edges,
-            height_m=sheet.height_m,
-            twist_world=np.zeros(6),
-            ahead_s=0.0,
-            finger_tip=tip,
-        )
+        predicted = estimate_sheet(*edges, height_m=sheet.height_m, finger_tip=tip)
         assert predicted is not None
         return predicted, solve_sheet(self.scene, *edges, tip)
 
@@ -263,13 +257,7 @@ def print_frames(scene: Scene) -> None:
         bench_stage = SceneRenderer(shown, context, spacing_m=0.0025, basis=basis)
         edges = edge_poses(np.eye(4), scene.sheet.width_m * 1.05)
         tip = np.array([0.0, 0.0, -0.03])
-        sheet = estimate_sheet(
-            *edges,
-            height_m=scene.sheet.height_m,
-            twist_world=np.zeros(6),
-            ahead_s=0.0,
-            finger_tip=tip,
-        )
+        sheet = estimate_sheet(*edges, height_m=scene.sheet.height_m, finger_tip=tip)
         assert sheet is not None
         wall, cpu = ({method: np.empty(ROUNDS) for method in METHODS} for _ in range(2))
         for method in METHODS:
@@ -286,7 +274,6 @@ def print_frames(scene: Scene) -> None:
                 median, floor = np.median(taken[method]), np.median(taken[METHODS[0]])
                 cells += [f"{1e3 * median:.1f}", f"{median / floor:.2f}"]
             row(f"{size[0]}x{size[1]}", method, *cells)
-        bench_stage.release()
     context.release()
 
 

@@ -33,8 +33,9 @@ from flexsheet.messages.scene import (
     Sphere,
 )
 from flexsheet.nodes.fem_solver.elasticity import quadrature, shape_gradients
-from flexsheet.nodes.fem_solver.mesh import SolidMesh, build_mesh, mesh_budget, mesh_spec
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh, estimate_node_count, mesh_spec
 from flexsheet.nodes.fem_solver.mesh.quality import min_jacobian_ratios, radius_ratios
+from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.models.shapes.triangles import volume_m3
 
@@ -113,14 +114,14 @@ def spacing_mm(mesh: SolidMesh) -> float:
 
 def measure(name: str, scene: Scene, spacing_m: float) -> None:
     spec = mesh_spec(scene, spacing_m)
-    budget = mesh_budget(spec)
+    estimated = estimate_node_count(spec, make_shape(dict(spec.geometry)))
     start = time.perf_counter()
     mesh = build_mesh(spec)
     took_s = time.perf_counter() - start
     wanted = volume_of(spec.geometry, spec.slab_depth_m)
     dihedral = np.degrees(min_dihedral_rad(mesh.nodes, mesh.elements).min())
     print(
-        f"| {name} | {1e3 * spacing_m:g} mm | {len(mesh.nodes)} ({budget.nodes})"
+        f"| {name} | {1e3 * spacing_m:g} mm | {len(mesh.nodes)} ({estimated})"
         f" | {len(mesh.elements)} | {len(mesh.skin)}, {len(mesh.contact_nodes)}"
         f" | {spacing_mm(mesh):.2f} mm | {took_s:.1f} s"
         f" | {radius_ratios(mesh.nodes, mesh.elements).min():.2f}"

@@ -34,7 +34,8 @@ from flexsheet.messages.scene import Scene, require_cylinder, require_material
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver import body, precompute, snapshots
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery, locate
-from flexsheet.nodes.fem_solver.mesh import SolidMesh, build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
+from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from flexsheet.nodes.fem_solver.table import TableSoftBody
@@ -180,9 +181,9 @@ def normal_forces(
     return np.array(forces)
 
 
-def print_progress(done: int, total: int, need: precompute.WorkBudget) -> None:
+def print_progress(done: int, total: int, need: str) -> None:
     """Print progress on one line."""
-    print(f"\r{100 * done // total:3d} % of {need.text()}", end="", file=sys.stderr, flush=True)
+    print(f"\r{100 * done // total:3d} % of {need}", end="", file=sys.stderr, flush=True)
 
 
 def evaluate_push(

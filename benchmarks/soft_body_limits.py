@@ -25,8 +25,9 @@ from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQue
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody
 from flexsheet.nodes.fem_solver.elasticity import element_stiffness
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import SolidMesh, build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.mesh.quality import min_jacobian_ratios
+from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, compute
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob, solve_snapshot

@@ -35,7 +35,8 @@ from flexsheet.messages.scene import Scene, require_cylinder, require_material
 from flexsheet.nodes.fem_solver.body import make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody, SkinResponse
-from flexsheet.nodes.fem_solver.mesh import SolidMesh, build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
+from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from flexsheet.nodes.fem_solver.snapshots import DEPTHS_M
 from flexsheet.nodes.fem_solver.table import LINEAR_DEPTHS_M, Table, TableSoftBody, table_bytes
 from flexsheet.nodes.models.shapes import Shape, make_shape

@@ -1,4 +1,4 @@
-"""Provide a scene, and messages as values and as frames, for the tests of the console."""
+"""Provide messages, as values and as frames, for the tests of the console."""
 
 from __future__ import annotations
 
@@ -6,20 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Status
 from flexsheet.messages.wire import encode
-from tests.scenes import load_cylinder
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def cylinder() -> Scene:
-    """Load the first scene of the demo."""
-    return load_cylinder()
-
-
 class FixedMessages:
-    """Source whose messages the test sets."""
+    """A message source whose messages the test sets."""
 
     def __init__(self, **messages: Message) -> None:
         self.held = {
@@ -29,6 +23,25 @@ class FixedMessages:
 
     def latest(self, name: str, kind: Any) -> Any:
         return self.held.get(name)
+
+
+def status_of(node: str, **changes: Any) -> Status:
+    """Return the status message of a running node."""
+    values: dict[str, Any] = {
+        "node": node,
+        "state": "running",
+        "pid": 1,
+        "uptime_s": 1.0,
+        "cpu_ratio": 0.25,
+        "resident_bytes": 1,
+        "inputs": (),
+        "outputs": (),
+        "errors": 0,
+        "last_error": "",
+        "note": "",
+        "plan_hash": "",
+    }
+    return Status(**values | changes)
 
 
 def frames_of(message: Message, sequence: int = 1) -> tuple[list[Any], Header]:

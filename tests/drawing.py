@@ -17,18 +17,14 @@ Floats = NDArray[np.float64]
 def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> SheetPose:
     """Return the scene's sheet, slightly stretched, with its middle at a pose (4, 4)."""
     sheet = estimate_sheet(
-        *edge_poses(pose, 1.05 * scene.sheet.width_m),
-        height_m=scene.sheet.height_m,
-        twist_world=np.zeros(6),
-        ahead_s=0.0,
-        finger_tip=tip,
+        *edge_poses(pose, 1.05 * scene.sheet.width_m), height_m=scene.sheet.height_m, finger_tip=tip
     )
     assert sheet is not None
     return sheet
 
 
 def follow(stage: SceneRenderer, displacement: Floats | None) -> None:
-    """Deform the scene renderer by a displacement (vertices, 3) of its own surface, or reset it."""
+    """Deform the drawn object by a displacement (vertices, 3) of its surface, or reset it."""
     if displacement is None:
         stage.deform(None)
         return
@@ -51,8 +47,7 @@ def body_of(displacement: Floats) -> SoftBody:
 
 
 def dent(stage: SceneRenderer, depth_m: float, place: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Return a displacement (vertices, 3) of the surface pushed from the front, with a fixed
-    back."""
+    """Return a displacement (vertices, 3) of the surface by a push from the front."""
     points = stage._surface.rest_world_m
     away = np.linalg.norm(points[:, :2] - np.array(place), axis=1)
     facing = np.clip(1.0 + points[:, 2] / 0.05, 0.0, 1.0)

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import splu
 from scipy.special import roots_jacobi
 
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import EDGES
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

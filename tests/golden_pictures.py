@@ -43,7 +43,7 @@ TIP = (TILTED @ [0.015, -0.01, -0.025, 1.0])[:3]
 
 
 def small_scene(name: str, **appearance: object) -> Scene:
-    """Make a scene with fewer pixels and optionally another appearance."""
+    """Make a scene with few pixels and, if given, another appearance."""
     scene = make_weightless(load_scene(SCENES / f"{name}.yaml"))
     projector, lens = scene.projector, scene.projector.lens
     sizes = {key: SHARE * getattr(lens, key) for key in ("fx_px", "fy_px")}
@@ -66,7 +66,7 @@ def small_scene(name: str, **appearance: object) -> Scene:
 def draw(
     context: moderngl.Context, scene: Scene, display: Display, sheet: SheetPose | None = None
 ) -> Image:
-    """Render a deformed object with both its marks."""
+    """Draw a deformed object with the marks of fingertip and target."""
     sheet = sheet_at(scene, np.eye(4)) if sheet is None else sheet
     dented = display.correction == "two_pass" and sheet.pushed_point is not None
     basis = few_dents() if dented else None
@@ -80,7 +80,6 @@ def draw(
         target_mark=stage.surface_point(np.array([-0.02, 0.012, 0.01])) if marked else None,
     )
     picture = stage.draw(display, sheet, look, read=True)
-    stage.release()
     assert picture is not None
     return picture
 

@@ -1,4 +1,4 @@
-"""Dent shapes for tests: fewer nodes than the renderer's, over less, solved once per run."""
+"""Deflection shapes of the sheet for tests, with fewer nodes and a smaller range than in use."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ SIZE = (800, 600)
 
 
 class VirtualDisplay:
-    """An Xvfb of 800 x 600 whose frame buffer is a file."""
+    """A virtual X display of 800 x 600 pixels, whose frame buffer is a file."""
 
     def __init__(self, folder: Path) -> None:
         reader, writer = os.pipe()
@@ -74,7 +74,7 @@ def display(tmp_path_factory: pytest.TempPathFactory) -> Iterator[VirtualDisplay
 
 
 class WindowBench(Bench):
-    """The renderer with a window on the virtual display."""
+    """A renderer with a window on the virtual display."""
 
     async def start(self) -> None:
         await self.node.setup()

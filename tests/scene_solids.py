@@ -9,7 +9,8 @@ import numpy as np
 import trimesh
 
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.fem_solver.mesh import SolidMesh, mesh_scene
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh, mesh_spec
+from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
 from tests.scenes import load_values
 
 SPACINGS_M = {"plane": 0.0075}
@@ -18,7 +19,7 @@ SHAPES = ("cylinder", "sphere", "ellipsoid", "rounded_box", "plane", "mesh")
 
 
 def geometry(shape: str) -> dict[str, Any]:
-    """Return an object of this shape, of a hand's size or smaller."""
+    """Return the geometry of an object with the size of a hand or smaller."""
     match shape:
         case "cylinder":
             return {"shape": shape, "radius_m": 0.0353553, "length_m": 0.06}
@@ -42,10 +43,10 @@ def geometry(shape: str) -> dict[str, Any]:
 
 @cache
 def scene_solid(shape: str) -> SolidMesh:
-    """Mesh the object as the solver does, with the support of the scene."""
+    """Return the mesh of a scene's object, as the solver makes it."""
     content = load_values()
     body = content["object"]
     body.pop("support_angle_rad", None)
     body["geometry"] = geometry(shape)
     body["support"] = {"kind": "strip", "angle_rad": 1.5}
-    return mesh_scene(Scene.model_validate(content), SPACINGS_M.get(shape, 0.006))
+    return build_mesh(mesh_spec(Scene.model_validate(content), SPACINGS_M.get(shape, 0.006)))

@@ -1,4 +1,4 @@
-"""Soft bodies for tests: specifications without a scene, and an executor without processes."""
+"""Provide specifications of soft bodies, and an executor without processes, for tests."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from flexsheet.messages.scene import Cylinder, StripSupport
-from flexsheet.nodes.fem_solver.mesh import MeshSpec
+from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec
 from flexsheet.nodes.fem_solver.precompute import SoftBodySpec
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.fem_solver.mesh import EDGES
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES, add_midside_nodes, orient_tetrahedra
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -28,24 +28,13 @@ def bricks(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> tuple[
         tetrahedra.append(
             np.column_stack([np.ravel_multi_index(tuple(part.T), shape) for part in path])
         )
-    corners = np.concatenate(tetrahedra)
-    volume = np.linalg.det(grid[corners[:, 1:]] - grid[corners[:, :1]])
-    corners[volume < 0] = corners[volume < 0][:, [0, 2, 1, 3]]
-    return quadratic(grid, corners)
+    return add_midside_nodes(grid, orient_tetrahedra(grid, np.concatenate(tetrahedra)))
 
 
 def box(divisions: tuple[int, int, int], sides: tuple[float, float, float]) -> tuple[Floats, Ints]:
     """Return a box cut into equal bricks."""
     x, y, z = (np.linspace(0, s, n + 1) for s, n in zip(sides, divisions, strict=True))
     return bricks(x, y, z)
-
-
-def quadratic(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
-    """Add the edge midpoints to four-node tetrahedra."""
-    pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
-    unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
-    nodes = np.concatenate([corners, corners[unique].mean(axis=1)])
-    return nodes, np.concatenate([tetrahedra, inverse.reshape(-1, 6) + len(corners)], axis=1)
 
 
 def distorted(nodes: Floats, elements: Ints) -> tuple[Floats, Ints]:

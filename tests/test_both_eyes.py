@@ -28,7 +28,7 @@ HORIZON_S = 0.03
 
 
 class Tracked:
-    """Head tracker at 60 Hz whose message arrives 10 ms after its measurement."""
+    """A head tracker at 60 Hz, whose message arrives 10 ms after its measurement."""
 
     def __init__(self) -> None:
         self.clock = VirtualClock(START_NS, clock_id="clock")
@@ -46,7 +46,7 @@ class Tracked:
         self.predictor.add(eye, header)
 
     def moving(self, velocity: np.ndarray, count: int, noise_m: float = 0.0) -> np.ndarray:
-        """Send a motion; return the true position at the end of the horizon."""
+        """Send a motion, and return the true position at the end of the horizon."""
         random = np.random.default_rng(1)
         first_ns = self.clock.now_ns() + PERIOD_NS - 10_000_000
         for number in range(count):

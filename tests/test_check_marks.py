@@ -12,7 +12,7 @@ from flexsheet.messages.apparatus import NOMINAL_DISPLAY_LATENCY_S, nominal_appa
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Display, Frame, StereoMode, StereoPair, TwinArms
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
-from flexsheet.nodes.renderer.check_marks import intersect
+from flexsheet.nodes.models.shapes.triangles import intersect_rays
 from flexsheet.nodes.renderer.node import Renderer
 from flexsheet.nodes.renderer.parameters import RendererParameters
 from flexsheet.nodes.triangulator.node import Triangulator
@@ -126,7 +126,7 @@ def test_without_marks_the_simulator_and_the_triangulator_do_not_read_frames() -
 def test_rays_hit_the_nearest_point_of_their_triangle_or_nothing() -> None:
     square = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]], float)
     rays = np.array([[0.2, 0.3, -1.0], [0.7, 0.8, -1.0], [3.0, 0.0, -1.0]])
-    triangles, weights = intersect(np.array([0.0, 0.0, 1.0]), rays, square)
+    triangles, weights = intersect_rays(np.array([0.0, 0.0, 1.0]), rays, square)
     points = np.einsum("nk,nki->ni", weights, square[triangles])
     np.testing.assert_allclose(points[:2], [[0.2, 0.3, 0.0], [0.7, 0.8, 0.0]], atol=1e-12)
     assert np.isnan(points[2]).all()

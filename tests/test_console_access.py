@@ -127,7 +127,7 @@ def test_the_page_is_served_with_our_title_style_and_script(packed: bool) -> Non
 
 
 class LogLines(logging.Handler):
-    """Handler that stores its lines."""
+    """A log handler that stores the lines."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -140,7 +140,7 @@ class LogLines(logging.Handler):
 
 @pytest.fixture(scope="module")
 def page_server() -> Iterator[tuple[int, LogLines]]:
-    """Start a page; yield its port and its server's log."""
+    """Start a page, and yield its port and the lines of its log."""
     lines = LogLines()
     for logger in (make_page_logger(), logging.getLogger("websockets.server")):
         logger.addHandler(lines)
@@ -152,7 +152,7 @@ def page_server() -> Iterator[tuple[int, LogLines]]:
 
 
 async def answer_to(port: int, sent: bytes) -> tuple[int, dict[str, str]]:
-    """Send bytes; return the status and the headers (lower case) of the answer."""
+    """Send bytes, and return the status and the headers (in lower case) of the response."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     writer.write(sent)
     async with asyncio.timeout(DEADLINE_S):

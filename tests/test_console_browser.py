@@ -20,14 +20,15 @@ from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.console import panels
 from flexsheet.nodes.console.access_control import AccessControl, start_server
 from flexsheet.nodes.console.banner import GraphState
-from flexsheet.nodes.console.controller import Sliders
 from flexsheet.nodes.console.history import History
 from flexsheet.nodes.console.page import Page
+from flexsheet.nodes.console.state_file import Sliders
 from tests.arm_states import arm_state
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
-from tests.console_parts import FixedMessages, cylinder
+from tests.console_parts import FixedMessages, status_of
 from tests.fingertips import fingertip
-from tests.test_console_words import port, status
+from tests.scenes import load_cylinder
+from tests.test_console_words import port
 from tests.waiting import DEADLINE_S
 
 pytestmark = BROWSER_MARKS
@@ -48,7 +49,7 @@ INKED_POINTS = """() => {
 
 @dataclass
 class PageVisit:
-    """Results of one visit to the page."""
+    """The results of one visit to the page."""
 
     title: str = ""
     ran: list[Any] = field(default_factory=list)
@@ -74,14 +75,14 @@ async def browser_tab() -> AsyncIterator[BrowserTab]:
 
 
 async def show_names_with_markup(page: Page, tab: BrowserTab, found: PageVisit) -> None:
-    """Put markup into every name and text that others define."""
-    scene = cylinder().model_copy(update={"name": MARKUP})
+    """Put HTML markup into every name and text that the page shows."""
+    scene = load_cylinder().model_copy(update={"name": MARKUP})
     faulty = {"left": arm_state("left", mode="fault", faults=(MARKUP,), reason=MARKUP)}
     page.touch.show_scene(scene, scene, (MARKUP, "other"), Sliders.from_scene(scene))
     page.show_problem(MARKUP)
     page.record.show_bags((f"{MARKUP}.mcap",))
     page.record.show_state(panels.recorder(MARKUP, (MARKUP,)), recording=True)
-    broken = status(MARKUP, note=MARKUP, errors=1, last_error=MARKUP, outputs=(port("stereo"),))
+    broken = status_of(MARKUP, note=MARKUP, errors=1, last_error=MARKUP, outputs=(port("stereo"),))
     statuses = {MARKUP: (broken, 0.0)}
     tables = panels.make_topics_table(statuses) + panels.make_nodes_table(statuses)
     page.graph.show(tables, History().columns())
@@ -152,7 +153,7 @@ async def draw_a_single_sample(page: Page, tab: BrowserTab, found: PageVisit) ->
 
 
 class FramingPage(BaseHTTPRequestHandler):
-    """Page of another site that shows the console in a frame."""
+    """A page of another site that shows the console in a frame."""
 
     def __init__(self, inner: str, *arguments: Any) -> None:
         self._inner = inner
@@ -168,11 +169,11 @@ class FramingPage(BaseHTTPRequestHandler):
         self.wfile.write(body.encode())
 
     def log_message(self, *_: Any) -> None:
-        """Write nothing."""
+        """Suppress the log of the server."""
 
 
 async def open_in_frames(url: str, tab: BrowserTab, found: PageVisit) -> None:
-    """Open the console in pages of another origin, and record its answers."""
+    """Open the console in frames of another site's page, and record the responses."""
     site = ThreadingHTTPServer(("127.0.0.1", 0), partial(FramingPage, url))
     Thread(target=site.serve_forever, daemon=True).start()
     try:
@@ -224,8 +225,7 @@ def test_markup_in_names_is_shown_as_text_and_not_run(found: PageVisit) -> None:
 
 
 def test_nothing_moves_while_texts_change(found: PageVisit) -> None:
-    """ "unconfirmed" is shorter than a position, which moved the sliders below while a user dragged
-    one."""
+    """Earlier, a shorter text about the finger moved the sliders while a user dragged one."""
     assert len(found.slider_boxes) > 3
     assert len({str(box) for box in found.slider_boxes.values()}) == 1, found.slider_boxes
     assert len(found.stop_boxes) == 5

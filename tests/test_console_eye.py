@@ -1,4 +1,4 @@
-"""Test the view from the user's eye, and its reset."""
+"""Test the requests for eye views, and the display settings after them."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from flexsheet.nodes.console.controller import (
     EyeViewState,
 )
 from flexsheet.nodes.console.finger import FingerController
-from tests.console_parts import cylinder
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return cylinder()
+    return load_cylinder()
 
 
 def test_looking_puts_back_what_another_had_set(scene: Scene) -> None:
@@ -126,7 +126,7 @@ def frame(label: str, *, pixels: bool = True) -> Frame:
 
 
 def test_a_slow_image_is_still_shown(scene: Scene) -> None:
-    """On a busy computer each image came after the next request, and none was shown."""
+    """On a busy computer, an image may arrive after the next request."""
     sent: list[Message] = []
     eye_view = EyeViewRequester(sent.append, scene)
     eye_view.enabled = True

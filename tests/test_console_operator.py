@@ -1,4 +1,4 @@
-"""Test that the page agrees with the node's state after any request."""
+"""Test that the page shows the state of the node after each request."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.types import Display, FingerPath, Recording, Status
+from flexsheet.messages.types import Display, FingerPath, Recording
 from flexsheet.nodes.console.access_control import AccessControl, start_server
 from flexsheet.nodes.console.controller import (
     MAX_DRAWING_S,
@@ -26,8 +26,9 @@ from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.latest_messages import LatestMessages
 from flexsheet.nodes.console.operator import Operator
-from flexsheet.nodes.console.touch_tab import LIFT, LOWER
-from tests.console_parts import cylinder
+from flexsheet.nodes.console.tabs import LIFT, LOWER
+from tests.console_parts import status_of
+from tests.scenes import load_cylinder
 
 EYE = np.array([0.1, 0.05, 0.5])
 TICK_S = 0.04
@@ -35,7 +36,7 @@ TICK_S = 0.04
 
 @dataclass
 class Bench:
-    """Page without a viewer, and the messages of its node."""
+    """A page without a viewer, and the messages that its node has sent."""
 
     operator: Operator
     bags: Path
@@ -51,7 +52,7 @@ class Bench:
         return self.operator._page.record._bag
 
     def run(self, seconds: float = 20.0) -> None:
-        """Let time pass as the node does."""
+        """Advance the time in steps of the node's period."""
         end_s = self.now_s + seconds
         while self.now_s < end_s:
             self.now_s += TICK_S
@@ -59,7 +60,7 @@ class Bench:
         self.operator.refresh_tables(self.now_s)
 
     async def change_scene(self, name: str, value: float) -> None:
-        """Move one of the scene's sliders, and wait until the new object is ready."""
+        """Move a slider of the scene, and wait until the new object is ready."""
         self.operator.handle_request("slide", name, value)
         self.run(2.0 * SETTLE_S)
         await self.know_object()
@@ -88,7 +89,7 @@ class Bench:
 @pytest.fixture
 async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     (tmp_path / "plan.json").write_text(
-        json.dumps({"scene": json.loads(cylinder().model_dump_json())})
+        json.dumps({"scene": json.loads(load_cylinder().model_dump_json())})
     )
     files = ConsoleFiles(
         tmp_path / "plan.json", tmp_path, tmp_path / "bags", tmp_path / "kept.json"
@@ -194,24 +195,9 @@ async def test_own_display_messages_are_known_by_their_writer(
 
 async def test_notes_come_from_the_nodes_of_the_plan_with_any_names(bench: Bench) -> None:
     for name, note in (("tape", "recording to a.mcap"), ("body", "meshes, 3 s left")):
-        bench.operator.on_message(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
+        bench.operator.on_message(
+            status_of(name, note=note), Header(1, 1, 1, "clock", name, 1), 0.0
+        )
     bench.run(0.5)
-    assert "recording to a.mcap" in bench.operator._page.record._text._shown
-    assert "meshes, 3 s left" in bench.operator._page._state._shown
-
-
-def status(node: str, note: str) -> Status:
-    return Status(
-        node=node,
-        state="running",
-        pid=1,
-        uptime_s=1.0,
-        cpu_ratio=0.0,
-        resident_bytes=0,
-        inputs=(),
-        outputs=(),
-        errors=0,
-        last_error="",
-        note=note,
-        plan_hash="",
-    )
+    assert "recording to a.mcap" in bench.operator._page.record._text.content
+    assert "meshes, 3 s left" in bench.operator._page._state.content

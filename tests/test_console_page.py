@@ -1,9 +1,10 @@
-"""Test the page in a browser by real clicks, drags and keys, and the graph's reaction."""
+"""Test the page and the graph by clicks, drags and keys in a browser."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import shutil
 import socket
 import tempfile
@@ -45,7 +46,7 @@ pytestmark = BROWSER_MARKS
 
 @dataclass
 class ReceivedMessages:
-    """Messages of the graph by topic, in order."""
+    """The received messages of the graph by topic, in order."""
 
     messages: dict[str, list[Any]] = field(default_factory=dict)
     fingers_on_first_object: int = 0
@@ -95,7 +96,7 @@ def free_port() -> int:
 
 @dataclass
 class PageVisit:
-    """Results of one visit to the page."""
+    """The results of one visit to the page."""
 
     inbox: ReceivedMessages
     bag: Path
@@ -105,7 +106,7 @@ class PageVisit:
 
 
 async def refused(port: int, **headers: str) -> str:
-    """Return the answer to a connection to the page's socket with such headers."""
+    """Return the response to a WebSocket request with the given headers."""
     try:
         async with websockets.connect(
             f"ws://127.0.0.1:{port}", additional_headers=headers, open_timeout=DEADLINE_S
@@ -116,7 +117,7 @@ async def refused(port: int, **headers: str) -> str:
 
 
 async def slide(page: Page, label: str, value: str) -> None:
-    """Enter the number beside a slider by keyboard."""
+    """Enter a value in the number field of a slider."""
     box = page.get_by_role("textbox", name=label)
     await box.fill(value)
     await box.press("Enter")
@@ -209,11 +210,14 @@ async def change_the_scene(page: Page, inbox: ReceivedMessages) -> None:
 
 
 async def stop_and_release(page: Page, inbox: ReceivedMessages) -> None:
+    reset = page.get_by_role("button", name="Reset the fault")
+    await expect(reset).to_have_attribute("title", re.compile("^Disabled, because no e-stop"))
     await page.get_by_role("button", name="E-STOP").click()
     await inbox.until(lambda: engaged(inbox) == "pressed at the console", "an e-stop")
     await expect(page.get_by_role("status")).to_contain_text("E-STOP is engaged")
     release = page.get_by_role("button", name="Release")
     await expect(release).to_be_enabled()
+    await expect(release).to_have_attribute("title", re.compile("The arms must be at rest"))
     await release.press("Enter")
     await inbox.until(lambda: engaged(inbox) is None, "a release")
     # viser heeds no hotkey while a text box has the focus.
@@ -253,7 +257,7 @@ def engaged(inbox: ReceivedMessages) -> str | None:
 
 @pytest.fixture(scope="module")
 def session() -> Any:
-    """Visit the page once for all tests, since a browser starts slowly."""
+    """Visit the page once for all tests, because a browser starts slowly."""
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(runs.ROOT_VARIABLE, str(folder / "runs"))

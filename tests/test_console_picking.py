@@ -1,4 +1,4 @@
-"""Test the meaning of the pointer, and the path of the finger."""
+"""Test the selection of points on the object, and the path of the finger."""
 
 from __future__ import annotations
 
@@ -20,19 +20,22 @@ from flexsheet.messages.types import (
 from flexsheet.nodes.console.controller import SceneController
 from flexsheet.nodes.console.finger import FingerController, FingerIntent, Ray
 from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
-from tests.console_parts import cylinder
 from tests.plans import scene_with
+from tests.scenes import load_cylinder
 from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
 
 
-AIMS = [SurfacePicker(cylinder()), SurfacePicker(scene_with({"shape": "sphere", "radius_m": 0.04}))]
+AIMS = [
+    SurfacePicker(load_cylinder()),
+    SurfacePicker(scene_with({"shape": "sphere", "radius_m": 0.04})),
+]
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return cylinder()
+    return load_cylinder()
 
 
 def test_the_mouse_means_a_point_below_the_surface_or_beside_it(scene: Scene) -> None:
@@ -80,7 +83,9 @@ def test_the_finger_goes_round_the_object_and_not_through_it(scene: Scene) -> No
 
 
 def moved(finger: FingerController, sent: list[FingerPath]) -> Floats:
-    """Return the finger (3,) after it has stopped; each step is within its speed."""
+    """Advance the finger until it stops, and return its position (3,). Each step obeys the speed
+    limit.
+    """
     for _ in range(200):
         count = len(sent)
         finger.advance(0.05, None)
@@ -93,13 +98,13 @@ def moved(finger: FingerController, sent: list[FingerPath]) -> Floats:
 
 
 def depth_m(scene: Scene, point: Floats) -> float:
-    """Return the depth of a point in the cylinder's side."""
+    """Return the depth (m) of a point below the side of the cylinder."""
     away = (point - scene.object.world_from_object.position_m)[1:]
     return float(scene.object.geometry.radius_m - np.linalg.norm(away))  # type: ignore[union-attr]  # a cylinder
 
 
 def test_the_requested_push_survives_scenes_and_lifting(scene: Scene) -> None:
-    """The push was lost with each new scene, and by lifting the finger."""
+    """Earlier, a new scene or lifting the finger reset the push depth."""
     sent: list[FingerPath] = []
     finger = FingerController(sent.append, speed_m_per_s=0.1)  # type: ignore[arg-type]  # it sends no other
     finger.use(SurfacePicker(scene))

@@ -1,4 +1,4 @@
-"""Test the plan of a console."""
+"""Test the plan of a graph with a console."""
 
 from __future__ import annotations
 
@@ -77,6 +77,6 @@ def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path
 
 
 def test_a_requested_image_has_the_priority_of_a_frame() -> None:
-    """On two busy cores the first image of the Eye tab took a minute and a half."""
+    """With a lower priority, the first eye view took 90 s on two busy cores."""
     nodes = load_graph(ROOT / "launch" / "demo.yaml", console=True).nodes
     assert nodes["twin_eye"].nice <= nodes["renderer"].nice

@@ -20,15 +20,15 @@ from flexsheet.messages.types import (
 )
 from flexsheet.nodes.console.controller import Replay
 from flexsheet.nodes.console.replay import Timeline, list_bags
-from tests.console_parts import cylinder
 from tests.fingertips import fingertip
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return cylinder()
+    return load_cylinder()
 
 
 @pytest.fixture

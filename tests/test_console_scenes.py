@@ -26,8 +26,10 @@ from flexsheet.nodes.console.controller import (
 )
 from flexsheet.nodes.console.finger import FingerController, FingerIntent
 from flexsheet.nodes.console.picking import SurfacePicker
-from tests.console_parts import ROOT, cylinder
+from flexsheet.nodes.console.state_file import ConsoleState, Sliders, load_state, save_state
+from tests.console_parts import ROOT
 from tests.plans import scene_with
+from tests.scenes import load_cylinder
 
 Floats = NDArray[np.float64]
 SCENES = ROOT / "launch" / "scenes"
@@ -35,7 +37,7 @@ SCENES = ROOT / "launch" / "scenes"
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return cylinder()
+    return load_cylinder()
 
 
 SOLIDS: list[dict[str, Any]] = [
@@ -83,7 +85,7 @@ def test_values_that_make_no_scene_are_rejected(scene: Scene, name: str, value: 
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
 def test_the_tension_ends_where_the_arms_would_stop(path: Path) -> None:
-    """At more than 8 % the arms of the demo stopped, and the scene's own limit was raised."""
+    """At more than 8 % of stretch, the edge force would exceed the limit of the arms."""
     scene = load_scene(path)
     limit = scenes.max_stretch_ratio(scene)
     tight = scenes.edit_scene(
@@ -115,6 +117,15 @@ async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path)
     with pytest.raises(scenes.SceneChoiceError):
         controller.apply_sliders(31.0)
     assert len(sent) == 2
+
+
+def test_the_sliders_of_a_rigid_object_are_saved(scene: Scene, tmp_path: Path) -> None:
+    rigid = scene.model_copy(update={"object": scene.object.model_copy(update={"material": None})})
+    state = ConsoleState(base=rigid, sliders=Sliders.from_scene(rigid))
+    save_state(tmp_path / "state.json", state)
+    loaded = load_state(tmp_path / "state.json")
+    assert loaded is not None
+    assert loaded.sliders == state.sliders
 
 
 def test_a_restarted_console_restores_its_state(scene: Scene, tmp_path: Path) -> None:

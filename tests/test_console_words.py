@@ -8,17 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexsheet.messages.types import ArmState, PortStatus, Status
+from flexsheet.messages.types import ArmState, PortStatus
 from flexsheet.nodes.console import banner, html_head, panels
 from flexsheet.nodes.console.banner import BannerState, GraphState
 from flexsheet.nodes.console.controller import EyeViewState
-from flexsheet.nodes.console.graph_tab import max_latency_ms
 from flexsheet.nodes.console.history import SERIES, WINDOW_S, History, widen_isolated
 from flexsheet.nodes.console.page import STOP_COLOR
-from flexsheet.nodes.console.record_tab import RECORDING_COLOR
+from flexsheet.nodes.console.tabs import RECORDING_COLOR, max_latency_ms
 from tests.arm_states import arm_state
 from tests.colours import luminance
-from tests.console_parts import FixedMessages
+from tests.console_parts import FixedMessages, status_of
 from tests.fingertips import fingertip
 
 PAGE_STYLE = (html_head.HERE / "page.css").read_text()
@@ -37,31 +36,15 @@ def port(topic: str, **changes: Any) -> PortStatus:
     return PortStatus(**values | changes)
 
 
-def status(node: str, **changes: Any) -> Status:
-    values: dict[str, Any] = {
-        "node": node,
-        "state": "running",
-        "pid": 1,
-        "uptime_s": 1.0,
-        "cpu_ratio": 0.25,
-        "resident_bytes": 1,
-        "inputs": (),
-        "outputs": (),
-        "errors": 0,
-        "last_error": "",
-        "note": "",
-        "plan_hash": "",
-        "clock_id": "here",
-    }
-    return Status(**values | changes)
-
-
 def test_tables_name_faults() -> None:
     statuses = {
-        "camera": (status("camera", outputs=(port("stereo", rate_hz=3.0), port("eye"))), 0.5),
-        "planner": (status("planner", inputs=(port("stereo", dropped=7, gaps=2, rejected=1),)), 0),
-        "left": (status("left", state="degraded", errors=2, last_error="<b>bang</b>"), 0.0),
-        "right": (status("right", outputs=(port("frame", rate_hz=0.0),)), 9.0),
+        "camera": (status_of("camera", outputs=(port("stereo", rate_hz=3.0), port("eye"))), 0.5),
+        "planner": (
+            status_of("planner", inputs=(port("stereo", dropped=7, gaps=2, rejected=1),)),
+            0,
+        ),
+        "left": (status_of("left", state="degraded", errors=2, last_error="<b>bang</b>"), 0.0),
+        "right": (status_of("right", outputs=(port("frame", rate_hz=0.0),)), 9.0),
     }
     topics, nodes = panels.make_topics_table(statuses), panels.make_nodes_table(statuses)
     assert "1 refused" in topics
@@ -72,9 +55,9 @@ def test_tables_name_faults() -> None:
     assert "2 errors: &lt;b&gt;bang" in nodes
     assert "silent for 9 s" in nodes
     assert ">25<" in nodes, "the share of a core, %"
-    quiet = {"camera": (status("camera", outputs=(port("stereo", rate_hz=0.0),)), 0.5)}
+    quiet = {"camera": (status_of("camera", outputs=(port("stereo", rate_hz=0.0),)), 0.5)}
     assert "silent" in panels.make_topics_table(quiet)
-    slow = {"camera": (status("camera", outputs=(port("stereo", rate_hz=3.0),)), 0.5)}
+    slow = {"camera": (status_of("camera", outputs=(port("stereo", rate_hz=3.0),)), 0.5)}
     assert "slow" in panels.make_topics_table(slow)
 
 
@@ -178,8 +161,10 @@ def test_names_with_markup_are_shown_as_text() -> None:
         rendered(scene=evil, replay=evil, estop_reason=evil),
         rendered(arms=arms_in(mode="fault", faults=(evil,), reason=evil)),
         rendered(arms=blocked, overload=evil, solver_note=evil),
-        panels.make_nodes_table({evil: (status(evil, note=evil, errors=1, last_error=evil), 0.0)}),
-        panels.make_topics_table({evil: (status(evil, outputs=(port("stereo"),)), 0.0)}),
+        panels.make_nodes_table(
+            {evil: (status_of(evil, note=evil, errors=1, last_error=evil), 0.0)}
+        ),
+        panels.make_topics_table({evil: (status_of(evil, outputs=(port("stereo"),)), 0.0)}),
         panels.problem(evil),
         panels.recorder(evil, (evil,)),
     ):

@@ -1,4 +1,4 @@
-"""Test equations (1)-(6): their validity on planes and on the pushed sheet, and their limits."""
+"""Test equations (1)-(6) of the paper on planes and on the pushed sheet, and their limits."""
 
 from __future__ import annotations
 
@@ -36,8 +36,7 @@ def tilted(tilt_x: float, tilt_y: float, centre: np.ndarray) -> ScreenPlane:
 
 
 def seen_at(on_screen: np.ndarray, screen_point: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Return the visible point on z = 0 of light sent through `on_screen` and reflected by a
-    plane."""
+    """Return the point on z = 0 at which the eye sees light that a plane reflects."""
     ray = on_screen - PROJECTOR
     share = ((screen_point - PROJECTOR) @ normal) / (ray @ normal)
     return on_imaginary_screen(PROJECTOR + share[:, None] * ray, EYE)

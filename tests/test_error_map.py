@@ -1,4 +1,4 @@
-"""Test the dense error map of the image: zero without errors, and known displacements."""
+"""Test the map of the image error for perfect and for displaced images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SCALE_M = 0.0007
 
 
 def painted(places: NDArray[np.float64]) -> Image:
-    """Render a pattern of positions (rows, columns) m; black for NaN."""
+    """Draw positions (rows, columns), m, as colours, and NaN as black."""
     phase = 2.0 * np.pi * places / PERIOD_M
     coarse = 0.2 + 0.8 * (places / RANGE_M + 0.5)
     colours = np.stack([0.5 + 0.5 * np.cos(phase), 0.5 + 0.5 * np.sin(phase), coarse], axis=-1)
@@ -61,8 +61,7 @@ def test_blended_colours_are_left_out() -> None:
 
 
 def test_the_renderer_paints_what_the_twin_reads() -> None:
-    """The error is zero on an unpushed sheet, and constant on a sheet that was displaced
-    unnoticed."""
+    """The error is zero on an undeflected sheet, and constant on a displaced sheet."""
     stage = SceneRenderer(SCENE, headless_context(), spacing_m=0.005)
     sheet = SCENE.sheet
     rubber = TrueRubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
@@ -90,4 +89,3 @@ def test_the_renderer_paints_what_the_twin_reads() -> None:
     x, y = mean_error_mm(0.01)
     assert x == pytest.approx(0.0, abs=0.05)
     assert y == pytest.approx(-2.5, abs=0.3)
-    stage.release()

@@ -1,4 +1,4 @@
-"""Test the soft body's method family, the data of the chart."""
+"""Test the benchmark of the soft-body methods."""
 
 from __future__ import annotations
 

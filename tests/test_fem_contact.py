@@ -1,4 +1,4 @@
-"""Test the fingertip's contact with the soft body: smooth, unique, bounded."""
+"""Test the contact of the fingertip with the soft body: smoothness, uniqueness and bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Test the computation of a table by workers of a scheduler: real processes on loopback."""
+"""Test the computation of a table by the workers of a dask scheduler in real processes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 
 from flexsheet.nodes.cache import CheckpointStore
 from flexsheet.nodes.fem_solver.dask_executor import SchedulerError, connect_workers
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from flexsheet.nodes.fem_solver.precompute_table import LostWorkersError, solve_all
 from flexsheet.nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
 from tests.solids import box
@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 class Lab:
-    """Scheduler of `distributed`, with workers that are started one by one."""
+    """A scheduler of `distributed`, with workers that are started one by one."""
 
     def __init__(self) -> None:
         with socket.socket() as probe:

@@ -17,7 +17,7 @@ from flexsheet.nodes.fem_solver.closest_contact import (
 )
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom
-from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.precompute import (
     SoftBodyModel,
     compute,
@@ -104,7 +104,7 @@ def test_the_friction_force_is_proportional_to_the_drag(body: LinearSoftBody) ->
 
 
 def test_sticking_is_smooth_in_depth_and_drag(body: LinearSoftBody) -> None:
-    """The push is tilted: downwards and sideways simultaneously, from the first contact."""
+    """Push downwards and sideways at the same time, from the first contact."""
     way = np.linspace(0.0, 0.006, 400)
     answers = [body.respond(push(d, (0.5 * d, 0.0, 0.0))) for d in way]
     moves = [

@@ -10,15 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from benchmarks.external_solvers import scikit_basis
 from flexsheet.nodes.fem_solver.elasticity import (
     SolidMeshError,
-    degrees_of_freedom,
     element_stiffness,
 )
 from flexsheet.nodes.fem_solver.hyperelastic import InvertedElementError, NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import EDGES, boundary_faces
 from flexsheet.nodes.fem_solver.multifrontal import IndefiniteError, NestedDissection
-from tests.linear_elasticity import solve, stiffness_matrix
 from tests.solids import box, distorted
 
 Floats = NDArray[np.float64]
@@ -63,24 +61,6 @@ def test_small_strains_are_hookes_law() -> None:
     assert np.abs(solid.tangents(np.zeros_like(solid.nodes)) - hooke).max() < 1e-10 * hooke.max()
 
 
-def test_a_patch_carries_a_large_uniform_deformation_exactly() -> None:
-    solid = block((3, 3, 3))
-    gradient = np.array([[1.3, 0.4, 0.0], [-0.2, 0.8, 0.1], [0.1, 0.0, 1.1]])
-    forces = solid.forces(solid.nodes @ (gradient - np.eye(3)).T)
-    surface = np.unique(boundary_faces(solid.elements))
-    inner = np.setdiff1d(np.arange(len(solid.nodes)), surface)
-    assert len(inner) > 20
-    assert np.abs(forces[inner]).max() < 1e-12 * np.abs(forces).max()
-    # energy and stress of the closed form
-    ratio = np.linalg.det(gradient)
-    density = 0.5 * MU * (np.square(gradient).sum() - 3) - MU * np.log(ratio)
-    density += 0.5 * LAME * np.log(ratio) ** 2
-    assert solid.energy(solid.nodes @ (gradient - np.eye(3)).T) == pytest.approx(density, rel=1e-12)
-    stress = MU * gradient + (LAME * np.log(ratio) - MU) * np.linalg.inv(gradient).T
-    virtual = np.einsum("ni,nj->ij", forces, solid.nodes)
-    assert np.abs(virtual - stress).max() < 1e-12 * np.abs(stress).max()
-
-
 def test_turning_the_body_costs_nothing() -> None:
     solid = block()
     angle = 2.0
@@ -113,21 +93,6 @@ def test_a_squeezed_volume_costs_ever_more(nu: float) -> None:
     assert (np.diff(energies) > 0).all()
 
 
-def test_dissection_solves_as_the_sparse_factor() -> None:
-    solid = block((4, 3, 5))
-    fixed = solid.nodes[:, 2] == 0.0
-    matrices = solid.tangents(np.zeros_like(solid.nodes))
-    loads = np.random.default_rng(3).normal(size=(solid.nodes.size, 2))
-    got = NestedDissection(solid.nodes, solid.elements, fixed).factor(matrices).solve(loads)
-    whole = stiffness_matrix(
-        solid.nodes, solid.elements, young_modulus_pa=MODULUS, poisson_ratio=NU
-    )
-    held = degrees_of_freedom(np.flatnonzero(fixed))
-    for column in range(2):
-        wanted = solve(whole, held, np.zeros(len(held)), loads[:, column])
-        assert np.abs(got[:, column] - wanted).max() < 1e-10 * np.abs(wanted).max()
-
-
 def test_a_stiffness_that_does_not_resist_is_an_error() -> None:
     solid = block((3, 2, 2))
     order = NestedDissection(solid.nodes, solid.elements, solid.nodes[:, 2] == 0.0)
@@ -135,34 +100,8 @@ def test_a_stiffness_that_does_not_resist_is_an_error() -> None:
         order.factor(-solid.tangents(np.zeros_like(solid.nodes)))
 
 
-def their_basis(nodes: Floats, elements: Ints) -> tuple[Any, Ints]:
-    """Return scikit-fem's quadratic basis on a straight mesh, and our degree of freedom for each of
-    its.
-
-    The quadrature is equal, so that only the assembly differs.
-    """
-    import skfem
-    from scipy.spatial import cKDTree
-
-    from flexsheet.nodes.fem_solver.elasticity import quadrature
-
-    corners = np.unique(elements[:, :4])
-    mesh = skfem.MeshTet(nodes[corners].T, np.searchsorted(corners, elements[:, :4]).T)
-    points, weights = quadrature()
-    basis = skfem.Basis(
-        mesh, skfem.ElementVector(skfem.ElementTetP2()), quadrature=(points.T, weights)
-    )
-    distance, node = cKDTree(nodes).query(basis.doflocs.T)
-    assert distance.max() < 1e-12
-    axis = np.empty(len(node), dtype=np.int64)
-    for names in (basis.nodal_dofs, basis.edge_dofs):
-        for number, dofs in enumerate(names):
-            axis[dofs] = number
-    return basis, 3 * node + axis
-
-
 def test_nonlinear_forces_tangent_and_solution_equal_those_of_scikit_fem() -> None:
-    """A block fixed at its bottom is deformed sideways by its weight at large strains."""
+    """Deform a block, fixed at its bottom, sideways by body forces at large strains."""
     import skfem
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
@@ -170,7 +109,7 @@ def test_nonlinear_forces_tangent_and_solution_equal_those_of_scikit_fem() -> No
 
     nodes, elements = box((1, 2, 2), (1.0, 1.0, 2.0))
     solid = NeoHookeanSolid(nodes, elements, young_modulus_pa=MODULUS, poisson_ratio=NU)
-    basis, order = their_basis(nodes, elements)
+    basis, order = scikit_basis(skfem, nodes, elements)
 
     def stress(state: Any) -> Any:
         gradient = grad(state) + identity(grad(state))
@@ -227,8 +166,3 @@ def test_nonlinear_forces_tangent_and_solution_equal_those_of_scikit_fem() -> No
             -1, 3
         )
     assert np.abs(moved - there).max() < 1e-8 * np.abs(there).max()
-
-
-def test_quadratic_edges_are_those_of_scikit_fem() -> None:
-    nodes, elements = box((1, 1, 1), (1.0, 1.0, 1.0))
-    assert np.allclose(nodes[elements[:, 4:]], nodes[elements[:, EDGES]].mean(axis=2))

@@ -1,4 +1,4 @@
-"""Test the limits of the soft body's methods: rejected, flagged, or still answered."""
+"""Test the limits of the soft-body methods: errors, range flags and bounded results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from benchmarks.soft_body_limits import (
 from flexsheet.messages.scene import BaseSupport, Sphere
 from flexsheet.nodes.fem_solver.body import state_force_error_ratio
 from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
-from flexsheet.nodes.fem_solver.mesh import MeshSpec
+from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec
 from flexsheet.nodes.models import rigid
 from tests.soft_bodies import cylinder_spec
 
@@ -34,7 +34,7 @@ def body() -> Body:
 
 
 def test_a_skin_coarser_than_the_fingertip_is_rejected() -> None:
-    """Its force would be more than twice too large without a flag."""
+    """Without this check, the force would be more than twice too large."""
     with pytest.raises(ValueError, match=r"skin_spacing_m: 0.005 .* finger.radius_m \(0.0045\)"):
         make_body(cylinder(finger_m=0.0045))
 
@@ -60,8 +60,7 @@ def test_two_supports_hold_and_one_point_is_rejected(body: Body) -> None:
 
 
 def test_a_finger_that_jumps_is_answered_where_it_is(body: Body) -> None:
-    """The result is that of the new position, within a right angle of the old one, without
-    inversion."""
+    """After a jump by less than a right angle, the response is that of the new position."""
     rng = np.random.default_rng(7)
     jumped: ContactAnchor | None = None
     for _ in range(40):

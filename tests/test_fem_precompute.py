@@ -1,4 +1,4 @@
-"""Test the precomputation and its cache: correct and atomic."""
+"""Test the precomputed response and its cache."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ import pytest
 from flexsheet.nodes.cache import CheckpointStore, default_cache_dir, load_cached, save_cached
 from flexsheet.nodes.fem_solver import precompute
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom
-from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
 from flexsheet.nodes.fem_solver.precompute import (
     Interrupted,
-    ResponseBudget,
     SoftBodyModel,
     compute,
     compute_budget,
@@ -32,7 +31,7 @@ from tests.soft_bodies import cylinder_spec
 SPEC = cylinder_spec(0.02, 0.06, touch_angle_rad=1.2, skin_spacing_m=0.005)
 
 
-def quiet(done: int, total: int, need: ResponseBudget) -> None:
+def quiet(done: int, total: int, need: str) -> None:
     pass
 
 
@@ -79,7 +78,7 @@ def test_a_kept_model_comes_back_the_same(model: SoftBodyModel, tmp_path: Path) 
 def test_the_second_start_computes_nothing(model: SoftBodyModel, tmp_path: Path) -> None:
     save_cached(response_cache(SPEC), tmp_path, model)
 
-    def refuse(done: int, total: int, need: ResponseBudget) -> None:
+    def refuse(done: int, total: int, need: str) -> None:
         raise AssertionError("computed although it was kept")
 
     assert same(load_or_compute(SPEC, tmp_path, refuse), model)
@@ -150,7 +149,7 @@ def test_an_interrupted_computation_resumes(
 ) -> None:
     monkeypatch.setattr(precompute, "CHUNK_LOADS", 20)
 
-    def stop(done: int, total: int, need: ResponseBudget) -> None:
+    def stop(done: int, total: int, need: str) -> None:
         if done >= stop_at * total:
             raise Interrupted
 
@@ -170,7 +169,7 @@ def test_an_interrupted_computation_resumes(
 
 
 def test_a_damaged_part_is_computed_again(model: SoftBodyModel, tmp_path: Path) -> None:
-    def stop(done: int, total: int, need: ResponseBudget) -> None:
+    def stop(done: int, total: int, need: str) -> None:
         if done == total:
             raise Interrupted
 
@@ -236,7 +235,7 @@ def test_the_cache_follows_the_desktop_standard(
 
 
 def test_the_node_module_is_light_to_import() -> None:
-    """No part of scipy is loaded before a scene needs it, since processes must start quickly."""
+    """Processes must start quickly, so no part of scipy is loaded before a scene needs it."""
     code = (
         "import sys, json, flexsheet.nodes.fem_solver.node;"
         "print(json.dumps([m for m in sys.modules if m.split('.')[0] in ('scipy', 'matplotlib')]))"

@@ -1,4 +1,4 @@
-"""Test the parts of the soft body's quick start: order of pushes, force correction, transitions."""
+"""Test what makes the first table early: order of the pushes, symmetry, and force correction."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.nodes.fem_solver import snapshots as snapshots_module
-from flexsheet.nodes.fem_solver.body import blend_responses, make_soft_body_spec, make_table_spec
-from flexsheet.nodes.fem_solver.contact import Response
-from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.body import make_soft_body_spec, make_table_spec
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.precompute_table import make_table_cache
 from flexsheet.nodes.fem_solver.shipped_pushes import load_shipped, shipped_path
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
@@ -145,7 +144,7 @@ def test_the_shipped_pushes_of_the_demo_are_current() -> None:
 
 
 def test_forces_are_corrected_to_those_of_an_infinitely_fine_mesh() -> None:
-    """The table's excess is 12 % in proportion to the square of the element size."""
+    """Use a table whose forces are 12 % too large, in proportion to the squared element size."""
     depths = np.array([0.0, 0.0007, 0.0015, 0.005, 0.010, 0.020])
     exact = 1e-3 * (depths / 0.01) ** 1.5
     sample = SamplePoint(0.03 * UP, UP)
@@ -173,22 +172,3 @@ def test_forces_are_corrected_to_those_of_an_infinitely_fine_mesh() -> None:
         (sample, push), cast(Any, response), cast(Any, linear), cast(Any, interpolator), depths
     )
     assert factors == pytest.approx([1.0, 1 / 1.3, 1 / 1.12, 1 / 1.12, 1 / 1.12, 1 / 1.12])
-
-
-def response(force: float, stiffness: float, depths: Floats) -> Response:
-    curve = np.column_stack([depths, force * depths])
-    moved = np.full((2, 3), force, dtype=np.float32)
-    return Response(moved, np.array([0.0, 0.0, force]), stiffness, curve, 0.004, True)
-
-
-def test_a_transition_has_no_step_in_force_or_shape() -> None:
-    old = response(1.0, 10.0, np.linspace(0.0, 0.01, 5))
-    new = response(2.0, 30.0, np.linspace(0.0, 0.01, 9))
-    start, half, end = (blend_responses(old, new, weight) for weight in (0.0, 0.5, 1.0))
-    assert (start.displacement == old.displacement).all()
-    assert (start.force_n == old.force_n).all()
-    assert start.force_curve[:, 1] == pytest.approx(new.force_curve[:, 0])
-    assert half.force_n == pytest.approx([0.0, 0.0, 1.5])
-    assert half.stiffness_n_per_m == pytest.approx(20.0)
-    assert half.displacement == pytest.approx(1.5)
-    assert end.force_curve == pytest.approx(new.force_curve)

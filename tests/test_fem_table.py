@@ -23,7 +23,8 @@ from flexsheet.nodes.cache import load_cached, save_cached
 from flexsheet.nodes.fem_solver import precompute_table, snapshots
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
 from flexsheet.nodes.fem_solver.contact import CURVE_FRACTIONS, Response, SkinResponse
-from flexsheet.nodes.fem_solver.mesh import build_mesh, cylinder
+from flexsheet.nodes.fem_solver.mesh import cylinder
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.precompute import Interrupted, SoftBodyModel, compute
 from flexsheet.nodes.fem_solver.precompute_table import (
     TableSpec,
@@ -55,7 +56,7 @@ MODULUS = 4000.0
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse() -> Iterator[None]:
-    """Return a specification with few samples, few depths and a coarse mesh."""
+    """Reduce the number of samples and depths of all tables, and coarsen their meshes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(snapshots, "DEPTHS_M", DEPTHS)
         patch.setattr(snapshots, "FINE_DEPTHS_M", (0.0015, 0.003))
@@ -67,7 +68,7 @@ def coarse() -> Iterator[None]:
 
 
 class CachingExecutor(InlineExecutor):
-    """Executor that computes equal tasks once, since several tests make the same table."""
+    """An executor that computes equal tasks only once, because tests share tables."""
 
     results: ClassVar[dict[bytes, Future[Any]]] = {}
 
@@ -121,7 +122,7 @@ def largest_move(a: Response, b: Response) -> float:
 def test_away_from_the_finger_it_is_what_newton_finds(
     body: TableSoftBody, model: SoftBodyModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The test position is not a sample of the table."""
+    """Compare at a point that is not a sample point of the table."""
     monkeypatch.setattr(snapshots, "DEPTHS_M", DEPTHS[:2])
     there = push(0.005, 0.2, 0.003)
     mesh = build_mesh(SPEC.body.mesh)

@@ -1,4 +1,4 @@
-"""Test the nonlinear table of shapes other than cylinders: own mesh, smooth, bounded."""
+"""Test the nonlinear table of shapes other than cylinders: smoothness and bounds."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SCENES = {
 def both(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Body, SceneBody]:
-    """Return the body by the linear method, and by a table of few samples and shallow depths."""
+    """Return a body with the linear method, and with a table of few samples and small depths."""
     scene = SCENES[request.param]
     linear = make_body(scene, 0.0065)
     with pytest.MonkeyPatch.context() as patch:

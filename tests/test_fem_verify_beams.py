@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import ellipk, ellipkinc
 
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from tests.examples import long_except
 from tests.fem_fields import dofs_of, equilibrium, lame, relative_errors, surface_loads
 from tests.fem_verification import Record, at_most, between, near
@@ -113,10 +113,10 @@ def test_slender_cantilever_with_end_shear(record_property: Record) -> None:
 
 
 def elastica(load: float) -> tuple[float, float]:
-    """Tip of a cantilever under a dead end load P = load EI / L^2: (across, along) over L.
+    """Return the tip (across, along) of a cantilever of unit length under the end load `load` E I.
 
-    With p the modulus of the elliptic integrals and phi their amplitude at the root,
-    K(p) - F(phi, p) = sqrt(load), sin phi = 1 / (p sqrt 2).
+    With p the modulus of the elliptic integrals and phi their amplitude at the root, K(p) - F(phi,
+    p) = sqrt(load), sin phi = 1 / (p sqrt 2).
     """
     from scipy.optimize import brentq
     from scipy.special import ellipe, ellipeinc

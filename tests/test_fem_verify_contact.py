@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flexsheet.nodes.fem_solver import newton
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from tests.examples import long_except
 from tests.fem_fields import dofs_of
 from tests.fem_verification import Record, at_most, between, near
@@ -138,7 +138,7 @@ def touches(penalty: tuple[float, float]) -> list[Touch]:
 
 
 def sunk_at(r: float, patch: float, force: float) -> float:
-    """Return Hertz's surface outside the contact."""
+    """Return the displacement of the surface outside the contact by Hertz's theory."""
     pressure = 3 * force / (2 * np.pi * patch**2)
     share = patch / r
     bend = (2 * patch**2 - r**2) * np.arcsin(share) + r * patch * np.sqrt(1 - share**2)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from tests.fem_fields import dofs_of, equilibrium, lame
 from tests.fem_verification import Record, at_most, near
 from tests.solids import box, distorted

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.fem_solver.elasticity import SolidMeshError
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces
 from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES, SolidMesh, boundary_faces
 from tests.examples import long_except
 from tests.fem_fields import body_loads, dofs_of, equilibrium, lame, surface_loads
 from tests.fem_verification import Record, at_most

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flexsheet.nodes.fem_solver.elasticity import element_stiffness
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
 from tests.fem_fields import body_loads, lame, rate, relative_errors
 from tests.fem_verification import Record, at_most, between

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import skfem
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from flexsheet.nodes.fem_solver.elasticity import element_stiffness, quadrature
-from flexsheet.nodes.fem_solver.mesh import EDGES, boundary_faces
+from benchmarks.external_solvers import scikit_basis
+from flexsheet.nodes.fem_solver.elasticity import element_stiffness
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
 from tests.examples import long_except
 from tests.fem_fields import dofs_of, pressure_loads
@@ -29,28 +29,8 @@ E, NU, PRESSURE = 4000.0, 0.45, 50.0
 
 @cache
 def their_basis(shape: str) -> tuple[Any, Ints]:
-    """Return scikit-fem's basis on the curved mesh, and our degree of freedom for each of its, with
-    the same quadrature so that only the assembly differs."""
     mesh = scene_solid(shape)
-    corners = np.unique(mesh.elements[:, :4])
-    straight = mesh.nodes.copy()
-    straight[mesh.elements[:, 4:]] = mesh.nodes[mesh.elements[:, EDGES]].mean(axis=2)
-    tetrahedra = np.searchsorted(corners, mesh.elements[:, :4])
-    theirs = skfem.MeshTet2.from_mesh(skfem.MeshTet(straight[corners].T, tetrahedra.T))
-    distance, ours = cKDTree(straight).query(theirs.doflocs.T)
-    assert distance.max() < 1e-12
-    theirs = skfem.MeshTet2(mesh.nodes[ours].T, theirs.t)
-    points, weights = quadrature()
-    basis = skfem.Basis(
-        theirs, skfem.ElementVector(skfem.ElementTetP2()), quadrature=(points.T, weights)
-    )
-    distance, node = cKDTree(mesh.nodes).query(basis.doflocs.T)
-    assert distance.max() < 1e-9
-    axis = np.empty(len(node), dtype=np.int64)
-    for names in (basis.nodal_dofs, basis.edge_dofs):
-        for number, dofs in enumerate(names):
-            axis[dofs] = number
-    return basis, 3 * node + axis
+    return scikit_basis(skfem, mesh.nodes, mesh.elements)
 
 
 @cache

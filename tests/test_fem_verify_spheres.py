@@ -23,7 +23,7 @@ E = 1000.0
 
 
 class Lame:
-    """Displacement of a thick sphere under an inner and an outer pressure."""
+    """The displacement of a thick sphere under an inner and an outer pressure."""
 
     def __init__(self, inside: float, outside: float, nu: float) -> None:
         a3, b3 = INNER**3, OUTER**3

@@ -27,7 +27,7 @@ from flexsheet.messages.scene import Cylinder
 from flexsheet.nodes.fem_solver import precompute_table
 from flexsheet.nodes.fem_solver.body import SceneBody, make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
-from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.precompute import Interrupted
 from flexsheet.nodes.fem_solver.snapshots import (
     SamplePoint,

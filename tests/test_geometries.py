@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import BaseSupport, Geometry, Part, Pose, Positive, Scene
 from flexsheet.nodes.console.scenes import edit_scene, front_m
-from flexsheet.nodes.fem_solver.mesh import mesh_scene
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh, mesh_spec
 from flexsheet.nodes.models.shapes import (
     GEOMETRIES,
     Convex,
@@ -111,7 +111,7 @@ def distances_m(points: Floats) -> Floats:
 
 
 def test_a_new_geometry_is_meshed(capsule_scene: Scene) -> None:
-    mesh = mesh_scene(capsule_scene, 0.006)
+    mesh = build_mesh(mesh_spec(capsule_scene, 0.006))
     assert np.abs(distances_m(mesh.nodes[mesh.skin])).max() < 1e-6
     assert mesh.fixed.any()
 

@@ -1,4 +1,4 @@
-"""Test that the renderer's images are unchanged; see `tests/golden_pictures.py` to redraw them."""
+"""Test that the renderer's images are unchanged. `tests/golden_pictures.py` draws them again."""
 
 from __future__ import annotations
 

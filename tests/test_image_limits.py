@@ -1,4 +1,4 @@
-"""Test the limits of the image: dark, or the last valid plane, but never wrong."""
+"""Test the image on sheets at extreme poses: it is dark or correct, but never wrong."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from flexsheet.nodes.renderer.benchmarks import (
 )
 from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
-from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
+from flexsheet.nodes.renderer.sheet import estimate_sheet
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import seen
+from tests.drawing import sheet_at
 from tests.indentation_bases import DEEPEST_M, few_dents
 from tests.scenes import make_weightless
 
@@ -46,25 +47,11 @@ def stage() -> Iterator[SceneRenderer]:
     context = headless_context()
     made = SceneRenderer(SCENE, context, spacing_m=0.005, basis=few_dents())
     yield made
-    made.release()
     context.release()
 
 
-def sheet_at(pose: Floats, tip: Floats | None = None) -> SheetPose:
-    sheet = estimate_sheet(
-        *edge_poses(pose, STRETCH * SCENE.sheet.width_m),
-        height_m=SCENE.sheet.height_m,
-        twist_world=np.zeros(6),
-        ahead_s=0.0,
-        finger_tip=tip,
-    )
-    assert sheet is not None
-    return sheet
-
-
 def plane_through(point: Floats) -> Floats:
-    """Return world_from_sheet at the world's origin, rotated about x until it contains the
-    point."""
+    """Return the pose (4, 4) of a sheet about the x axis whose plane contains a point."""
     angle = float(np.arctan2(point[1], point[2])) - 0.5 * np.pi
     return transform(rotation_from_vector([-angle, 0.0, 0.0]), np.zeros(3))
 
@@ -76,7 +63,7 @@ def test_a_sheet_with_eye_or_projector_in_its_plane_is_dark(
 ) -> None:
     pose = plane_through(EYE if seer == "eye" else PROJECTOR)
     turn = transform(rotation_from_vector([np.radians(turned_deg), 0.0, 0.0]), np.zeros(3))
-    sheet = sheet_at(pose @ turn)
+    sheet = sheet_at(SCENE, pose @ turn)
     towards = (EYE if seer == "eye" else PROJECTOR) - sheet.plane.point
     assert abs(sheet.plane.normal @ towards) < 0.04 * np.linalg.norm(towards)
     assert not stage.usable(sheet)
@@ -90,7 +77,7 @@ def test_a_sheet_with_eye_or_projector_in_its_plane_is_dark(
 def test_beyond_the_steepest_tilts_the_plane_is_not_usable(
     stage: SceneRenderer, tilt_deg: int
 ) -> None:
-    sheet = sheet_at(roll_sheet(SCENE, -np.radians(tilt_deg)))
+    sheet = sheet_at(SCENE, roll_sheet(SCENE, -np.radians(tilt_deg)))
     assert stage.usable(sheet) == (tilt_deg == 80)
     for method in ("none", *METHODS):
         draw_stereo(stage, method, sheet)
@@ -120,7 +107,7 @@ def test_poses_that_are_not_finite_hold_no_sheet(what: str) -> None:
     ],
 )
 def test_what_pushes_the_sheet(tip: tuple[float, float, float], pushes: bool) -> None:
-    sheet = sheet_at(np.eye(4), np.array(tip))
+    sheet = sheet_at(SCENE, np.eye(4), np.array(tip))
     assert (sheet.pushed_point is not None) == pushes
 
 
@@ -136,7 +123,7 @@ def test_what_pushes_the_sheet(tip: tuple[float, float, float], pushes: bool) ->
 def test_a_push_out_of_range_is_drawn_and_reported(
     stage: SceneRenderer, tip: tuple[float, float, float], printed: str
 ) -> None:
-    picture, _ = draw_coordinate_ramps(stage, "two_pass", sheet_at(np.eye(4), np.array(tip)))
+    picture, _ = draw_coordinate_ramps(stage, "two_pass", sheet_at(SCENE, np.eye(4), np.array(tip)))
     assert picture.max() > 150
     assert stage.note == "" if not printed else printed in stage.note
 
@@ -144,8 +131,7 @@ def test_a_push_out_of_range_is_drawn_and_reported(
 def test_a_fold_that_keeps_the_light_away_is_dark_and_the_rest_is_right(
     stage: SceneRenderer,
 ) -> None:
-    """The indentation of a downward sheet blocks the light: the lit part is correct, the rest is
-    dark."""
+    """The indentation of a tilted sheet shades a part of the image."""
     place = np.array([0.0, 0.05, 0.0])
     pose = roll_sheet(SCENE, np.radians(40.0), (0.0, 0.05))
     tip = pose[:3, 3] + pose[:3, :3] @ (place - [0.0, 0.0, DEEPEST_M])

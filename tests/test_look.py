@@ -87,7 +87,6 @@ def test_an_image_is_laid_over_the_front(context: moderngl.Context) -> None:
     image[2:, :4], image[2:, 4:] = (0, 0, 255), (255, 255, 0)
     stage = SceneRenderer(painted(texture="image", image=image), context, spacing_m=0.004)
     picture = drawn(stage).astype(int)
-    stage.release()
     row, column = MIDDLE
     # As the projector shows it: left is right, seen through the sheet.
     assert picture[row - 20, column + 60].argmax() == 0
@@ -106,7 +105,6 @@ def test_a_texture_moves_with_the_skin(context: moderngl.Context, texture: str) 
     # 4 mm to the right in the world is 8 pixels to the left.
     follow(stage, np.tile([0.004, 0.0, 0.0], (len(stage._surface.rest_world_m), 1)))
     after = drawn(stage)[patch].astype(int)
-    stage.release()
     assert np.abs(after[:, :-8] - before[:, 8:]).mean() < 2.0
     assert np.abs(after - before).mean() > 10.0
 
@@ -132,7 +130,7 @@ POSES = [
 def test_an_even_patch_has_no_seam(
     plain: SceneRenderer, correction: Correction, pose: Floats
 ) -> None:
-    """There is no dark line between triangles, of the sheet or of the object."""
+    """No dark line may appear between triangles of the sheet or of the object."""
     tip = (pose @ [0.02, -0.03, -0.03, 1.0])[:3]
     picture = drawn(
         plain, DrawStyle(False, "white"), correction=correction, sheet=sheet_at(SCENE, pose, tip)
@@ -149,7 +147,7 @@ def test_an_even_patch_has_no_seam(
 
 @pytest.mark.parametrize("correction", ["none", "four_triangles", "two_pass"])
 def test_edges_are_soft(plain: SceneRenderer, correction: Correction) -> None:
-    """Outlines have intermediate levels, since they are multisampled."""
+    """Multisampled outlines have intermediate brightness."""
     picture = drawn(plain, DrawStyle(True, "object"), correction=correction)[..., 0]
     between = (picture > 16) & (picture < 240)
     assert between.sum() > 200

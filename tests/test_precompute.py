@@ -1,4 +1,4 @@
-"""Test `flexsheet precompute`: indentation shapes and the soft body's table."""
+"""Test the command `flexsheet precompute`."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ SPACING_M = 0.005
 
 @pytest.fixture
 def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Write a scene of a small cylinder with few shallow pushes on a coarse mesh, without
-    indentation shapes, which take longest."""
+    """Write a scene of a small cylinder with small pushes on a coarse mesh."""
     monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.002, 0.0025, 0.003))
     monkeypatch.setattr(snapshots, "FINE_DEPTHS_M", (0.0015, 0.003))
     monkeypatch.setattr(snapshots, "FINE_RATIO", 1.0)
@@ -51,8 +50,7 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def flexsheet(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str]]:
-    """Return a function that runs the command in this process: exit code, output without line
-    breaks."""
+    """Return a function that runs the command and returns its exit code and its output."""
 
     def run(*arguments: object) -> tuple[int, str]:
         monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, arguments)])

@@ -1,4 +1,4 @@
-"""Test the renderer: shader against numpy, images, packing, and the node's timing."""
+"""Test the renderer: shader equations, images, stereo packing, and timing of the node."""
 
 from __future__ import annotations
 
@@ -30,7 +30,12 @@ from flexsheet.nodes.renderer.correction import (
 )
 from flexsheet.nodes.renderer.gl import Canvas, DrawStyle, EyeView, NoOpenGLError, headless_context
 from flexsheet.nodes.renderer.node import Renderer, RendererParameters
-from flexsheet.nodes.renderer.object_surface import VertexNormals, cylinder_surface, transfer_matrix
+from flexsheet.nodes.renderer.object_surface import (
+    ObjectSurface,
+    VertexNormals,
+    cylinder_surface,
+    transfer_matrix,
+)
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import estimate_sheet
 from tests.arm_states import arm_state
@@ -116,8 +121,7 @@ def test_uncorrected_silhouette_agrees_with_the_projector_model(
 def test_nearest_surface_hides_what_is_behind(
     context: moderngl.Context, stage: SceneRenderer
 ) -> None:
-    """The squares cross: depth decides, independent of the order of the triangles."""
-    canvas = Canvas(context, 80, 60)
+    """Draw two overlapping squares in both orders. The nearer square must hide the other one."""
     square = np.array([[-0.05, -0.05, 0.0], [0.05, -0.05, 0], [0.05, 0.05, 0], [-0.05, 0.05, 0]])
     far = square + np.array([0.0, 0.0, -0.05])
     near = 0.4 * square + np.array([0.0, 0.0, 0.02])
@@ -128,13 +132,17 @@ def test_nearest_surface_hides_what_is_behind(
     lit, dark = np.tile(gl.LIGHT, (4, 1)), np.tile(-gl.LIGHT, (4, 1))
     for order in (1, -1):
         positions = np.concatenate([far, near][::order])
-        canvas.set_mesh(positions, np.concatenate([triangles, triangles + 4]).astype(np.int32))
-        canvas.set_shape(positions, np.concatenate([dark, lit][::order]))
-        canvas.draw(view, DrawStyle(flat=False, pattern="object"))
+        surface = ObjectSurface(
+            positions,
+            np.concatenate([dark, lit][::order]),
+            np.concatenate([triangles, triangles + 4]).astype(np.int32),
+        )
+        canvas = Canvas(context, (80, 60), surface, stage._material())
+        canvas.draw_unresolved(view, DrawStyle(flat=False, pattern="object"))
+        canvas.resolve()
         picture = canvas.read()
         assert picture[30, 40, 0] > 200
         assert 30 < picture[30, 50, 0] < 100
-    canvas.release()
 
 
 def test_black_and_grid_patterns(stage: SceneRenderer) -> None:
@@ -163,7 +171,7 @@ def test_marks_are_drawn_on_the_object(stage: SceneRenderer) -> None:
 
 
 def test_second_eye_sees_the_front_shifted_the_other_direction(stage: SceneRenderer) -> None:
-    """The object is behind the screen: the right eye sees it further right (mirrored: left)."""
+    """The right eye sees an object behind the screen further to the right."""
     stage.deform(None)
     shown = Display(correction="none", stereo="side_by_side", shading="flat")
     picture = stage.draw(shown, stage.sheet_at_rest(), DrawStyle(True, "object"), read=True)
@@ -202,7 +210,7 @@ def test_a_software_driver_leaves_cores_to_other_nodes(
 def test_both_eyes_share_an_image(
     stage: SceneRenderer, correction: Correction, swap_eyes: bool
 ) -> None:
-    """Each mode is what packing the images of single eyes gives, up to the blur of outlines."""
+    """Compare each stereo mode with the packed images of single eyes, except near outlines."""
     stage.deform(None)
     sheet, look = stage.sheet_at_rest(), DrawStyle(False, "object")
     shown = Display(correction=correction, stereo="mono")
@@ -261,7 +269,7 @@ def test_surface_follows_a_linear_displacement_of_a_coarse_skin() -> None:
 
 
 def test_a_skin_finer_in_front_is_followed_by_its_nearest_triangles() -> None:
-    """Beside many small triangles a large one is the nearest, although its centre is far."""
+    """A large triangle beside many small ones is nearest, although its centre is far away."""
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     small = np.concatenate([[-0.02, -0.01, 0.0] + 0.02 * (corners - [k, 0, 0]) for k in range(40)])
     vertices = np.concatenate([corners, small])
@@ -311,8 +319,6 @@ def test_finger_pushes_only_below_and_over_the_sheet(
         left,
         right,
         height_m=0.24,
-        twist_world=np.zeros(6),
-        ahead_s=0.0,
         finger_tip=np.array(tip),
     )
     assert sheet is not None
@@ -320,7 +326,7 @@ def test_finger_pushes_only_below_and_over_the_sheet(
 
 
 class Bench(NodeHarness[Renderer, VirtualClock]):
-    """Renderer with the paper's scene."""
+    """A renderer node with the paper's scene."""
 
     def __init__(self, **parameters: object) -> None:
         given = RendererParameters(spacing_m=0.006, **parameters)
@@ -407,7 +413,7 @@ async def test_frame_follows_the_soft_body_and_carries_its_exposure(bench: Bench
 async def test_a_frame_contains_the_unlit_fraction_of_the_sheet(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The frame is that of a folded sheet (tests/test_renderer_failures.py)."""
+    """Draw on a folded sheet."""
     monkeypatch.setattr(
         "flexsheet.nodes.renderer.scene_renderer.occluded_fraction",
         lambda mesh, eye, projector: 0.25,
@@ -439,7 +445,7 @@ async def test_timer_keeps_the_image_alive_only_when_idle(bench: Bench) -> None:
 
 
 async def test_while_nothing_moves_few_frames_are_drawn(bench: Bench) -> None:
-    """The next one follows immediately when a finger comes or the sheet moves."""
+    """A finger or a motion of the sheet causes the next frame immediately."""
     await bench.step("scene", bench.scene)
     await bench.arms(np.eye(4))
     _, body = skin_and_body(0.0)
@@ -579,8 +585,7 @@ async def test_a_new_scene_is_drawn_and_a_bad_one_is_reported(bench: Bench) -> N
 
 
 async def test_a_silent_solver_leaves_the_object_as_it_was(bench: Bench) -> None:
-    """The indentation does not flicker when the solver is late; the fingertip is drawn
-    meanwhile."""
+    """If the solver is late, the object keeps its shape, and fingertips cause the frames."""
     skin, body = skin_and_body(0.01)
     await bench.step("scene", bench.scene)
     await bench.step("skin", skin)

@@ -1,4 +1,4 @@
-"""Test the correction family: errors at the eye within the stated range of each method."""
+"""Test the benchmark of the correction methods: small errors within the range of each method."""
 
 from __future__ import annotations
 

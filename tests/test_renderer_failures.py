@@ -1,5 +1,4 @@
-"""Test the limits of drawing: behind the eye, in front of the sheet, degenerate, folded,
-infinite."""
+"""Test drawing at its limits: points behind the eye, folded sheets, and values like NaN."""
 
 from __future__ import annotations
 
@@ -62,16 +61,14 @@ def test_what_is_behind_the_eye_is_not_drawn(context: moderngl.Context) -> None:
     behind = SceneRenderer(with_object_at(0.6), context, spacing_m=0.006)
     for correction in CORRECTIONS:
         assert drawn(behind, correction, behind.sheet_at_rest()).max() == 0
-    behind.release()
     # Half of it behind: the rest is there, ahead of the eye it fills the view.
     half = SceneRenderer(with_object_at(0.39), context, spacing_m=0.006)
     for correction in CORRECTIONS:
         assert drawn(half, correction, half.sheet_at_rest()).max() in (0, 255)
-    half.release()
 
 
 def test_a_point_in_front_of_the_sheet_is_seen_at_its_position(stage: SceneRenderer) -> None:
-    """A sheet 25 mm behind the object's front is valid for the equations and two passes."""
+    """Place the sheet 25 mm behind the front of the object."""
     pose = transform(np.eye(3), np.array([0.0, 0.0, -0.025]))
     spec = SCENE.sheet
     rubber = TrueRubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
@@ -112,7 +109,7 @@ def test_light_lost_at_folds_is_measured() -> None:
 def test_a_folded_sheet_is_drawn_and_reported(
     stage: SceneRenderer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The projector lights the nearest point; of two points on its ray one gets the light."""
+    """The projector lights only the nearer of two points on one ray."""
     monkeypatch.setattr(stage, "sheet_mesh", lambda sheet: folded(0.03))
     stage.note = ""
     picture = drawn(stage, "two_pass", stage.sheet_at_rest())

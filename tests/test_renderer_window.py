@@ -1,4 +1,4 @@
-"""Test the window in a separate process, since a display that ends also ends its clients."""
+"""Test the window in a separate process, because the end of a display also ends its clients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every scene that is shipped: drawn, projected, seen, and as the twin says it ought to be seen."""
+"""Test for every shipped scene that the eye sees the image that the simulator expects."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ SHIFT_M = np.array([0.004, 0.006, -0.008])
 
 @dataclass
 class Case:
-    """A scene, its stage, and a skin coarser than what is drawn."""
+    """A scene, its renderer, and a skin that is coarser than the drawn surface."""
 
     scene: Scene
     stage: SceneRenderer
@@ -61,7 +61,7 @@ class Case:
         )
 
     def dent(self, depth_m: float, place: tuple[float, float] = (0.0, 0.0)) -> Floats:
-        """Displacement (skin vertices, 3) of a dent from the front, steep as a finger's."""
+        """Return the displacement (skin vertices, 3) of a steep indentation from the front."""
         points = self.skin.vertices_world_m.astype(np.float64)
         away = np.linalg.norm(points[:, :2] - np.array(place), axis=1)
         facing = (points[:, 2] - points[:, 2].min()) / np.ptp(points[:, 2])
@@ -91,7 +91,6 @@ def case(request: pytest.FixtureRequest, context: moderngl.Context) -> Case:
     # As a solver's skin: coarser, on the true surface, its facets inside.
     coarse = SceneRenderer(scene, context, spacing_m=0.006)
     surface = coarse._surface
-    coarse.release()
     skin = Skin(
         mesh_id="m",
         vertices_world_m=surface.rest_world_m.astype(np.float32),
@@ -106,7 +105,7 @@ def cross_products(points: Floats, triangles: NDArray[np.integer]) -> Floats:
 
 
 def test_the_drawn_surface_is_the_objects_own(case: Case) -> None:
-    """On the true shape, closed or facing the user, wound outwards, of the truth's volume."""
+    """The drawn mesh is on the true shape, oriented outwards, and has the volume of the object."""
     surface = case.stage._surface
     points, triangles = surface.rest_world_m, surface.triangles
     area = cross_products(points, triangles)
@@ -148,7 +147,7 @@ def test_an_indentation_is_followed_without_inverted_triangles(case: Case) -> No
 
 
 def test_the_simulated_body_follows_the_same_indentation(case: Case) -> None:
-    """Drawn and true object, meshed and moved by different code, have the same dented front."""
+    """Compare the deformed fronts of the drawn and the simulated object."""
     true, displacement = TrueBody(case.scene), case.dent(0.02)
     vertices, triangles = case.skin.vertices_world_m.astype(float), case.skin.triangles
     rigid = true.displaced(vertices, triangles, np.tile(SHIFT_M, (len(vertices), 1)))
@@ -169,13 +168,13 @@ def test_the_simulated_body_follows_the_same_indentation(case: Case) -> None:
 
 
 def lowest(case: Case, displacement: Floats) -> float:
-    """Height of the dented skin before the eye, near its middle."""
+    """Return the height (m) of the deformed skin near its middle."""
     points = case.skin.vertices_world_m + displacement
     return float(points[np.linalg.norm(points[:, :2], axis=1) < 0.006, 2].max())
 
 
 class Chain:
-    """Renderer and twin eye of a scene, with a clock moved by hand."""
+    """A renderer and a simulated eye, with a clock that the test advances."""
 
     def __init__(self, case: Case) -> None:
         self.scene, self.clock = case.scene, VirtualClock(10**10)
@@ -218,7 +217,7 @@ class Chain:
                 assert node.errors == 0, node.last_error
 
     async def picture(self, shading: Shading, *messages: tuple[str, Message]) -> TwinEye:
-        """Return the seen and the expected image, with the sheet upright and the arms at rest."""
+        """Return the seen and the expected image for an upright sheet and resting arms."""
         display = Display(
             correction="two_pass",
             stereo="mono",

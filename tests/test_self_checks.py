@@ -19,7 +19,7 @@ from flexsheet.launch.health.probe import HostProbe, Reachability
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.notes import BUSY_FIRST, SELF_CHECK_REMEDIES
 from flexsheet.messages.sheet_calibration import Fitted, SheetCalibration
-from flexsheet.messages.types import SelfCheck, Status, StereoPair
+from flexsheet.messages.types import SelfCheck, StereoPair
 from flexsheet.nodes.arm_bridge.self_checks import ServoCheck
 from flexsheet.nodes.console import panels
 from flexsheet.nodes.models.rigid import transform
@@ -34,6 +34,7 @@ from flexsheet.nodes.twin.clutter import CLUTTER, FixedPoint, SecondMarker
 from flexsheet.nodes.twin.pixels import TwinCamera
 from flexsheet.nodes.twin.tolerance_table import sample_apparatus
 from flexsheet.nodes.twin.truth import apply_apparatus
+from tests.console_parts import status_of
 from tests.node_harness import build_node
 
 SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
@@ -125,23 +126,6 @@ def observe(seed: int, seconds: float, fault: Fault) -> Iterator[tuple[SelfCheck
             check.on_marks(list(marks[number]), at_ns)
         if number % (FINGER_HZ // 2) == 0:
             yield check.results()
-
-
-def make_status(node: str) -> Status:
-    return Status(
-        node=node,
-        state="running",
-        pid=1,
-        uptime_s=1.0,
-        cpu_ratio=0.0,
-        resident_bytes=0,
-        inputs=(),
-        outputs=(),
-        errors=0,
-        last_error="",
-        note="",
-        plan_hash="",
-    )
 
 
 def suspected(checks: tuple[SelfCheck, ...]) -> set[str]:
@@ -380,7 +364,7 @@ def test_doctor_and_console_show_the_cause_with_its_remedy() -> None:
         threshold=0.01,
         suspected=True,
     )
-    status = make_status("arm_left_bridge").model_copy(update={"self_checks": (check,)})
+    status = status_of("arm_left_bridge").model_copy(update={"self_checks": (check,)})
     text = panels.make_nodes_table({status.node: (status, 0.0)})
     assert "measured 52.00 ms, expected 30.00" in text
     assert "servo_lag_s" in text

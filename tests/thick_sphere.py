@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
 from flexsheet.nodes.fem_solver.mesh.bisection import CELL, make_lattice
 from flexsheet.nodes.fem_solver.mesh.curving import curve_edges
-from flexsheet.nodes.fem_solver.mesh.solid import add_midside_nodes, orient_tetrahedra
+from flexsheet.nodes.fem_solver.mesh.solid import (
+    add_midside_nodes,
+    boundary_faces,
+    orient_tetrahedra,
+)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -138,7 +138,7 @@ async def animate(bag: Path, output: Path, *, frames_per_s: int = FRAMES_PER_S) 
     def _join(client: viser.ClientHandle) -> None:
         loop.call_soon_threadsafe(joined.set_result, client)
 
-    view = SceneView(server)
+    view = SceneView(server, lambda *_: None)
     view.set_scene(scene[0])
     view.set_skin(np.asarray(skin[0].vertices_world_m, dtype=np.float64), skin[0].triangles)
     url = f"http://127.0.0.1:{server.get_port()}/"

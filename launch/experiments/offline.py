@@ -31,12 +31,12 @@ from flexsheet.messages.scene import Scene, require_projector
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.models.shapes.triangles import intersect_rays
 from flexsheet.nodes.models.sheet.force_models import SheetPush
 from flexsheet.nodes.models.sheet.tension import compute_sag_m
 from flexsheet.nodes.planner.sheet_force import make_force_model, make_rubber
 from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.benchmarks import draw_coordinate_ramps
-from flexsheet.nodes.renderer.check_marks import intersect
 from flexsheet.nodes.renderer.gl import headless_context
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import estimate_sheet
@@ -483,8 +483,6 @@ class OfflineEvaluator:
         believed = estimate_sheet(
             *edges,
             height_m=self._scene.sheet.height_m,
-            twist_world=np.zeros(6),
-            ahead_s=0.0,
             finger_tip=None if tip is None else tip + tip_error,
         )
         assert believed is not None
@@ -529,13 +527,7 @@ class OfflineEvaluator:
         )
         targets = np.array([contact.point for contact in contacts])
         edges = self._edges(self._touch(0.0))
-        believed = estimate_sheet(
-            *edges,
-            height_m=self._scene.sheet.height_m,
-            twist_world=np.zeros(6),
-            ahead_s=0.0,
-            finger_tip=None,
-        )
+        believed = estimate_sheet(*edges, height_m=self._scene.sheet.height_m, finger_tip=None)
         assert believed is not None
         mesh = self._renderer.sheet_mesh(believed)
         corners = mesh.vertices[mesh.triangles].astype(np.float64)
@@ -549,7 +541,7 @@ class OfflineEvaluator:
                 one.eyes.centre_world_m + side * one.eyes.interocular_m * np.eye(3)[0]
                 for one in (self._scene, scene)
             )
-            triangles, weights = intersect(believed_eye, targets - believed_eye, corners)
+            triangles, weights = intersect_rays(believed_eye, targets - believed_eye, corners)
             drawn = np.einsum("nk,nki->ni", weights, corners[triangles])
             lit, lands = lamp.intersect_surface(
                 project_points(require_projector(self._scene), np.nan_to_num(drawn))

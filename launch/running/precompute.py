@@ -120,17 +120,16 @@ def precompute_soft_body(
     """
     from flexsheet.nodes.cache import EtaEstimator
     from flexsheet.nodes.fem_solver import body, precompute_table
-    from flexsheet.nodes.fem_solver.precompute import WorkBudget
     from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 
     folder = cache_dir or default_cache_dir()
     eta, reported_percent = EtaEstimator(), -1
 
-    def on_progress(done: int, total: int, need: WorkBudget) -> None:
+    def on_progress(done: int, total: int, need: str) -> None:
         nonlocal reported_percent
         progress_text = eta.text(done, total, time.monotonic())
         if 100 * done // total != reported_percent:
-            progress(f"computing the soft body: {progress_text} ({need.text()})")
+            progress(f"computing the soft body: {progress_text} ({need})")
             reported_percent = 100 * done // total
 
     factory = SoftBodyFactory(skin_spacing_m=skin_spacing_m, cache_dir=folder, scheduler=scheduler)

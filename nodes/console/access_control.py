@@ -51,7 +51,7 @@ MALFORMED = (
     "the console cannot read this HTTP request; open the address of the console in a browser"
 )
 CLOSE_TIMEOUT_S = 1.0
-"""The time for which a refused connection stays open, so that the client can read the reason."""
+"""The time for which a refused connection stays open. The client reads the reason in this time."""
 
 PageRequest = Callable[[Any, Request], Response | None]
 
@@ -66,8 +66,8 @@ class ConsoleError(FlexsheetError, RuntimeError):
 def read_token(path: Path) -> str:
     """Read the access token from a file.
 
-    Raises ConsoleError if the file cannot be read, or if other users can read it. Also raise it if
-    the token is too short or contains characters other than letters and digits.
+    Raises ConsoleError if the file cannot be read, if other users can read the file, or if the
+    token is too short or contains characters other than letters and digits.
     """
     try:
         mode, text = path.stat().st_mode, path.read_text().strip()
@@ -198,7 +198,7 @@ def forbid_framing(response: Response) -> Response:
 
 
 def make_page_logger() -> logging.Logger:
-    """Return the logger of the page's server, which logs an error as one line of text."""
+    """Return the logger of the page's server. The logger writes each error as one line of text."""
     logger = logging.getLogger("flexsheet.console")
     if not logger.filters:
         logger.addFilter(shorten_traceback)
@@ -208,7 +208,7 @@ def make_page_logger() -> logging.Logger:
 def shorten_traceback(record: logging.LogRecord) -> bool:
     """Replace the traceback of a log record by its last line.
 
-    Returns True, which makes the logger output the record.
+    Returns True, so the logger outputs the record.
     """
     if record.exc_info and record.exc_info[1] is not None:
         error = record.exc_info[1]

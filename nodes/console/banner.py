@@ -151,13 +151,9 @@ def _remedy(state: GraphState, shown: BannerState) -> str:
         if all(arm.mode == "disconnected" for arm in arms if is_faulty(arm)):
             return "Check the power and the cable of the arm. The arm reconnects automatically."
         return f"Remove the cause, then press Reset the fault; {_after_reset(state)}."
-    if shown is BannerState.WAITING and any(_awaits_user(arm) for arm in arms):
+    if shown is BannerState.WAITING and any(not arm.ready and not arm.auto_arming for arm in arms):
         return "The arms stay at rest until you run: flexsheet arms enable."
     return ""
-
-
-def _awaits_user(arm: ArmState) -> bool:
-    return not arm.ready and not arm.auto_arming
 
 
 def _after_reset(state: GraphState) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, astuple, dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import Enum, auto
 from pathlib import Path
 from typing import Literal
@@ -27,7 +27,7 @@ from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.picking import SurfacePicker
 from flexsheet.nodes.console.replay import Timeline, list_bags
-from flexsheet.nodes.console.state_file import ConsoleState, load_state, save_state
+from flexsheet.nodes.console.state_file import ConsoleState, Sliders, load_state, save_state
 
 Publish = Callable[[Message], None]
 
@@ -50,33 +50,8 @@ MAX_LABELS = 64
 """The number of newest requests whose images are shown even if they arrive late."""
 
 
-@dataclass(frozen=True, slots=True)
-class Sliders:
-    """The positions of the sliders on the console page.
-
-    young_modulus_pa: Young's modulus of the object; None for a rigid object.
-    stretch_ratio: minimum stretch ratio of the sheet.
-    size_ratio: size of the object, relative to its size in the scene file.
-    """
-
-    young_modulus_pa: float | None
-    stretch_ratio: float
-    size_ratio: float
-
-    @staticmethod
-    def from_scene(scene: Scene) -> Sliders:
-        """Return the slider positions that correspond to an unchanged scene."""
-        material = scene.object.material
-        return Sliders(
-            None if material is None else material.young_modulus_pa,
-            max(scene.sheet.min_stretch_ratio, scenes.MIN_STRETCH_RATIO),
-            1.0,
-        )
-
-
 class SceneController:
-    """A controller of the graph's scene. Viewers of the page select a scene, or change it by
-    sliders."""
+    """Select and change the scene of the graph as viewers of the page request."""
 
     def __init__(
         self,
@@ -106,15 +81,15 @@ class SceneController:
         self._send(self.base)
 
     def slide(self, now_s: float, **changes: float) -> None:
-        """Store new slider positions, which `apply_sliders` applies to the scene later.
+        """Store new slider positions by name. `apply_sliders` changes the scene later.
 
-        now_s: current time. changes: new slider positions by name.
+        now_s: current time.
         """
         self.sliders = replace(self.sliders, **changes)
         self._due_s = now_s + SETTLE_S
 
     def apply_sliders(self, now_s: float) -> bool:
-        """Publish the changed scene and return True, if the sliders have stopped moving.
+        """Change the scene if the sliders have stopped moving, and return whether it changed.
 
         Raises SceneChoiceError for invalid slider positions.
         """
@@ -137,10 +112,10 @@ class SceneController:
         self._publish(self.scene)
 
     def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
-        """Prepare the selection of points on the object in a background thread.
+        """Compute, in a background thread, what the mouse needs to select points on the object.
 
-        failed: function that receives the cause if the object permits no selection.
-        By selecting points, viewers move the finger.
+        finger: controller that moves the finger to the selected points. failed: function that
+        receives an error text if the object permits no selection.
         """
         if self._picker_task is not None:
             self._picker_task.cancel()
@@ -170,13 +145,11 @@ class EyeViewState(Enum):
 
 
 class EyeViewRequester:
-    """A requester of eye views, which are images from the position of the user's eye.
+    """Request eye views, one at a time, because ray tracing takes a second of processor time.
 
-    For each view, the requester orders one frame with pixels from the renderer, which the simulated
-    eye then traces. Only one image is requested at a time, because tracing takes a second of
-    processor time. When the simulated eye has all its inputs, the previous display settings are
-    restored. If no other node has sent display settings, the image correction of the scene or of
-    the console is restored.
+    For each view, the renderer draws one frame with pixels. From this frame, the simulated eye
+    computes the view. Afterwards, the previous display settings are restored. If no other node has
+    sent display settings, the image correction of the scene or of the console is restored.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
@@ -193,7 +166,7 @@ class EyeViewRequester:
 
     @property
     def label(self) -> str:
-        """Return the label of the newest request, which the requested frame also contains."""
+        """Return the label of the newest request. The requested frame has the same label."""
         return f"console {self._number}"
 
     @property
@@ -216,7 +189,7 @@ class EyeViewRequester:
             self._restore_display()
 
     def on_others_display(self, display: Display) -> None:
-        """Store the display settings of another node, to restore them after an eye view."""
+        """Store the display settings of another node, which an eye view must restore."""
         self._others_display, self._owns_display = display, False
 
     def advance(self, now_s: float) -> None:
@@ -260,7 +233,10 @@ class EyeViewRequester:
             self._enter(EyeViewState.TRACING, now_s)
 
     def on_image(self, eye: TwinEye, now_s: float) -> bool:
-        """Process a ray-traced image, and return whether this console has requested it."""
+        """End the request to which an image belongs.
+
+        Return whether this console has requested the image.
+        """
         if eye.label == self.label and self.state is not EyeViewState.RESTING:
             self._rest(now_s)
         return eye.label in self._labels
@@ -281,7 +257,7 @@ class EyeViewRequester:
 
 
 class Replay:
-    """The replay of a bag on the console page, which publishes no messages.
+    """The replay of a bag on the console page. A replay publishes no messages.
 
     timeline: opened bag, or None. playing: whether the replay advances. rate: ratio of recorded
         time to real time.
@@ -353,10 +329,10 @@ class ReleaseError(FlexsheetError, ValueError):
 
 
 class ConsoleController:
-    """The main controller of the console, which also publishes e-stops, recordings and bookmarks.
+    """Publish e-stops, recordings and bookmarks, and save the state of the console.
 
-    warn: function that receives the cause if the saved state cannot be used.
-    After a restart, the console continues with the saved scene, sliders and recording.
+    warn: function that receives an error text if the saved state cannot be used. After a restart,
+    the console continues with the saved scene, sliders, finger and recording.
     """
 
     def __init__(
@@ -369,9 +345,8 @@ class ConsoleController:
     ) -> None:
         self._files, self.facts = files, facts or GraphFacts()
         state = load_first_state(files, warn)
-        self.recording, sliders = state.recording, state.sliders
-        previous = None if sliders is None else Sliders(*sliders)
-        self.scenes = SceneController(self._send_scene, files.scenes, state.base, previous)
+        self.recording = state.recording
+        self.scenes = SceneController(self._send_scene, files.scenes, state.base, state.sliders)
         self.finger = finger
         if state.finger is not None:
             finger.restore(state.finger)
@@ -429,7 +404,7 @@ class ConsoleController:
         scenes = self.scenes
         state = ConsoleState(
             base=scenes.base,
-            sliders=astuple(scenes.sliders) if scenes.moved else None,
+            sliders=scenes.sliders if scenes.moved else None,
             recording=self.recording,
             finger=self.finger.intent if self.finger.commanded else None,
         )

@@ -81,9 +81,8 @@ class FingerController:
     """A controller that moves the simulated finger to the requested position at a limited speed.
 
     commanded: whether a viewer has moved the finger. position_m: requested position (x, y) as seen
-        from the front.
-    Each step is published as a path of one point. Nothing is published before the first command of
-    a viewer, so that other programs can control the finger.
+    from the front. Each step is published as a path of one point. Before the first command of a
+    viewer, nothing is published, and other programs can control the finger.
     """
 
     def __init__(self, publish: Callable[[Message], None], *, speed_m_per_s: float) -> None:

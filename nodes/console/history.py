@@ -6,6 +6,7 @@ from collections import deque
 
 import numpy as np
 
+from flexsheet.messages.base import Message
 from flexsheet.messages.types import ArmState, Fingertip, Frame, SheetTarget, SoftBody
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.latest_messages import MessageSource
@@ -77,23 +78,22 @@ def read_latencies_ms(source: MessageSource) -> tuple[float, ...]:
 
     A latency is NaN if there is no message. The latency of the arms ends when the command is sent.
     """
-    found = []
-    for name, kind in (
-        ("fingertip", Fingertip),
-        ("sheet_target", SheetTarget),
-        ("soft_body", SoftBody),
-    ):
+    missing = float("nan")
+
+    def latency_ms(name: str, kind: type[Message]) -> float:
         entry = source.latest(name, kind)
-        found.append(
-            float("nan") if entry is None else 1e-6 * (entry[1].publish_ns - entry[1].source_ns)
-        )
+        return missing if entry is None else 1e-6 * (entry[1].publish_ns - entry[1].source_ns)
+
     arms = [source.latest(name, ArmState) for name in ("arm_left", "arm_right")]
     sent = [
         1e-6 * (arm[0].command_sent_ns - arm[0].target_source_ns)
         for arm in arms
         if arm is not None and arm[0].target_source_ns and arm[0].command_sent_ns
     ]
-    found.append(max(sent, default=float("nan")))
-    frame = source.latest("frame", Frame)
-    late = float("nan") if frame is None else 1e-6 * (frame[1].publish_ns - frame[1].source_ns)
-    return (*found, late)
+    return (
+        latency_ms("fingertip", Fingertip),
+        latency_ms("sheet_target", SheetTarget),
+        latency_ms("soft_body", SoftBody),
+        max(sent, default=missing),
+        latency_ms("frame", Frame),
+    )

@@ -24,7 +24,7 @@ class MessageSource(Protocol):
 
 
 class LatestMessages:
-    """A store of the latest message of each topic, which decodes a message when it is first read.
+    """Store the latest message of each topic, and decode a message only when it is read.
 
     refused: function that receives the topic and the error if a message cannot be decoded.
     """
@@ -44,10 +44,6 @@ class LatestMessages:
         return unread
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the latest message of a topic with its header, or None before the first message.
-
-        Raises TypeError if the message does not have the type `kind`.
-        """
         frames = self._frames.pop(name, None)
         if frames is not None:
             topic = find_topic(name)

@@ -31,13 +31,12 @@ from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console import panels
 from flexsheet.nodes.console.banner import GraphState
 from flexsheet.nodes.console.controller import SETTLE_S, ConsoleController
-from flexsheet.nodes.console.controls import Request
 from flexsheet.nodes.console.history import History
 from flexsheet.nodes.console.latest_messages import LatestMessages, MessageSource
 from flexsheet.nodes.console.page import Page
-from flexsheet.nodes.console.record_tab import NO_BAG
 from flexsheet.nodes.console.scene_view import LAYERS
 from flexsheet.nodes.console.snapshot import compute_snapshot
+from flexsheet.nodes.console.tabs import NO_BAG, Request
 
 MAX_WIDTH_PX = 340
 """The maximum width of the images on the page."""
@@ -60,7 +59,7 @@ NO_RECORDER = (
 
 
 class Operator:
-    """A mediator between the page and the running graph, in the console node's event loop."""
+    """Connect the page with the running graph, in the event loop of the console node."""
 
     def __init__(
         self,
@@ -139,7 +138,7 @@ class Operator:
         self._page.show_problem(str(error))
 
     def on_message(self, message: Message, header: Header, now_s: float) -> None:
-        """Process a message of a topic for which the newest message is not sufficient."""
+        """Process a message of a topic whose messages are all needed, not only the newest."""
         if isinstance(message, Status):
             self._statuses[message.node] = (message, now_s)
         elif isinstance(message, HostStatus):
@@ -284,7 +283,7 @@ class Operator:
             waited_s=eye_view.waited_s(now_s),
             ago_s=None if self._image_s is None else now_s - self._image_s,
         )
-        self._page.eye.text.show(text)
+        self._page.eye.text.content = text
 
     def _touch(self, origin: Floats, direction: Floats) -> None:
         self._command_finger(self.controller.finger.touch, origin, direction)

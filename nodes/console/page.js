@@ -1,5 +1,5 @@
-// Add to viser's page: names of its controls, missing keys, the browser's dark mode, and a message
-// when the connection is lost.  It runs before viser's own script.
+// Add to viser's page: names of its controls, titles of buttons, missing keys, the browser's dark mode,
+// and a message when the connection is lost.  It runs before viser's own script.
 (() => {
   "use strict";
 
@@ -59,6 +59,26 @@
     "arrow-back": "Back to the console",
     maximize: "Show larger",
   };
+
+  // viser does not show the hints of buttons.  The third text is for a disabled button.
+  const TITLES = [
+    [STOP, "Stop both arms immediately. Key: Escape"],
+    ["Release the stop", "Reset the e-stop. The arms must be at rest"],
+    [
+      "Reset the fault",
+      "Reset the faults of the arms. The arms must be at rest",
+      "Disabled, because no e-stop is engaged and no arm reports a fault",
+    ],
+    ["Lift the finger", "Move the fingertip 30 mm off the object's surface. Key: L"],
+    ["Lower the finger", "Move the fingertip to the depth of the slider Push. Key: L"],
+  ];
+
+  function titleButtons() {
+    for (const button of document.querySelectorAll("#root button")) {
+      const found = TITLES.find(([start]) => button.textContent.startsWith(start));
+      if (found) button.title = button.disabled ? (found[2] ?? found[1]) : found[1];
+    }
+  }
 
   function nameControls() {
     for (const label of document.querySelectorAll("label[for]"))
@@ -125,7 +145,13 @@
       setTimeout(() => {
         due = false;
         nameControls();
+        titleButtons();
       }, 100);
-    }).observe(document.body, { childList: true, subtree: true });
+    }).observe(document.body, {
+      childList: true,
+      characterData: true,
+      subtree: true,
+      attributeFilter: ["disabled"],
+    });
   });
 })();

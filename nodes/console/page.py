@@ -10,12 +10,8 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.console import banner, panels
 from flexsheet.nodes.console.banner import GraphState
 from flexsheet.nodes.console.controller import ConsoleController
-from flexsheet.nodes.console.controls import Html, Request, make_callback
-from flexsheet.nodes.console.eye_tab import EyeTab
-from flexsheet.nodes.console.graph_tab import GraphTab
-from flexsheet.nodes.console.record_tab import RecordTab
 from flexsheet.nodes.console.scene_view import SceneView
-from flexsheet.nodes.console.touch_tab import TouchTab
+from flexsheet.nodes.console.tabs import EyeTab, GraphTab, RecordTab, Request, TouchTab
 
 BRAND = (14, 92, 132)
 STOP_COLOR = (185, 28, 28)
@@ -42,15 +38,14 @@ class Page:
         """
         self._gui: Any = server.gui
         self._request, self._others_may = request, others_may
-        self.view = SceneView(server)
-        self.view.on_touch(lambda *ray: request("touch", *ray), lambda: None)
+        self.view = SceneView(server, lambda *ray: request("touch", *ray))
         self._gui.configure_theme(
             dark_mode=False, show_logo=False, show_share_button=False, brand_color=BRAND
         )
         self._gui.main_panel.dock_right()
         self._gui.main_panel.set_width(MAIN_WIDTH)
         self._add_stop()
-        self._problem = Html(self._gui)
+        self._problem = self._gui.add_html("")
         tabs = self._gui.add_tab_group()
         with tabs.add_tab("Touch", viser.Icon.HAND_FINGER):
             self.touch = TouchTab(self._gui, request, self.view, with_finger=with_finger)
@@ -64,21 +59,17 @@ class Page:
     def _add_stop(self) -> None:
         panel = self._gui.add_panel()
         with panel.add_tab("Stop", viser.Icon.HAND_STOP):
-            stop = self._gui.add_button(
-                "E-STOP  (Esc)", color=STOP_COLOR, hint="Stop both arms immediately. Key: Escape"
-            )
-            self._state = Html(self._gui)
-            self._release = self._gui.add_button(
-                RELEASE, disabled=True, hint="The arms must be at rest"
-            )
+            stop = self._gui.add_button("E-STOP  (Esc)", color=STOP_COLOR)
+            self._state = self._gui.add_html("")
+            self._release = self._gui.add_button(RESET, disabled=True)
         # Place the window at the bottom, because viser shows its own notices at the top.
         panel.float(x=14, y=-14, width=STOP_WIDTH)
         # Expand the window, because viser folds panels on small screens.
         panel.expand()
-        stop.on_click(make_callback(self._request, "stop", "pressed at the console"))
-        self._release.on_click(make_callback(self._request, "release"))
+        stop.on_click(lambda _: self._request("stop", "pressed at the console"))
+        self._release.on_click(lambda _: self._request("release"))
         command = self._gui.add_command("E-stop: stop both arms", hotkey="escape")
-        command.on_trigger(make_callback(self._request, "stop", "Escape at the console"))
+        command.on_trigger(lambda _: self._request("stop", "Escape at the console"))
 
     def show_scene(self, scene: Scene, controller: ConsoleController) -> None:
         """Show the values of a scene from the graph or from a bag."""
@@ -90,15 +81,14 @@ class Page:
 
     def show_problem(self, text: str) -> None:
         """Show an error, or remove the shown error if the text is empty."""
-        self._problem.show(panels.problem(text))
+        self._problem.content = panels.problem(text)
 
     def show_state(self, state: GraphState) -> None:
         """Show the banner, and enable the button that releases the e-stop or resets a fault."""
-        self._state.show(banner.render(state))
+        self._state.content = banner.render(state)
         # The button is always visible, so that no other control moves under the mouse pointer.
         self._release.disabled = not state.resettable
         label = RESET if state.stopped is None else RELEASE
         if self._others_may:
             label = f"{label}: on {' or '.join(self._others_may)}"
-        if self._release.label != label:
-            self._release.label = label
+        self._release.label = label

@@ -38,7 +38,7 @@ MODES = {
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The line style of a series in a chart.
+    """The style of a line in a chart.
 
     color: colour that is visible on light and dark pages. dash: lengths of dashes and gaps, px.
     """
@@ -202,7 +202,7 @@ def _finger(fingertip: Fingertip | None) -> str:
 def eye(
     *, possible: bool, enabled: bool, state: EyeViewState, waited_s: float, ago_s: float | None
 ) -> str:
-    """Describe as HTML the state of the eye view, which is the image that the user sees.
+    """Describe as HTML the state of the eye view, the image that the user sees.
 
     possible: whether the graph has a simulated eye.
     enabled: whether viewers have requested images.

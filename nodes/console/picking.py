@@ -66,10 +66,9 @@ class SurfacePicker:
     def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
         """Return the next point (3,), in m, on the path of the finger to the target.
 
-        finger, target: present and requested position (3,), m.
-        The step is at most `max_step_m` long. It enters the object at most to `depth_m`, or to the
-        present depth of the finger if that is larger. If a step around the object makes no
-        progress, the step is straight.
+        finger, target: present and requested position (3,), m. The step is at most `max_step_m`
+        long. The step ends at most `depth_m` below the surface, or at the present depth if that is
+        larger. If a step around the object makes no progress, the step is straight.
         """
         across = target - finger
         distance = float(np.linalg.norm(across))

@@ -45,12 +45,7 @@ class Timeline:
         self.seconds = 0.0
 
     def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """Return the last message of a topic at or before the selected time, with its header.
-
-        kind: type of the message.
-        Return None if there is no such message.
-        Raises TypeError if the message has another type.
-        """
+        """Return the last message of a topic at or before the selected time, or None."""
         times, _ = self._positions.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
         if i < 0:

@@ -20,11 +20,7 @@ from flexsheet.nodes.console.arms import (
 )
 from flexsheet.nodes.console.creases import split_creases
 from flexsheet.nodes.console.sheet import COLUMNS, ROWS, TRIANGLES, compute_sheet_points
-from flexsheet.nodes.console.snapshot import (
-    SceneSnapshot,
-    rays,
-    select_ray_vertices,
-)
+from flexsheet.nodes.console.snapshot import SceneSnapshot, rays, select_ray_vertices
 from flexsheet.nodes.models.rigid import (
     apply,
     pose_matrix,
@@ -81,17 +77,20 @@ are the origin (3,), m, and the direction (3,) of the ray."""
 
 
 class SceneView:
-    """The 3D view of the scene, which is the same for all viewers."""
+    """The 3D view of the scene. All viewers see the same view."""
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server, self._scene = server, server.scene
+    def __init__(self, server: viser.ViserServer, touched: Drag) -> None:
+        """Set the lights and the first camera position.
+
+        touched: callback for each position of the pointer while it is pressed on the object.
+        """
+        self._server, self._scene, self._touched = server, server.scene, touched
         self._shown = dict.fromkeys(LAYERS, True)
         self._layers: dict[str, list[Any]] = {}
         self._links: dict[str, list[Any]] = {}
         self._posed: set[str] = set()
         self._of_scene: Scene | None = None
         self._skin_shape: tuple[int, ...] | None = None
-        self._finger_color = FINGER
         self._scene.set_up_direction("+y")
         # Without a graphics card, shadows would take most of the drawing time.
         self._scene.configure_default_lights(cast_shadow=False)
@@ -136,7 +135,6 @@ class SceneView:
         self._add_sheet(scene)
         self._add_finger(scene.finger.radius_m)
         self._add_devices(scene)
-        self._add_names(scene)
         ends = np.zeros((1, 2, 3))
         self._rays = [
             self._add("Rays", self._lines("/rays/eye", ends, TO_EYE, 1.6)),
@@ -159,13 +157,6 @@ class SceneView:
         self._skin_shape, self._ray_vertices = rest.shape, select_ray_vertices(rest)
         self._make_touchable(self._object)
 
-    def on_touch(self, touched: Drag, released: Callable[[], None]) -> None:
-        """Set the callbacks for touching the object with the pointer.
-
-        touched: called while the pointer is pressed or dragged. released: called at the end.
-        """
-        self._touched, self._released = touched, released
-
     def draw(self, snapshot: SceneSnapshot) -> None:
         """Update all poses and meshes of the 3D view to the state in `snapshot`."""
         scene = self._of_scene
@@ -187,9 +178,7 @@ class SceneView:
                 self._object.vertices = _f32(snapshot.skin[self._skin_source])
             if snapshot.finger is not None:
                 self._finger.position = snapshot.finger
-                color = FINGER if snapshot.finger_valid else FINGER_LOST
-                if self._finger_color != color:
-                    self._finger_color = self._finger.color = color
+                self._finger.color = FINGER if snapshot.finger_valid else FINGER_LOST
             self._draw_rays(scene, snapshot)
 
     def _draw_rays(self, scene: Scene, snapshot: SceneSnapshot) -> None:
@@ -250,6 +239,7 @@ class SceneView:
         self._scene.add_mesh_simple(
             f"/{side}/clamp/bar", _f32(vertices), triangles, color=ARM_DARK, flat_shading=True
         )
+        self._add_name(f"/names/{side}", f"{side} arm", arm.world_from_base.position_m)
         return [*frames, clamp]
 
     def _add_sheet(self, scene: Scene) -> None:
@@ -278,6 +268,8 @@ class SceneView:
         segments = make_line_segments(lift_sheet(points, LINES_LIFT_M))
         lines = self._lines("/sheet_lines", segments, SHEET_LINES, 1.0)
         self._sheet_lines = self._add("Sheet", lines)
+        top_m = 0.5 * scene.sheet.height_m + 0.012
+        self._add_name("/right/clamp/name", "rubber sheet", (0.0, top_m, 0.0))
         self._make_touchable(self._sheet)
 
     def _add_finger(self, radius_m: float) -> None:
@@ -287,7 +279,7 @@ class SceneView:
             self._scene.add_mesh_simple("/finger", _f32(vertices), triangles, color=FINGER),
         )
         self._finger.position = (0.0, 0.0, 0.08)
-        self._finger_color = FINGER
+        self._add_name("/finger/name", "finger", FINGER_NAME_M)
 
     def _add_devices(self, scene: Scene) -> None:
         camera = scene.camera
@@ -300,44 +292,32 @@ class SceneView:
             [(0.0, 0.0, 0.0), (baseline_m, 0.0, 0.0)],
             0.011,
         )
+        centre = apply(left, np.array([0.5 * baseline_m, 0.0, 0.0]))
+        self._add_name("/names/camera", "stereo camera", centre + NAME_ABOVE_M)
         if scene.projector is not None:
+            pose = pose_matrix(scene.projector.world_from_projector)
             self._add_device(
                 "/devices/projector",
-                pose_matrix(scene.projector.world_from_projector),
+                pose,
                 ((0.16, 0.07, 0.12), (0.0, 0.0, -0.065)),
                 [(0.0, 0.0, -0.005)],
                 0.02,
             )
+            self._add_name("/names/projector", "projector", pose[:3, 3] + NAME_ABOVE_M)
+        eyes_m = scene.eyes.centre_world_m
+        self._add_name("/names/eyes", "user's eyes", eyes_m + 0.4 * NAME_ABOVE_M)
         half = 0.5 * scene.eyes.interocular_m
         for name, offset in (("left", -half), ("right", half)):
             eye = self._scene.add_icosphere(
                 f"/devices/eye_{name}",
                 radius=0.011,
                 color=EYE,
-                position=scene.eyes.centre_world_m + np.array([offset, 0.0, 0.0]),
+                position=eyes_m + np.array([offset, 0.0, 0.0]),
             )
             self._add("Devices", eye)
             self._scene.add_icosphere(
                 f"/devices/eye_{name}/pupil", radius=0.006, color=TO_EYE, position=(0, 0, -0.0065)
             )
-
-    def _add_names(self, scene: Scene) -> None:
-        camera = scene.camera
-        baseline_m = -float(camera.right_from_left[0, 3])
-        centre = apply(pose_matrix(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0]))
-        named: dict[str, tuple[str, Any]] = {
-            "/names/camera": ("stereo camera", centre + NAME_ABOVE_M),
-            "/names/eyes": ("user's eyes", scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M),
-            "/names/left": ("left arm", scene.arms.left.world_from_base.position_m),
-            "/names/right": ("right arm", scene.arms.right.world_from_base.position_m),
-            "/finger/name": ("finger", FINGER_NAME_M),
-            "/right/clamp/name": ("rubber sheet", (0.0, 0.5 * scene.sheet.height_m + 0.012, 0.0)),
-        }
-        if scene.projector is not None:
-            position_m = np.asarray(scene.projector.world_from_projector.position_m)
-            named["/names/projector"] = ("projector", position_m + NAME_ABOVE_M)
-        for node, (text, position) in named.items():
-            self._add_name(node, text, position)
 
     def _add_name(self, node: str, text: str, position: Any) -> None:
         label = self._scene.add_label(
@@ -377,15 +357,12 @@ class SceneView:
     def _make_touchable(self, handle: Any) -> None:
         # Coroutines run in the server's own event loop, which keeps the order of the mouse events.
         async def dragged(event: Any) -> None:
-            if event.phase == "end":
-                self._released()
-                return
-            eye = np.array(event.client.camera.position)
-            self._touched(eye, np.array(event.end_position) - eye)
+            if event.phase != "end":
+                eye = np.array(event.client.camera.position)
+                self._touched(eye, np.array(event.end_position) - eye)
 
         async def clicked(event: Any) -> None:
             self._touched(np.array(event.ray_origin), np.array(event.ray_direction))
-            self._released()
 
         handle.on_drag("left")(dragged)
         handle.on_click(clicked)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse
@@ -20,9 +19,6 @@ COLUMNS, ROWS = 41, 41
 TRIANGLES = triangulate_grid(ROWS, COLUMNS)
 """The triangles (t, 3) of the sheet's grid, which are counter-clockwise as seen by the user."""
 MIN_EDGE_DISTANCE_M = 0.05
-NEAR = 6
-"""The number of rows and columns of grid cells near a vertex that are tested against a ray."""
-
 MIRRORED = 2
 """The number of mirror images of the finger beyond each free edge."""
 
@@ -68,9 +64,9 @@ def film(
 
     x, y: coordinates (n,) of the points, m. finger: position (x, y), m. size_m: width and height.
     The result is relative to the depth of the finger, and it is 1 within `radius_m` of the finger.
-    It solves Laplace's equation for a point force in an infinite strip, whose Green's function is
-    known from a conformal map. Mirror images of the finger model the free edges at y = +-height /
-    2.
+    The deflection solves Laplace's equation for a point force in an infinite strip. Its Green's
+    function follows from a conformal map. Mirror images of the finger model the free edges at y =
+    +-height / 2.
     """
     width_m, height_m = size_m
     finger_x, finger_y = finger
@@ -101,40 +97,3 @@ def _fractions() -> tuple[Floats, Floats]:
     """Return the positions of the grid's vertices as fractions (n, 1) of width and height."""
     up, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
     return across.reshape(-1, 1), up.reshape(-1, 1)
-
-
-def intersect_sheet(points: Floats, origin: Floats, towards: Floats) -> Floats:
-    """Intersect rays from `origin` (3,) through the points `towards` (n, 3) with the sheet.
-
-    points: vertices (ROWS * COLUMNS, 3) of the sheet.
-    Returns the intersections (n, 3), which are NaN for rays that miss the sheet. For each ray, only
-    the triangles near one vertex are tested: the vertex whose direction is nearest to the ray.
-    Source: Moeller and Trumbore 1997.
-    """
-    direction = towards - origin
-    directions = points - origin
-    directions = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
-    nearest = np.argmax(direction @ directions.T, axis=1)
-    triangles = TRIANGLES[_around(nearest)]
-    a, b, c = (points[triangles[..., i]] for i in range(3))
-    first, second, along = b - a, c - a, direction[:, None, :]
-    across, away = np.cross(along, second), np.cross(origin - a, first)
-    determinant = (first * across).sum(axis=2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = ((origin - a) * across).sum(axis=2) / determinant
-        v = (along * away).sum(axis=2) / determinant
-        length = (second * away).sum(axis=2) / determinant
-    inside = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (length > 0.0)
-    length = np.where(inside, length, np.inf).min(axis=1)
-    length[~np.isfinite(length)] = np.nan
-    return np.asarray(origin + length[:, None] * direction)
-
-
-def _around(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the indices (n, 2 * NEAR**2) of the triangles in the grid cells near n vertices."""
-    rows, columns = np.divmod(vertices, COLUMNS)
-    cells = np.arange(-NEAR // 2, NEAR - NEAR // 2)
-    row = np.clip(rows[:, None, None] + cells[None, :, None], 0, ROWS - 2)
-    column = np.clip(columns[:, None, None] + cells[None, None, :], 0, COLUMNS - 2)
-    cell = (row * (COLUMNS - 1) + column).reshape(len(vertices), -1)
-    return np.concatenate([cell, cell + (ROWS - 1) * (COLUMNS - 1)], axis=1)

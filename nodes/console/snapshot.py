@@ -10,17 +10,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, Fingertip, Skin, SoftBody
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.console.arms import compute_link_poses
 from flexsheet.nodes.console.latest_messages import MessageSource
-from flexsheet.nodes.console.sheet import compute_sheet_points, intersect_sheet
+from flexsheet.nodes.console.sheet import COLUMNS, ROWS, compute_sheet_points
 from flexsheet.nodes.models.rigid import pose_matrix
+from flexsheet.nodes.models.shapes.triangles import intersect_rays, triangulate_grid
 
 RAY_POSITIONS = (-0.55, 0.0, 0.55)
 """The positions of the drawn light rays, as fractions of half the object's width and height."""
+RAY_TRIANGLES = triangulate_grid(ROWS // 2 + 1, COLUMNS // 2 + 1)
+"""The triangles (t, 3) between every second row and column of the drawn sheet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,15 +55,15 @@ def compute_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
                 pose_matrix(arm.world_from_base), state[0].joints_rad, arm.model
             )
             edges[side] = state[0].world_from_flange @ pose_matrix(arm.flange_from_edge)
-    finger = _message(source.latest("fingertip", Fingertip))
-    tip = None if finger is None else finger.position_world_m
+    entry = source.latest("fingertip", Fingertip)
+    tip, valid = (None, False) if entry is None else (entry[0].position_world_m, entry[0].valid)
     sheet = None
     if len(edges) == 2:
         sheet = compute_sheet_points(
             edges["left"],
             edges["right"],
             height_m=scene.sheet.height_m,
-            fingertip=tip if finger is not None and finger.valid else None,
+            fingertip=tip if valid else None,
             finger_radius_m=scene.finger.radius_m,
         )
     return SceneSnapshot(
@@ -70,12 +72,8 @@ def compute_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
         sheet=sheet,
         skin=_skin(source),
         finger=tip,
-        finger_valid=finger is not None and finger.valid,
+        finger_valid=valid,
     )
-
-
-def _message(entry: tuple[Fingertip, Header] | None) -> Fingertip | None:
-    return None if entry is None else entry[0]
 
 
 def _skin(source: MessageSource) -> Floats | None:
@@ -121,8 +119,12 @@ def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
         return np.empty((0, 2, 3)), np.empty((0, 2, 3))
     eye = scene.eyes.centre_world_m
     projector = pose_matrix(scene.projector.world_from_projector)[:3, 3]
-    hits = intersect_sheet(sheet, eye, points)
-    hits = hits[np.isfinite(hits).all(axis=1)]
+    # Every second row and column is sufficient for a drawing, and four times as fast.
+    corners = sheet.reshape(ROWS, COLUMNS, 3)[::2, ::2].reshape(-1, 3)[RAY_TRIANGLES]
+    triangles, weights = intersect_rays(eye, points - eye, corners)
+    hits = np.einsum("nk,nki->ni", weights, corners[triangles])
+    # Remove misses, which are NaN, and intersections behind the eye.
+    hits = hits[((hits - eye) * (points - eye)).sum(axis=1) > 0.0]
     to_eye = np.stack([np.broadcast_to(eye, hits.shape), hits], axis=1)
     from_projector = np.stack([hits, np.broadcast_to(projector, hits.shape)], axis=1)
     return to_eye, from_projector

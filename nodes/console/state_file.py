@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -9,7 +10,31 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.console.finger import FingerIntent
-from flexsheet.nodes.console.scenes import SceneChoiceError
+from flexsheet.nodes.console.scenes import MIN_STRETCH_RATIO, SceneChoiceError
+
+
+@dataclass(frozen=True, slots=True)
+class Sliders:
+    """The positions of the sliders on the console page.
+
+    young_modulus_pa: Young's modulus of the object; None for a rigid object.
+    stretch_ratio: minimum stretch ratio of the sheet.
+    size_ratio: size of the object, relative to its size in the scene file.
+    """
+
+    young_modulus_pa: float | None
+    stretch_ratio: float
+    size_ratio: float
+
+    @staticmethod
+    def from_scene(scene: Scene) -> Sliders:
+        """Return the slider positions that correspond to an unchanged scene."""
+        material = scene.object.material
+        return Sliders(
+            None if material is None else material.young_modulus_pa,
+            max(scene.sheet.min_stretch_ratio, MIN_STRETCH_RATIO),
+            1.0,
+        )
 
 
 class ConsoleState(BaseModel):
@@ -23,7 +48,7 @@ class ConsoleState(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     base: Scene
-    sliders: tuple[float, float, float] | None = None
+    sliders: Sliders | None = None
     recording: bool = False
     finger: FingerIntent | None = None
 

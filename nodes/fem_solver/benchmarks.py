@@ -1,10 +1,10 @@
 """Measure the error and the time of the soft-body methods for `flexsheet chart soft-body`.
 
-The methods are the linear method, the nonlinear table, and Newton's method. They are compared with
-references, which are full Newton solutions of one push on separate, finer meshes. At each push
-depth the reference is the finest mesh whose solution converged there. The difference from the
-second finest mesh is taken as the uncertainty of the reference. Where no solution converged, the
-chart shows only the time and the maximum displacement of the skin (the surface of the body).
+The methods are the linear method, the nonlinear table, and Newton's method. The references are full
+Newton solutions of one push on separate, finer meshes. At each push depth, the reference is the
+finest mesh with a converged solution. The difference from the second finest mesh is taken as the
+uncertainty of the reference. Where no solution converged, the chart shows only the time and the
+maximum displacement of the skin (the surface of the body).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import structlog
@@ -24,9 +24,9 @@ from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver import snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
 from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
-from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import boundary_faces
 from flexsheet.nodes.fem_solver.newton import EquilibriumState, NeoHookeanBody
-from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, WorkBudget, load_or_compute
+from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, load_or_compute
 from flexsheet.nodes.fem_solver.reference import (
     LocalTable,
     ReferenceSolution,
@@ -34,7 +34,6 @@ from flexsheet.nodes.fem_solver.reference import (
     load_full_table,
     make_even_job,
     make_focused_job,
-    select_references,
     solve_cached_jobs,
 )
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
@@ -103,10 +102,11 @@ class SoftBodyBenchmark:
         """
         spec = make_soft_body_spec(self.scene, spacing_m)
 
-        def log_start(done: int, total: int, need: WorkBudget) -> None:
+        def log_start(done: int, total: int, need: str) -> None:
             if done == 0:
-                log = structlog.get_logger()
-                log.info("precomputing: soft body", spacing_m=spacing_m, need=need.text())
+                structlog.get_logger().info(
+                    "precomputing: soft body", spacing_m=spacing_m, need=need
+                )
 
         model = load_or_compute(spec, self.cache_dir, log_start)
         body = build_scene_body(
@@ -269,7 +269,7 @@ class ReferenceSet:
         converged at the depth.
         """
         off_finger = np.linalg.norm(rest - self.sample.point, axis=1) > self._rim_m
-        present = select_references(self._references, depth_m)
+        present = [one for one in self._references if one.reaches(depth_m)]
         expected = [reference.evaluate(depth_m, rest) for reference in present[:2]]
         uncertainty: dict[str, float] = {}
         if len(expected) > 1:
@@ -325,38 +325,32 @@ def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
     )
 
 
-def linear_benchmark(scene: Scene) -> SoftBodyBenchmark:
-    """Return a benchmark of the linear methods only, which needs no long precomputation."""
-    return replace(make_benchmark(scene), table_m={}, newton_m=())
+def _family(methods: Sequence[str], **changes: Any) -> Family:
+    """Return the benchmark of some soft-body methods.
+
+    changes: changed fields of the `SoftBodyBenchmark`.
+    """
+
+    def benchmark(scene: Scene) -> SoftBodyBenchmark:
+        return replace(make_benchmark(scene), **changes)
+
+    return Family(
+        name="soft-body",
+        unit="mm",
+        reference=(
+            "a neo-Hookean body of 10-node tetrahedra by Newton's method, at each depth on the "
+            "finest mesh that reaches it; beyond 1.5 finger radii from the push"
+        ),
+        methods=tuple(methods),
+        trials=lambda scene: benchmark(scene).trials(),
+        tolerance=lambda scene: 1e3 * scene.tolerances.skin_m,
+        sweep_key="depth_mm",
+        prepare=lambda scene, on_progress: benchmark(scene).prepare(on_progress),
+    )
 
 
-def table_benchmark(scene: Scene) -> SoftBodyBenchmark:
-    """Return a benchmark of the nonlinear tables only, which take minutes to precompute."""
-    return replace(make_benchmark(scene), linear_m={}, newton_m=())
-
-
-SOFT_BODY = Family(
-    name="soft-body",
-    unit="mm",
-    reference=(
-        "a neo-Hookean body of 10-node tetrahedra by Newton's method, at each depth on the finest "
-        "mesh that reaches it; beyond 1.5 finger radii from the push"
-    ),
-    methods=(*LINEAR_SPACINGS_M, *TABLE_SPACINGS_M, NEWTON),
-    trials=lambda scene: make_benchmark(scene).trials(),
-    tolerance=lambda scene: 1e3 * scene.tolerances.skin_m,
-    sweep_key="depth_mm",
-    prepare=lambda scene, on_progress: make_benchmark(scene).prepare(on_progress),
-)
-SOFT_BODY_LINEAR = replace(
-    SOFT_BODY,
-    methods=tuple(LINEAR_SPACINGS_M),
-    trials=lambda scene: linear_benchmark(scene).trials(),
-    prepare=lambda scene, on_progress: linear_benchmark(scene).prepare(on_progress),
-)
-SOFT_BODY_TABLES = replace(
-    SOFT_BODY,
-    methods=tuple(TABLE_SPACINGS_M),
-    trials=lambda scene: table_benchmark(scene).trials(),
-    prepare=lambda scene, on_progress: table_benchmark(scene).prepare(on_progress),
-)
+SOFT_BODY = _family([*LINEAR_SPACINGS_M, *TABLE_SPACINGS_M, NEWTON])
+SOFT_BODY_LINEAR = _family([*LINEAR_SPACINGS_M], table_m={}, newton_m=())
+SOFT_BODY_TABLES = _family([*TABLE_SPACINGS_M], linear_m={}, newton_m=())
+"""The families of all methods, of the linear methods, and of the nonlinear tables. The linear
+methods need no long precomputation. The tables need minutes."""

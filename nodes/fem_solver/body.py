@@ -18,7 +18,7 @@ from flexsheet.nodes.fem_solver.closest_contact import (
     slide_anchor,
 )
 from flexsheet.nodes.fem_solver.contact import LinearSoftBody, Response, SoftBodyMethod
-from flexsheet.nodes.fem_solver.mesh import MeshSpec, mesh_spec, world_from_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec, mesh_spec, world_from_mesh
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
 from flexsheet.nodes.fem_solver.precompute_table import TableSpec
 from flexsheet.nodes.fem_solver.table import Table, TableSoftBody
@@ -79,16 +79,6 @@ def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
     return TableSpec(spec, scene.finger.radius_m)
 
 
-def find_front_point(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
-    """Return the surface point (3,), in m, mesh frame, that is nearest to the user.
-
-    rest (s, 3): undeformed skin nodes, m.
-    """
-    middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
-    away = 2.0 * float(np.ptp(rest, axis=0).max())
-    return shape.closest(middle + away * np.array(spec.mesh.towards_user)).point
-
-
 @dataclass(frozen=True, slots=True)
 class SceneBody:
     """A soft body of a scene, in its pose in the world.
@@ -138,9 +128,7 @@ class SceneBody:
         return response, new_anchor
 
     def at_rest(self) -> Response:
-        """Return the response without contact. Its stiffness is that of the surface point nearest
-        to the user.
-        """
+        """Return the response without contact, with the stiffness at the front of the object."""
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -196,7 +184,7 @@ def build_scene_body(
     """Build the soft body of a scene from its precomputed model.
 
     linear_depth_m: maximum depth at which the linear method is valid. max_depth_m: depth that
-    limits the displacement. friction_ratio: friction coefficient between finger and skin. Raise
+    limits the displacement. friction_ratio: friction coefficient between finger and skin. Raises
     ValueError unless 0 < linear_depth_m < max_depth_m, or if the axis of a cylinder points to the
     user.
     """
@@ -214,6 +202,10 @@ def build_scene_body(
         push_depth_m=scene.working_range.push_depth_m,
         drag=model.drag,
     )
+    # The point of the surface that is nearest to the user.
+    middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
+    away = 2.0 * float(np.ptp(rest, axis=0).max())
+    front = shape.closest(middle + away * np.array(spec.mesh.towards_user)).point
     pose_digest = hashlib.sha256(pose.tobytes()).hexdigest()[:8]
     skin = Skin(
         mesh_id=f"{spec.key()[:12]}-{pose_digest}",
@@ -224,7 +216,7 @@ def build_scene_body(
         method=method,
         spec=spec,
         shape=shape,
-        front=find_front_point(shape, spec, rest),
+        front=front,
         world_from_mesh=pose,
         rest=rest,
         skin=skin,
@@ -276,8 +268,8 @@ def blend_responses(old: Response, new: Response, weight: float) -> Response:
 def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:
     """Return the response at the time `lost_s` after the last measurement of the finger.
 
-    response: last response before the finger was lost. It is unchanged for the time `hold_s`, and
-        then decays exponentially with the time constant `relax_s`.
+    response: last response before the finger was lost. The response is unchanged for the time
+    `hold_s`, and then decays with the time constant `relax_s`.
     """
     if lost_s <= hold_s:
         return response

@@ -1,7 +1,7 @@
 """Find the contact point of a fingertip on a smooth shape.
 
 If the fingertip is deep inside the shape, the nearest surface point is ambiguous. Therefore the
-choice depends on the previous contact point, which is called the anchor.
+choice depends on the previous contact point, called the anchor.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ FLANK_RATIO = 0.9
 """The distance from the push axis, in finger radii, beyond which the spherical fingertip is
 approximated by a tangent cone."""
 FACING = (0.2, 0.6)
-"""The range of the cosine of the angle between skin normal and contact normal in which the weight
-of the penetration rises from 0 to 1."""
+"""The range in which the weight of the penetration rises from 0 to 1. The values are cosines of the
+angle between skin normal and contact normal."""
 PAD_RATIO = 1.1
 """The half width of the contact patch at the end of the linear range, in finger radii."""
 TANGENTIAL_COMPLIANCE_RATIO = 0.004
@@ -112,23 +112,21 @@ class SoftBodyMethod(Protocol):
     def at_rest(self) -> Singles: ...
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return the stiffness (N/m) of the touchable skin at the point nearest to a surface point
-        (3,).
+        """Return the stiffness (N/m) of the touchable skin near a surface point (3,).
+
+        The stiffness is the force divided by the depth at the end of the linear range.
         """
         ...
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force-depth curve (n, 2) of the touchable skin at the point nearest to a
-        surface point (3,).
+        """Return the force-depth curve (n, 2) of the touchable skin near a surface point (3,).
 
         The columns are depth (m) and force (N). Both start at 0 and never decrease.
         """
         ...
 
     def respond(self, query: ContactQuery) -> Response:
-        """Compute the displacement of the skin and the contact force for a contact with the
-        finger.
-        """
+        """Compute the displacement of the skin and the force on the finger."""
         ...
 
 
@@ -148,19 +146,6 @@ class NormalContact:
     weights: Floats
     normals: Floats
     pressed_n: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class Drag:
-    """The tangential contact forces between skin and finger.
-
-    nodes (k,): indices of the loaded contact nodes. forces (k, 2): forces (N) along the two
-    tangents of each of these nodes. force_n (3,): total tangential force on the finger, N.
-    """
-
-    nodes: Ints
-    forces: Floats
-    force_n: Floats
 
 
 def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
@@ -201,9 +186,7 @@ def sample_triangle(divisions: int) -> tuple[Floats, Floats]:
 
 
 class SphereContact:
-    """A solver of the frictionless contact between a linear body and a spherical fingertip. It has
-    no state.
-    """
+    """A solver of the frictionless contact between a linear body and a spherical fingertip."""
 
     def __init__(
         self,
@@ -309,18 +292,19 @@ class DragContact:
     def __init__(
         self, response: DragResponse, *, young_modulus_pa: float, finger_radius_m: float
     ) -> None:
-        self._response = response
+        self.influence, self._tangents = response.influence, response.tangents
         self._compliance = response.compliance / young_modulus_pa
         self._full_load_slip_m = TANGENTIAL_COMPLIANCE_RATIO * finger_radius_m
 
-    def solve(self, contact: NormalContact, drag: Floats) -> Drag:
+    def solve(self, contact: NormalContact, drag: Floats) -> tuple[Ints, Floats, Floats]:
         """Return the tangential forces of a sticking finger for a given normal contact.
 
-        drag (3,): displacement of the finger since it started to stick, m.
+        drag (3,): displacement of the finger since it started to stick, m. Return row indices (2k,)
+        of `influence`, the forces (2k,), N, of these rows, and the total force (3,) on the finger.
         """
         nodes, count = contact.nodes, len(contact.nodes)
         rows = (2 * nodes[:, None] + np.arange(2)).ravel()
-        across = self._response.tangents[nodes]
+        across = self._tangents[nodes]
         along = np.eye(3) - contact.normals[:, :, None] * contact.normals[:, None, :]
         # Tangential displacement of the contact points (3 q) per displacement of the nodes along
         # their two tangents (2 k).
@@ -330,8 +314,8 @@ class DragContact:
         target_drag = (along @ drag).ravel()
         loads = moved.T * springs
         system = np.eye(2 * count) + loads @ moved @ self._compliance[np.ix_(rows, rows)]
-        forces = np.linalg.solve(system, loads @ target_drag).reshape(-1, 2)
-        return Drag(nodes, forces, -np.einsum("ka,kai->i", forces, across))
+        forces = np.linalg.solve(system, loads @ target_drag)
+        return rows, forces, -np.einsum("ka,kai->i", forces.reshape(-1, 2), across)
 
 
 def solve_penalty_contact(
@@ -391,10 +375,10 @@ def _search_step(
 
 
 class LinearSoftBody:
-    """The linear soft-body method, which superposes precomputed responses to unit forces.
+    """The linear soft-body method: a superposition of precomputed responses to unit forces.
 
-    Pushes deeper than `linear_depth_m` are reported as out of range. Their force grows in
-    proportion to the depth. Their displacement grows up to the depth `max_depth_m` only.
+    Pushes deeper than `linear_depth_m` are reported as out of range. For these pushes, the force is
+    proportional to the depth, and the displacement grows up to the depth `max_depth_m` only.
     """
 
     name = "linear"
@@ -416,7 +400,7 @@ class LinearSoftBody:
 
         bounds (b, 3): positions of skin nodes that must not be touched. Pushes next to these nodes
         are reported as out of range. push_depth_m: depth at which the force curve ends; None for
-        `max_depth_m`. drag: tangential response for a sticking finger; None for no friction. Raise
+        `max_depth_m`. drag: tangential response for a sticking finger; None for no friction. Raises
         ValueError unless 0 < linear_depth_m < max_depth_m.
         """
         if not 0.0 < linear_depth_m < max_depth_m:
@@ -427,10 +411,9 @@ class LinearSoftBody:
         self.contact = SphereContact(
             response, shape, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
         )
-        self._drag = None if drag is None else drag.influence
-        self._drag_contact = None
+        self._drag: DragContact | None = None
         if drag is not None:
-            self._drag_contact = DragContact(
+            self._drag = DragContact(
                 drag, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
             )
         self._response = response
@@ -453,9 +436,6 @@ class LinearSoftBody:
         self._smoothing2 = max(float(max_edge_m), finger_radius_m) ** 2
 
     def respond(self, query: ContactQuery) -> Response:
-        """Compute the displacement of the skin and the contact force for a contact with the
-        finger.
-        """
         depth = saturate_depth(query.depth_m, self._linear, self._largest)
         contact = self.contact.solve(query, depth)
         curve = self.force_curve(query.surface)
@@ -465,11 +445,10 @@ class LinearSoftBody:
             return Response(self.at_rest, np.zeros(3), stiffness, curve, 0.0, clear)
         total = self._sum(self._response.influence, contact.nodes, contact.forces)
         force = contact.force_n
-        if self._drag_contact is not None and self._drag is not None and query.drag_m is not None:
-            dragged = self._drag_contact.solve(contact, query.drag_m)
-            rows = (2 * dragged.nodes[:, None] + np.arange(2)).ravel()
-            total += self._sum(self._drag, rows, dragged.forces.ravel())
-            force = force + dragged.force_n
+        if self._drag is not None and query.drag_m is not None:
+            rows, drag_forces, drag_n = self._drag.solve(contact, query.drag_m)
+            total += self._sum(self._drag.influence, rows, drag_forces)
+            force = force + drag_n
         return Response(
             displacement=total.reshape(-1, 3),
             force_n=force * (query.depth_m / depth if query.depth_m > depth else 1.0),
@@ -478,29 +457,14 @@ class LinearSoftBody:
             push_depth_m=max(0.0, query.depth_m - query.beyond_m),
             in_range=query.depth_m <= self._linear
             and query.beyond_m == 0.0
-            and self._clears_bounds(query.surface),
+            and bool((np.square(self._bounds - query.surface).sum(axis=1) >= self._pad2).all()),
         )
 
-    def _clears_bounds(self, surface: Floats) -> bool:
-        """Return whether the finger may touch all skin near a surface point (3,)."""
-        if not len(self._bounds):
-            return True
-        return bool(np.square(self._bounds - surface).sum(axis=1).min() >= self._pad2)
-
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return the force divided by depth (N/m) at the end of the linear range near a surface
-        point (3,).
-
-        The value does not depend on the current push and is available before contact.
-        """
         forces = self._weights(surface) @ self._corner_forces
         return float(forces[len(CURVE_FRACTIONS)]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force-depth curve (n, 2) near a surface point (3,).
-
-        The columns are depth (m) and force (N). The force is a weighted mean over the mesh corners.
-        """
         return np.column_stack([self._depths, self._weights(surface) @ self._corner_forces])
 
     def _weights(self, surface: Floats) -> Floats:

@@ -40,9 +40,7 @@ class SchedulerError(precompute_table.WorkersError):
 
 
 class DaskExecutor(Executor):
-    """An executor that runs functions on the workers of a dask scheduler, and can stop running
-    functions.
-    """
+    """Execute functions on the workers of a dask scheduler, and cancel running functions."""
 
     def __init__(self, client: distributed.Client) -> None:
         self._client = client

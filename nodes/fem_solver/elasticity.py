@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.nodes.arrays import Bools, Floats, Ints
-from flexsheet.nodes.fem_solver.mesh import EDGES
+from flexsheet.nodes.arrays import Floats, Ints
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 MAX_POISSON_RATIO = 0.4999
 """The maximum Poisson's ratio. For larger ratios, rounding errors make the solution useless."""
@@ -22,10 +22,10 @@ flatter elements, rounding errors make the solution useless."""
 
 
 class SolidMeshError(FlexsheetError, ValueError):
-    """Raised for a mesh with inverted elements or insufficient support."""
+    """Raised for a mesh with inverted or flat elements."""
 
     code = "solid-mesh"
-    remedy = "Increase skin_spacing_m, or fix more of the object; see docs/soft-body-reference.md."
+    remedy = "Increase skin_spacing_m; see docs/soft-body-reference.md."
 
 
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
@@ -82,7 +82,7 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     """Return Jacobian matrices (e, q, 3, 3) and their determinants (e, q).
 
     The matrices belong to the map from the unit tetrahedron to each element. nodes (n, 3), m,
-    elements (e, 10): mesh. local (q, 10, 3): gradients of the shape functions at q points. Raise
+    elements (e, 10): mesh. local (q, 10, 3): gradients of the shape functions at q points. Raises
     SolidMeshError if an element is inverted or flat, or if the coordinates of a node are not
     finite.
     """
@@ -128,26 +128,6 @@ def element_stiffness(
     for axis in range(3):
         stiffness[:, :, axis, :, axis] += trace
     return stiffness.reshape(-1, 30, 30)
-
-
-def require_support(nodes: Floats, fixed: Bools) -> None:
-    """Raise SolidMeshError if all fixed nodes are collinear, because the body could rotate freely.
-
-    nodes (n, 3): positions, m. fixed (n,): whether each node is fixed.
-    """
-    fixed_nodes = nodes[fixed]
-    extent = np.ptp(nodes, axis=0).max()
-    if (
-        len(fixed_nodes) < 3
-        or np.linalg.matrix_rank(
-            fixed_nodes - fixed_nodes.mean(axis=0), tol=1e-6 * extent * len(fixed_nodes) ** 0.5
-        )
-        < 2
-    ):
-        raise SolidMeshError(
-            f"the body is free to move: it has {len(fixed_nodes)} fixed nodes, and at least three "
-            "that are not collinear are required; enlarge object.support or reduce skin_spacing_m"
-        )
 
 
 def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:

@@ -24,7 +24,7 @@ from flexsheet.nodes.fem_solver.elasticity import (
     scatter_add,
     shape_gradients,
 )
-from flexsheet.nodes.fem_solver.mesh import EDGES
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 CORNERS = np.vstack([np.zeros(3), np.eye(3)])
 NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
@@ -46,7 +46,7 @@ class NeoHookeanSolid:
     ) -> None:
         """Compute the shape function gradients and the volumes of the elements.
 
-        nodes (n, 3): positions of the nodes, m. elements (e, 10): node indices. Raise
+        nodes (n, 3): positions of the nodes, m. elements (e, 10): node indices. Raises
         SolidMeshError for inverted elements, and ValueError for an invalid material.
         """
         self.nodes, self.elements = nodes, elements
@@ -80,7 +80,7 @@ class NeoHookeanSolid:
         return gradient, determinants(gradient)
 
     def energy(self, displacement: Floats) -> float:
-        """Return the elastic energy in joules, which is infinite if an element is inverted.
+        """Return the elastic energy in joules, or infinity if an element is inverted.
 
         displacement (n, 3): displacement of the nodes, m.
         """
@@ -93,7 +93,7 @@ class NeoHookeanSolid:
         return float((self._volumes * density).sum())
 
     def forces(self, displacement: Floats) -> Floats:
-        """Return the elastic nodal forces (n, 3), N, which are the gradient of the energy.
+        """Return the elastic nodal forces (n, 3), N: the gradient of the energy.
 
         displacement (n, 3): displacement of the nodes, m. Raises InvertedElementError if an element
         is inverted.
@@ -111,7 +111,7 @@ class NeoHookeanSolid:
         The tangent stiffness is the second derivative of the energy. For the nodes a and b of an
         element, let g_a and g_b be the gradients of their shape functions, and h = F^-T g. The
         block of these nodes is the integral of mu (g_a . g_b) I + lambda h_a h_b^T + (mu - lambda
-        ln J) h_b h_a^T. displacement (n, 3): displacement of the nodes, m. Raise
+        ln J) h_b h_a^T. displacement (n, 3): displacement of the nodes, m. Raises
         InvertedElementError if an element is inverted.
         """
         _, inverse, log = self._state(displacement)

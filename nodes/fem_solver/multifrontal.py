@@ -52,9 +52,7 @@ class Front:
 
 @dataclass(frozen=True, slots=True)
 class Factors:
-    """The Cholesky factors L of a stiffness matrix K = L L^T, which are stored in the precision of
-    K.
-    """
+    """The Cholesky factors L of a stiffness matrix K = L L^T, in the precision of K."""
 
     fronts: list[Front]
     diagonal: list[Floats]
@@ -102,9 +100,7 @@ class _Part:
 
 
 class NestedDissection:
-    """An elimination order of the stiffness matrix of a mesh, which reduces the work of the
-    factorization.
-    """
+    """An order of elimination that makes the factorization of a mesh's stiffness matrix fast."""
 
     def __init__(self, nodes: Floats, elements: Ints, fixed: Bools) -> None:
         """Compute the elimination order.
@@ -176,8 +172,8 @@ class NestedDissection:
     def _split(self, members: Ints) -> tuple[int, Ints, Ints]:
         """Divide elements recursively, and append each part after its halves to the list of parts.
 
-        members: indices of the elements. Return the index of the last part, its free nodes (k,),
-        and the number of its elements (k,) that use each of these nodes.
+        members: indices of the elements. Return the index of the last part, the free nodes (k,) of
+        this part, and the number of elements of the part at each of these nodes (k,).
         """
         if len(members) <= LEAF_ELEMENTS:
             present, counts = np.unique(self._elements[members], return_counts=True)

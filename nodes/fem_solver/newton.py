@@ -24,7 +24,7 @@ from flexsheet.nodes.arrays import Bools, Floats, Ints
 from flexsheet.nodes.fem_solver.contact import POINT_SPACING_RATIO, sample_triangle
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from flexsheet.nodes.fem_solver.mesh import FACES, SUBTRIANGLES, nodes_in_planes, skin_faces
+from flexsheet.nodes.fem_solver.mesh.solid import FACES, SUBTRIANGLES, nodes_in_planes, skin_faces
 from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, NestedDissection
 
 PENALTY_RATIO = 200.0
@@ -137,8 +137,7 @@ class FingerObstacle:
         return float(self._penalty[inner] @ density)
 
     def forces(self, positions: Floats, centre: Floats) -> Floats:
-        """Return the force (n, 3), N, of each node on the finger, which is the gradient of the
-        energy.
+        """Return the force (n, 3), N, of each node on the finger: the gradient of the energy.
 
         positions (n, 3): nodes, m. centre (3,): centre of the sphere, m.
         """
@@ -195,7 +194,7 @@ class FingerObstacle:
 
 
 class NeoHookeanBody:
-    """A neo-Hookean (hyperelastic) body with fixed nodes, which a finger pushes."""
+    """A solver for a neo-Hookean (hyperelastic) body with fixed nodes and a pushing finger."""
 
     def __init__(
         self,
@@ -304,8 +303,8 @@ class NeoHookeanBody:
     ) -> tuple[Floats, Factors | None]:
         """Find the equilibrium with the sphere at `centre` (3,) by Newton's method.
 
-        The iteration starts at `displacement` or `guess` (n, 3), m. It uses the start with less
-        energy. Return the displacement (n, 3) at equilibrium and the last factors of the tangent
+        The iteration starts at `displacement` or `guess` (n, 3), m. The start with less energy is
+        used. Return the displacement (n, 3) at equilibrium and the last factors of the tangent
         stiffness. Raises NewtonNotConvergedError if the iteration does not converge.
         """
         nodes = self.solid.nodes

@@ -94,7 +94,7 @@ class FemSolver(Node):
             self.note = f"soft body by {self._describe(bodies[0])}"
 
     def _describe(self, current: body.SceneBody) -> str:
-        """Return the method in use, its force error and its number of skin nodes as a text."""
+        """Return a text with the current method, the force error, and the number of skin nodes."""
         nodes = len(current.skin.vertices_world_m)
         bodies = (current, *(old for old, _ in self._replaced))
         errors = " and ".join(
@@ -175,12 +175,12 @@ class FemSolver(Node):
         else:
             self._set_bodies([best, linear])
 
-    def _progress(self, stop: Event, done: int, total: int, need: precompute.WorkBudget) -> None:
+    def _progress(self, stop: Event, done: int, total: int, need: str) -> None:
         if stop.is_set() or self._stop.is_set():
             raise precompute.Interrupted
         eta = self._eta.text(done, total, self.clock.now_ns() * 1e-9)
         now = "".join(f"; now {self._describe(one)}" for one in [*self._bodies.values()][:1])
-        self.note = f"precomputing the soft body: {eta} ({need.text()}){now}"
+        self.note = f"precomputing the soft body: {eta} ({need}){now}"
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         if not self._bodies:

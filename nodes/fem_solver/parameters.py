@@ -1,4 +1,4 @@
-"""Define the parameters of the soft-body node, which a launch file sets."""
+"""Define the parameters of the soft-body node that a launch file can set."""
 
 from __future__ import annotations
 

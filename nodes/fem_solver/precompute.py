@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,14 @@ from flexsheet.messages.scene import Plane
 from flexsheet.nodes.arrays import Bools, Floats, Ints, Singles
 from flexsheet.nodes.cache import CheckpointStore, Specification, cached, encode_fields, make_digest
 from flexsheet.nodes.fem_solver.contact import DragResponse, SkinResponse
-from flexsheet.nodes.fem_solver.mesh import MeshSpec, SolidMesh, build_mesh, mesh_budget
+from flexsheet.nodes.fem_solver.mesh.from_scene import (
+    BYTES_PER_NODE,
+    MeshSpec,
+    build_mesh,
+    estimate_node_count,
+)
+from flexsheet.nodes.fem_solver.mesh.solid import SolidMesh
+from flexsheet.nodes.models.shapes import make_shape
 
 if TYPE_CHECKING:
     from flexsheet.nodes.fem_solver.multifrontal import Factors, NestedDissection
@@ -34,16 +41,10 @@ MESH_STEPS, FACTOR_STEPS = 1, 4
 """The approximate durations of meshing and of factoring the stiffness matrix, in units of the
 duration of one load. They are used for progress reports."""
 
-Progress = Callable[[int, int, "WorkBudget"], None]
-"""A callback that receives the number of finished steps, the total number and the required
-resources. The first call is before the work starts. The callback may raise `Interrupted` to stop
-the work."""
-
-
-class WorkBudget(Protocol):
-    """The interface of an estimate of the resources that a computation needs."""
-
-    def text(self) -> str: ...
+Progress = Callable[[int, int, str], None]
+"""A callback that receives the number of finished steps, the total number, and a text about the
+required resources. The first call is before the work starts. The callback may raise `Interrupted`
+to stop the work."""
 
 
 class Interrupted(Exception):
@@ -74,7 +75,7 @@ class SoftBodySpec:
         return [VERSION, self.mesh.key(), self.poisson_ratio, self.sticking]
 
     def key(self) -> str:
-        """Return a digest of the inputs and of `VERSION`, which identifies the result."""
+        """Return a digest of the inputs and of `VERSION`, as an identifier of the result."""
         return make_digest(self.depends_on())
 
 
@@ -141,15 +142,15 @@ def estimate_budget(spec: SoftBodySpec) -> ResponseBudget:
 
     Raises UnfitMeshError if the skin spacing does not fit the object or requires too many nodes.
     """
-    nodes = mesh_budget(spec.mesh)
+    nodes = estimate_node_count(spec.mesh, make_shape(dict(spec.mesh.geometry)))
     # Empirical numbers of skin nodes, and of touchable nodes among them.
-    skin = int(6.0 * nodes.nodes ** (2.0 / 3.0))
+    skin = int(6.0 * nodes ** (2.0 / 3.0))
     loads, geometry = skin // 2, spec.mesh.geometry
     if isinstance(geometry, Plane):
         loads = int(geometry.width_m * geometry.height_m / spec.mesh.skin_spacing_m**2)
     loads *= spec.loads_per_node
     return ResponseBudget(
-        skin, loads, nodes.bytes + 16_000 * nodes.nodes, loads * (skin * 12 + loads * 8)
+        skin, loads, (BYTES_PER_NODE + 16_000) * nodes, loads * (skin * 12 + loads * 8)
     )
 
 
@@ -159,41 +160,38 @@ def compute(
     """Mesh the object, factor its stiffness matrix, and compute the response to a unit force on
     each touchable node.
 
-    checkpoints: store of finished parts, from which an interrupted computation can continue. Raise
-    SolidMeshError for a body without sufficient support, ValueError for an invalid material or
+    checkpoints: store of finished parts, from which an interrupted computation can continue. Raises
+    UnfitMeshError for an object that cannot be meshed, ValueError for an invalid material or
     size, and MemoryError if the free memory is insufficient.
     """
     from flexsheet.nodes.fem_solver.elasticity import (
         element_stiffness,
         lame_constants,
-        require_support,
     )
     from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
-    from flexsheet.nodes.models.shapes import make_shape
 
     lame_constants(1.0, spec.poisson_ratio)
     need = estimate_budget(spec)
-    progress(0, need.loads + MESH_STEPS + FACTOR_STEPS, need)
+    progress(0, need.loads + MESH_STEPS + FACTOR_STEPS, need.text())
     need.require_memory(spec.mesh.skin_spacing_m)
     mesh = build_mesh(spec.mesh)
-    require_support(mesh.nodes, mesh.fixed)
     order = NestedDissection(mesh.nodes, mesh.elements, mesh.fixed)
     need = compute_budget(mesh, order, spec.loads_per_node)
     need.require_memory(spec.mesh.skin_spacing_m)
-    done, total = MESH_STEPS, need.loads + MESH_STEPS + FACTOR_STEPS
-    progress(done, total, need)
+    done, total = 0, need.loads + MESH_STEPS + FACTOR_STEPS
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(done, total, need.text())
+
+    advance(MESH_STEPS)
     matrices = element_stiffness(
         mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=spec.poisson_ratio
     )
     factors = order.factor(matrices)
     del matrices
-    done += FACTOR_STEPS
-    progress(done, total, need)
-
-    def advance(count: int) -> None:
-        nonlocal done
-        done += count
-        progress(done, total, need)
+    advance(FACTOR_STEPS)
 
     def make_part_getter(name: str) -> Callable[[int, Callable[[], Part]], Part]:
         if checkpoints is None:
@@ -239,8 +237,8 @@ def _solve_unit_loads(
 
     directions (m, p, 3): unit vectors. get_part: function that loads the stored part with an index,
     or computes and stores it. advance: function that receives the number of newly finished loads.
-    Return two arrays of displacements per force, m/N: those of the s skin nodes (m p, 3 s), and
-    those of the contact nodes along each direction (m p, m p).
+    Return the displacements per force, m/N, of the s skin nodes (m p, 3 s), and of the contact
+    nodes along each direction (m p, m p).
     """
     each = directions.shape[1]
     loads = len(mesh.contact_nodes) * each
@@ -324,7 +322,7 @@ def response_cache(spec: SoftBodySpec) -> Specification[SoftBodyModel]:
 def load_or_compute(spec: SoftBodySpec, cache_dir: Path, progress: Progress) -> SoftBodyModel:
     """Load the cached model, or compute and store it.
 
-    Raises SolidMeshError for a body without sufficient support, ValueError for an invalid material
+    Raises UnfitMeshError for an object that cannot be meshed, ValueError for an invalid material
     or size, and MemoryError if the free memory is insufficient.
     """
     entry = response_cache(spec)

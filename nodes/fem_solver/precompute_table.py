@@ -36,9 +36,9 @@ from flexsheet.nodes.background import enter_background
 from flexsheet.nodes.cache import CheckpointStore, Specification, cached, encode_fields
 from flexsheet.nodes.fem_solver import precompute, snapshots
 from flexsheet.nodes.fem_solver.contact import unit_linear_body
-from flexsheet.nodes.fem_solver.mesh import build_mesh
 from flexsheet.nodes.fem_solver.mesh.from_scene import VERSION as mesh_version
-from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
+from flexsheet.nodes.fem_solver.precompute import Progress, SoftBodyModel, SoftBodySpec
 from flexsheet.nodes.fem_solver.shipped_pushes import load_shipped, shipped_path
 from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotSet
 from flexsheet.nodes.fem_solver.table import (
@@ -62,11 +62,6 @@ POLL_S = 0.2
 SNAPSHOT_BYTES = 600_000_000
 """The approximate memory that the solution of one snapshot needs, in bytes."""
 
-Progress = Callable[[int, int, "TableBudget"], None]
-"""A callback that receives the number of finished steps, the total number and the required
-resources. The first call is before the work starts. The callback may raise `precompute.Interrupted`
-to stop the work."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableSpec:
@@ -78,26 +73,6 @@ class TableSpec:
     def depends_on(self) -> list[object]:
         """Return all inputs of the table as a JSON value."""
         return [VERSION, self.body.key(), self.finger_radius_m]
-
-
-@dataclass(frozen=True, slots=True)
-class TableBudget:
-    """An estimate of the resources that the computation of a table needs.
-
-    snapshots, nodes: number of snapshots, and of nodes of the table. bytes: memory. coarse: whether
-    the table is the coarse table, which is computed first.
-    """
-
-    snapshots: int
-    nodes: int
-    bytes: int
-    coarse: bool = False
-
-    def text(self) -> str:
-        return (
-            f"{'coarse' if self.coarse else 'complete'} table, {self.snapshots} snapshots for "
-            f"{self.nodes} nodes, {self.bytes / 1e6:.0f} MB"
-        )
 
 
 @contextmanager
@@ -182,9 +157,9 @@ def compute_table(
     """Load the cached table, or compute and store it.
 
     model: linear response of the same body. workers: number of workers of the executor on this
-    computer. on_quick: function that receives a coarse table, which is ready much earlier than the
-    complete table; None to omit the coarse table. Raises MemoryError if this computer has too
-    little memory. Raises LostWorkersError if the executor loses its workers.
+    computer. on_quick: function that receives a coarse table long before the complete table is
+    ready; None to omit the coarse table. Raises MemoryError if this computer has too little memory.
+    Raises LostWorkersError if the executor loses its workers.
     """
     entry = make_table_cache(spec)
     checkpoints = entry.checkpoints(cache_dir)
@@ -231,7 +206,7 @@ def _compute_table(
     table = table_bytes(loads, len(response.rest), len(snapshots.DEPTHS_M))
 
     def compute_stage(
-        name: str, some: list[snapshots.SamplePoint], depths_m: tuple[float, ...], *, coarse: bool
+        name: str, stage: str, some: list[snapshots.SamplePoint], depths_m: tuple[float, ...]
     ) -> Table:
         jobs = [
             snapshots.make_snapshot_job(mesh_spec, mesh, sample, depths_m=depths_m, **given)
@@ -242,15 +217,18 @@ def _compute_table(
             # Both stages need the fine push. The second stage loads it from the checkpoints.
             jobs, names = [fine_job, *jobs], ["fine", *names]
         solving = SNAPSHOT_STEPS * len(jobs)
-        need = TableBudget(len(jobs), loads, 2 * table + workers * SNAPSHOT_BYTES, coarse=coarse)
+        required_bytes = 2 * table + workers * SNAPSHOT_BYTES
+        need = (
+            f"{stage} table, {len(jobs)} snapshots for {loads} nodes, {required_bytes / 1e6:.0f} MB"
+        )
 
         def report(steps: int) -> None:
             progress(steps, solving + NODE_STEPS * loads, need)
 
         report(0)
         precompute.require_memory(
-            need.bytes,
-            f"the computation of the nonlinear table of the soft body ({need.text()})",
+            required_bytes,
+            f"the computation of the nonlinear table of the soft body ({need})",
             f"increase skin_spacing_m above {mesh_spec.skin_spacing_m:g}, or set method to "
             '"linear"',
         )
@@ -272,8 +250,8 @@ def _compute_table(
 
     if on_quick is not None:
         some = samples[: snapshots.QUICK_COUNT]
-        on_quick(compute_stage("quick", some, snapshots.QUICK_DEPTHS_M, coarse=True))
-    return compute_stage("push", samples, snapshots.DEPTHS_M, coarse=False)
+        on_quick(compute_stage("quick", "coarse", some, snapshots.QUICK_DEPTHS_M))
+    return compute_stage("push", "complete", samples, snapshots.DEPTHS_M)
 
 
 def _interpolate_by(

@@ -27,7 +27,7 @@ from flexsheet.nodes.cache import (
 from flexsheet.nodes.fem_solver import snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody, attach_table, make_table_spec
 from flexsheet.nodes.fem_solver.contact import unit_linear_body
-from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import build_mesh
 from flexsheet.nodes.fem_solver.precompute import SoftBodyModel
 from flexsheet.nodes.fem_solver.precompute_table import local_processes, make_table_cache, solve_all
 from flexsheet.nodes.fem_solver.snapshot_interpolator import (
@@ -71,13 +71,6 @@ class ReferenceSolution:
         return displacement, float(self.snapshot.force_n[level] @ self.sample.normal)
 
 
-def select_references(
-    references: Sequence[ReferenceSolution], depth_m: float
-) -> list[ReferenceSolution]:
-    """Return the references that converged at a push depth, in order of decreasing accuracy."""
-    return [reference for reference in references if reference.reaches(depth_m)]
-
-
 def make_focused_job(
     body: SceneBody, scene: Scene, sample: SamplePoint, ratio: float, depths_m: Sequence[float]
 ) -> SnapshotJob:
@@ -118,7 +111,7 @@ def solve_cached_jobs(
 ) -> list[Snapshot]:
     """Load the snapshots of jobs from the cache. Compute and cache the missing snapshots.
 
-    on_progress: function that receives the number of finished jobs and the total number. Raise
+    on_progress: function that receives the number of finished jobs and the total number. Raises
     OSError if a cache file cannot be read after it was written.
     """
     cache = CheckpointStore(cache_dir)

@@ -1,5 +1,4 @@
-"""Load precomputed pushes (snapshots) of the coarse table, which are shipped with the package for
-some scenes.
+"""Load the pushes (snapshots) of the coarse table that the package contains for some scenes.
 
 For these scenes, the coarse table is available without a long computation. The files are in the
 folder `pushes`, and are named by the key of the table. The command `python -m

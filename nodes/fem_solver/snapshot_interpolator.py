@@ -1,9 +1,9 @@
 """Interpolate snapshots between their sample points, in order to fill a nonlinear table.
 
 A snapshot is the solution for pushes at one sample point to several depths. Near the finger, the
-displacement field is transported, which means that it is shifted and rotated from the sample point
-to the new point. Far from the finger, the field is not transported, because the ends and supports
-of the body do not move with the finger.
+displacement field is transported: shifted and rotated from the sample point to the new point. Far
+from the finger, the field is not transported, because the ends and supports of the body do not move
+with the finger.
 """
 
 from __future__ import annotations

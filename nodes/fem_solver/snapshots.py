@@ -18,15 +18,9 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.scene import Cylinder, StripSupport
 from flexsheet.nodes.arrays import Bools, Floats, Ints, Singles
-from flexsheet.nodes.fem_solver.mesh import (
-    SAME_M,
-    Focus,
-    MeshSpec,
-    SolidMesh,
-    cylinder_mesh,
-    nodes_in_planes,
-    skin_faces,
-)
+from flexsheet.nodes.fem_solver.mesh.cylinder import Focus, cylinder_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import MeshSpec
+from flexsheet.nodes.fem_solver.mesh.solid import SAME_M, SolidMesh, nodes_in_planes, skin_faces
 
 DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0.0225)
 SPACING_RATIO = 0.35
@@ -54,9 +48,10 @@ QUICK_COUNT = 9
 contains its push depths."""
 FINE_DEPTHS_M = (0.0007, 0.0015, 0.003, 0.005, 0.010)
 FINE_RATIO, FINE_NEAR_RATIO, FINE_GROWTH = 0.5, 0.4, 0.7
-"""The parameters of the fine mesh that corrects the forces. They are the ratio of its skin spacing
-to that of a snapshot, the radius of its fine region (finger radii), and its growth of the element
-size per distance (m/m). `FINE_DEPTHS_M` contains the push depths."""
+"""The parameters of the fine mesh that corrects the forces. The first is the ratio of the skin
+spacing to that of a snapshot. The second is the radius of the fine region, in finger radii. The
+third is the growth of the element size per distance (m/m). `FINE_DEPTHS_M` contains the push
+depths."""
 SAME_RATIO = 1e-6
 
 
@@ -74,7 +69,7 @@ class SamplePoint:
 
 @dataclass(frozen=True, slots=True)
 class SnapshotJob:
-    """The inputs of a snapshot, which describe pushes at one sample point to several depths.
+    """The inputs of a snapshot: pushes at one sample point to several depths.
 
     nodes (n, 3), m, elements (e, 10): mesh. fixed (n,): whether each node is fixed. faces (f, 6):
     six-node triangles that the finger can touch. depths_m: push depths. mirror_axes: axes of planes
@@ -100,7 +95,7 @@ class Snapshot:
     rest (s, 3): undeformed skin nodes, m. faces (f, 6): six-node triangles of the skin. depths_m
     (k,): push depths. moved (k, s, 3): skin displacement (m) at these depths. force_n (k, 3): force
     on the finger for a Young's modulus of 1 Pa. reached: number of converged depths. Entries at
-    deeper depths repeat the last converged solution.
+    larger depths repeat the last converged solution.
     """
 
     rest: Floats
@@ -357,7 +352,7 @@ def _make_focused_mesh(
 
 
 def _mirror_axes(sample: SamplePoint) -> tuple[int, ...]:
-    """Return the axes of the planes of symmetry of a cylinder that contain a push.
+    """Return the axes of the planes of symmetry of a cylinder that contain the sample point.
 
     The possible planes are x = 0 and y = 0, because the support is centred on -z.
     """

@@ -11,7 +11,7 @@ from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from flexsheet.messages.methods import SoftBodyMethod, resolve_method
 from flexsheet.messages.scene import Scene
@@ -51,7 +51,7 @@ def choose_method(
 
 @dataclass(slots=True)
 class SoftBodyFactory:
-    """A factory of soft bodies, which stores the last precomputed model in memory.
+    """Build soft bodies, and store the last precomputed model in memory.
 
     workers: number of processes that compute a table; 0 means one per core. scheduler: address of a
     dask scheduler whose workers compute the table instead. If the cache in `cache_dir` is empty,
@@ -72,7 +72,7 @@ class SoftBodyFactory:
     ) -> list[body.SceneBody]:
         """Build the soft body of a scene for each available method, starting with the best method.
 
-        Raises SolidMeshError for a body without sufficient support, ValueError for an invalid
+        Raises UnfitMeshError for an object that cannot be meshed, ValueError for an invalid
         material, size or depth, and MemoryError if the free memory is insufficient.
         """
         spec = body.make_soft_body_spec(
@@ -105,7 +105,7 @@ class SoftBodyFactory:
         return precompute.response_cache(spec).path(self.cache_dir).exists()
 
     def _load_model(
-        self, spec: precompute.SoftBodySpec, progress: Callable[[int, int, Any], None]
+        self, spec: precompute.SoftBodySpec, progress: precompute.Progress
     ) -> precompute.SoftBodyModel:
         """Return the model of a specification. Use the last model if its inputs are equal;
         otherwise, load or compute the model.
@@ -138,7 +138,7 @@ class SoftBodyFactory:
         self,
         scene: Scene,
         linear: body.SceneBody,
-        progress: precompute_table.Progress,
+        progress: precompute.Progress,
         on_quick: Callable[[body.SceneBody], None] | None = None,
     ) -> body.SceneBody:
         """Compute and cache the nonlinear table, and return the body that uses it.

@@ -3,8 +3,8 @@
 For pushes at every touchable node to several depths, the table contains the force and the
 displacement of the skin (the surface of the body). Shape functions of the mesh interpolate between
 nodes. Cubic polynomials with a continuous slope interpolate between depths. Therefore the response
-is a continuous function of the finger's position. One response reads 24 rows of the table, which
-belong to six nodes at four depths.
+is a continuous function of the finger's position. One response reads 24 rows of the table, for six
+nodes at four depths.
 
 The table is filled with solutions of Newton's method, called snapshots, at several tens of sample
 points. The module `snapshot_interpolator` interpolates them to the other nodes. At small depths the
@@ -126,11 +126,6 @@ def interpolate_nodes(job: FillJob) -> FilledNodes:
     )
 
 
-Interpolate = Callable[[Sequence[FillJob]], Iterable[FilledNodes]]
-"""A function that interpolates snapshots at the nodes of jobs, in this process or in other
-processes. It returns the results in the order of the jobs."""
-
-
 def fill_table(
     response: SkinResponse,
     triangles: NDArray[np.int32],
@@ -138,13 +133,16 @@ def fill_table(
     source: SnapshotSet,
     *,
     fine: tuple[SamplePoint, Snapshot] | None = None,
-    interpolate: Interpolate = lambda jobs: map(interpolate_nodes, jobs),
+    interpolate: Callable[[Sequence[FillJob]], Iterable[FilledNodes]] = lambda jobs: map(
+        interpolate_nodes, jobs
+    ),
 ) -> Table:
     """Compute the nonlinear table of a body from snapshots.
 
     triangles (t, 3): triangles of the skin. linear: linear method for the same response and a
     modulus of 1 Pa. Its linear range must contain the depths `BLEND_M`. fine: push on a fine mesh
-    with which all forces are corrected, or None. interpolate: function that processes the jobs.
+    with which all forces are corrected, or None. interpolate: function that interpolates the
+    snapshots at the nodes of jobs, and returns the results in the order of the jobs.
     """
     interpolator = source.make_interpolator()
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
@@ -184,7 +182,9 @@ def fill_table(
         )
         fields[number] = moved[1:]
         sound_m = depths[first + filled.valid[at] - 1]
-        reach[number] = min(_reach_m(filled.reached[at], depths[first:]), sound_m)
+        # The number of converged depths may be fractional.
+        levels = np.arange(1, len(depths) - first + 1)
+        reach[number] = min(float(np.interp(filled.reached[at], levels, depths[first:])), sound_m)
     return Table(depths, fields, force * factors[:, None], reach)
 
 
@@ -195,8 +195,8 @@ def find_mirror_images(
 
     points (n, 3): contact nodes, m. rest (s, 3): undeformed skin nodes, m. mirrors: vectors (3,) of
     signs, one for each mirror symmetry of the body. Symmetries that do not map all skin nodes to
-    skin nodes are ignored. For each contact node found, return the index of the earlier node, the
-    signs, and the index of the mirror image of each skin node (s,).
+    skin nodes are ignored. Return, by contact node, the index of the earlier node, the signs, and
+    the indices (s,) of the mirror images of the skin nodes.
     """
     from scipy.spatial import cKDTree
 
@@ -274,14 +274,6 @@ def _blend_levels(
     return moved, force
 
 
-def _reach_m(reached: float, depths: Floats) -> float:
-    """Return the maximum depth (m) with a valid interpolated solution.
-
-    reached: number of converged depths, which may be fractional. depths (k,): depths, m.
-    """
-    return float(np.interp(reached, np.arange(1, len(depths) + 1), depths))
-
-
 class CubicInterpolator:
     """An interpolator over increasing depths by cubic polynomials with a continuous slope.
 
@@ -316,8 +308,7 @@ class CubicInterpolator:
 
 
 def count_valid_levels(rest: Floats, moved: Singles, triangles: NDArray[np.int32]) -> int:
-    """Return the number of depths before the first depth with an invalid interpolated skin
-    displacement.
+    """Count the successive depths at which the interpolated displacement is valid.
 
     rest (s, 3): undeformed skin nodes, m. moved (L, s, 3): displacement at each depth, m. triangles
     (t, 3): skin triangles. A displacement is invalid if a triangle is rotated by more than the
@@ -412,9 +403,6 @@ class TableSoftBody:
         self._reach_and_bound = np.column_stack([self.reach_m, np.minimum(bound_distance, 1.0)])
 
     def respond(self, query: ContactQuery) -> Response:
-        """Compute the displacement of the skin and the contact force for a contact with the
-        finger.
-        """
         nodes, weights, off = self.project_to_surface(query.surface)
         curve = self._curve_at(nodes, weights)
         stiffness = float(curve[len(CURVE_FRACTIONS), 1]) / self._linear
@@ -475,16 +463,9 @@ class TableSoftBody:
         return self._faces[best], weights, 0.0
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
-        """Return the force divided by depth (N/m) at the depth `linear_depth_m` near a surface
-        point (3,).
-        """
         return float(self.force_curve(surface)[len(CURVE_FRACTIONS), 1]) / self._linear
 
     def force_curve(self, surface: Floats) -> Floats:
-        """Return the force-depth curve (n, 2) near a surface point (3,).
-
-        The columns are depth (m) and force (N).
-        """
         nodes, weights, _ = self.project_to_surface(surface)
         return self._curve_at(nodes, weights)
 

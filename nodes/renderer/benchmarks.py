@@ -3,8 +3,8 @@
 The measured time is the time for drawing a stereo frame, without reading its pixels. The method
 `floor` gives a lower bound of this time. This method clears the frame and draws the same triangles
 once for each eye, with the same number of samples. The error is measured at each point that the eye
-sees on a reference sheet. The caller provides this reference, which is computed independently of
-the renderer.
+sees on a reference sheet. The caller provides this reference, computed independently of the
+renderer.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
 from flexsheet.nodes.renderer.object_surface import make_surface
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
-from flexsheet.nodes.renderer.sheet_mesh import MAX_TRIANGLES_DEPTH_M, SheetMesh, pyramid_mesh
+from flexsheet.nodes.renderer.sheet_mesh import MAX_TRIANGLES_DEPTH_M, pyramid_mesh
 
 ErrorMeasure = Callable[[Image, Image], Floats]
 """A function that computes the errors (n,), m, at all visible points of the object. Its arguments
@@ -38,13 +38,14 @@ ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure
 sheet's left and right edges, and the fingertip (3,), m, or None."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
-SHAPES: dict[str, Callable[[SheetPose], SheetMesh]] = {
-    "two_pass_triangles": pyramid_mesh,
+FLOOR, TWO_PASS_TRIANGLES = "floor", "two_pass_triangles"
+"""The lower bound of the time, and the method two_pass with four triangles as the sheet."""
+CORRECTION_OF: dict[str, Correction] = {
+    FLOOR: "none",
+    **{correction: correction for correction in CORRECTIONS},
+    TWO_PASS_TRIANGLES: "two_pass",
 }
-"""The functions that make an approximate mesh of the sheet, by variant of the correction method
-two_pass."""
-FLOOR = "floor"
-METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
+METHODS = tuple(CORRECTION_OF)
 WITHOUT_SHAPES = tuple(method for method in METHODS if method != "two_pass")
 CASES: tuple[tuple[float, float], ...] = (
     *((tilt, 0) for tilt in (-50, -30, 30, 50)),
@@ -86,7 +87,7 @@ def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
     deepest_mm = {
         FLOOR: -1.0,
         "four_triangles": max_triangles_mm,
-        "two_pass_triangles": max_triangles_mm,
+        TWO_PASS_TRIANGLES: max_triangles_mm,
         "two_pass": 60.0,
     }.get(method, 0.0)
     return push_mm <= deepest_mm and abs(tilt_deg) <= 50.0
@@ -178,7 +179,6 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
                     in_range=is_in_range(method, tilt_deg=tilt_deg, push_mm=push_mm),
                     in_scene=in_scene,
                 )
-        scene_renderer.release()
     context.release()
 
 
@@ -189,30 +189,34 @@ def _make_situation(
     pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
-    predicted = estimate_sheet(
-        *edges,
-        height_m=scene.sheet.height_m,
-        twist_world=np.zeros(6),
-        ahead_s=0.0,
-        finger_tip=tip,
-    )
+    predicted = estimate_sheet(*edges, height_m=scene.sheet.height_m, finger_tip=tip)
     assert predicted is not None
     return predicted, cache(lambda: reference(scene, *edges, tip))
 
 
 def draw_stereo(scene_renderer: SceneRenderer, method: str, sheet: SheetPose) -> None:
-    """Draw one stereo frame by a correction method, or by the method `FLOOR`, which gives a lower
-    bound of the time.
-    """
-    display = Display(correction=_correction_name(method), stereo="side_by_side")
+    """Draw one stereo frame by a correction method, or by `FLOOR`, the lower bound of the time."""
+    display = Display(correction=CORRECTION_OF[method], stereo="side_by_side")
     look = DrawStyle(flat=False, pattern="object")
     if method == FLOOR:
         for eye in scene_renderer.eyes(display):
             scene_renderer.canvas.draw_unresolved(scene_renderer.view(eye), look)
-    elif method in SHAPES:
-        scene_renderer.draw_onto(display, SHAPES[method](sheet), look, read=False)
     else:
-        scene_renderer.draw(display, sheet, look, read=False)
+        _draw(scene_renderer, method, display, sheet, look, read=False)
+
+
+def _draw(
+    scene_renderer: SceneRenderer,
+    method: str,
+    display: Display,
+    sheet: SheetPose,
+    look: DrawStyle,
+    *,
+    read: bool,
+) -> Image | None:
+    if method == TWO_PASS_TRIANGLES:
+        return scene_renderer.draw_onto(display, pyramid_mesh(sheet), look, read=read)
+    return scene_renderer.draw(display, sheet, look, read=read)
 
 
 def draw_coordinate_ramps(
@@ -221,12 +225,9 @@ def draw_coordinate_ramps(
     """Draw the projector's images of both coordinate ramps for one eye, and return them."""
     images = []
     for pattern in COORDINATE_RAMPS:
-        display = Display(correction=_correction_name(method), stereo="mono", pattern=pattern)
+        display = Display(correction=CORRECTION_OF[method], stereo="mono", pattern=pattern)
         look = DrawStyle(flat=True, pattern=pattern)
-        if method in SHAPES:
-            image = scene_renderer.draw_onto(display, SHAPES[method](sheet), look, read=True)
-        else:
-            image = scene_renderer.draw(display, sheet, look, read=True)
+        image = _draw(scene_renderer, method, display, sheet, look, read=True)
         assert image is not None
         images.append(image)
     return images[0], images[1]
@@ -248,10 +249,3 @@ def _error_mm(
     """
     errors_m = get_measure()(*draw_coordinate_ramps(scene_renderer, method, sheet))
     return 1e3 * float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("inf")
-
-
-def _correction_name(method: str) -> Correction:
-    for correction in CORRECTIONS:
-        if method == correction:
-            return correction
-    return "none" if method == FLOOR else "two_pass"

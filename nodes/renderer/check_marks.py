@@ -17,6 +17,7 @@ from flexsheet.messages.scene import Projector
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models import camera
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
+from flexsheet.nodes.models.shapes.triangles import intersect_rays
 from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
 SIDE_M = 0.0053
@@ -71,35 +72,12 @@ def place_marks(
     centres = np.asarray(corners + half, dtype=np.float64)
     slopes = camera.normalize(centres, matrix, distortion)
     rays = np.column_stack([slopes, np.ones(len(slopes))]) @ world_from_projector[:3, :3].T
-    triangles, weights = intersect(world_from_projector[:3, 3], rays, mesh.vertices[mesh.triangles])
-    surface = mesh.vertices[mesh.triangles[triangles]]
+    surface = mesh.vertices[mesh.triangles]
+    triangles, weights = intersect_rays(world_from_projector[:3, 3], rays, surface)
+    surface = surface[triangles]
     world = np.einsum("nk,nki->ni", weights, surface)
     ratio = np.zeros(len(points))
     if deeper is not None:
         moved = deeper.vertices[mesh.triangles[triangles]] - surface
         ratio = np.einsum("nk,nki,i->n", weights, moved, -world_from_sheet[:3, 2]) / FINGER_STEP_M
     return CheckMarks(side_px, corners, world, np.nan_to_num(ratio))
-
-
-def intersect(origin: Floats, rays: Floats, corners: Floats) -> tuple[NDArray[np.intp], Floats]:
-    """Intersect rays from a point with triangles.
-
-    origin (3,): start of the rays. rays (n, 3): directions. corners (m, 3, 3): triangles. Return
-    the index (n,) of the triangle that each ray hits, and the barycentric weights (n, 3) of its
-    corners. The weights are NaN if the ray misses the mesh. Source: Moller and Trumbore 1997.
-    """
-    first, along, up = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    normal = np.cross(along, up)
-    from_first = origin - first
-    # Each matrix product computes a scalar triple product for all rays and triangles.
-    volume = -rays @ normal.T
-    v = rays @ np.cross(up, from_first).T
-    w = rays @ np.cross(from_first, along).T
-    volume = np.where(np.abs(volume) < 1e-15, np.nan, volume)
-    v, w = v / volume, w / volume
-    inside = np.minimum(np.minimum(v, w), 1.0 - v - w)
-    hit = np.nanargmax(inside, axis=1)
-    rows = np.arange(len(rays))
-    v, w = v[rows, hit], w[rows, hit]
-    weights = np.column_stack([1.0 - v - w, v, w])
-    return hit, np.where(inside[rows, hit][:, None] >= -1e-9, weights, np.nan)

@@ -1,10 +1,10 @@
 """Correct the projected image for a moved or pushed sheet (Furukawa et al. 2007, eq. (1)-(6)).
 
-The image is drawn for the imaginary screen, which is the fixed plane z = 0. It is projected onto
-the actual screen, which is the sheet. V is the eye, P the projector and A a point of the object. C
-is the intersection of the line V-A with the actual screen. C' is the intersection of the line C-P
-with the imaginary screen. A' is the point of the line V-C' at the depth of A. If the point is drawn
-at A', the eye sees it at A.
+The image is drawn for the imaginary screen, the fixed plane z = 0. The image is projected onto the
+actual screen, the sheet. V is the eye, P the projector and A a point of the object. C is the
+intersection of the line V-A with the actual screen. C' is the intersection of the line C-P with the
+imaginary screen. A' is the point of the line V-C' at the depth of A. If the point is drawn at A',
+the eye sees it at A.
 
 The actual screen is one plane, or the four triangles between the pushed point and the sheet's
 corners. All points are in the world frame, in m. A point is invalid and is not moved in two cases:
@@ -49,7 +49,7 @@ class ScreenPlane:
 
 @dataclass(frozen=True, slots=True)
 class ProjectionScreen:
-    """The actual screen, which consists of four triangles with a common vertex, or of one plane.
+    """The actual screen: four triangles with a common vertex, or one plane.
 
     point (3,): common vertex, m (r_s in Furukawa et al. 2007). normals (4, 3): unit normals towards
     the user (n_si in the paper). They are equal for a plane. corners (4, 3): corners, m,

@@ -132,7 +132,7 @@ def _combine(scene: Scene, parts: Sequence[tuple[float, IndentationBasis]]) -> I
 
 
 def load(scene: Scene, cache_dir: Path | None) -> IndentationBasis | None:
-    """Return the scene's deflection shapes from the cache, or None if they are not stored.
+    """Return the deflection shapes of a scene from the cache, or None if the cache lacks some.
 
     cache_dir: folder of the cache; None for the cache of the user.
     """

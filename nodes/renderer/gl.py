@@ -6,16 +6,15 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.nodes.arrays import Floats, Image
+from flexsheet.nodes.arrays import Floats, Image, Singles
 from flexsheet.nodes.models.shapes.triangles import triangulate_grid
 from flexsheet.nodes.renderer.correction import (
     GRAZING_SINE,
@@ -24,6 +23,7 @@ from flexsheet.nodes.renderer.correction import (
     sector_normals,
 )
 from flexsheet.nodes.renderer.lens import ClipLens
+from flexsheet.nodes.renderer.object_surface import ObjectSurface
 
 FAR_M = 5.0
 SAMPLES = 4
@@ -51,9 +51,9 @@ class EyeView:
     """The geometry of the image for one eye.
 
     eye, projector: positions (3,), world frame, m. screen: shape of the sheet for which the image
-    is corrected; None for no correction. clip_from_screen: matrix (3, 3) from the imaginary screen
-    to OpenGL clip coordinates. lens: lens of the projector; None for no distortion. grey: whether
-    to draw without colour.
+    is corrected; None for no correction. clip_from_screen: matrix (3, 3) from the imaginary screen,
+    the plane z = 0, to OpenGL clip coordinates. lens: lens of the projector; None for no
+    distortion. grey: whether to draw without colour.
     """
 
     eye: Floats
@@ -124,12 +124,12 @@ class SurfaceMaterial:
     (4, 4): inverse pose of the object.
     """
 
-    colour: tuple[float, float, float] = (0.95, 0.72, 0.60)
-    texture: str = "none"
-    pitch_m: float = 0.008
-    image: Image | None = None
-    image_from_world: Floats = field(default_factory=lambda: np.eye(4))
-    object_from_world: Floats = field(default_factory=lambda: np.eye(4))
+    colour: tuple[float, float, float]
+    texture: str
+    pitch_m: float
+    image: Image | None
+    image_from_world: Floats
+    object_from_world: Floats
 
 
 class Canvas:
@@ -138,106 +138,57 @@ class Canvas:
     """
 
     def __init__(
-        self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
+        self,
+        context: moderngl.Context,
+        size: tuple[int, int],
+        surface: ObjectSurface,
+        material: SurfaceMaterial,
+        *,
+        samples: int = SAMPLES,
     ) -> None:
-        """Allocate the framebuffers.
+        """Allocate the framebuffers and buffers.
 
-        samples: number of samples per pixel (multisampling), which the maximum of the driver
-        limits.
+        size: width and height of the image, px. samples: number of samples per pixel
+        (multisampling), which the maximum of the driver limits.
         """
-        self.width_px, self.height_px = width_px, height_px
+        self.width_px, self.height_px = size
         self.context = context
         self._programs = Programs(context, "object")
-        self._material: dict[str, object] = {}
-        self._texture = TEXTURES["none"]
-        samples = min(samples, self.context.max_samples)
-        size = (width_px, height_px)
-        self._frame = self.context.framebuffer(
-            self.context.renderbuffer(size, 4, samples=samples),
-            self.context.depth_renderbuffer(size, samples=samples),
+        samples = min(samples, context.max_samples)
+        self._frame = context.framebuffer(
+            context.renderbuffer(size, 4, samples=samples),
+            context.depth_renderbuffer(size, samples=samples),
         )
-        picture = self.context.renderbuffer(size, 4)
-        self.resolved = self.context.framebuffer(picture)
+        picture = context.renderbuffer(size, 4)
+        self.resolved = context.framebuffer(picture)
         # The same image with a depth buffer, for drawing without multisampling.
-        self._single = self.context.framebuffer(picture, self.context.depth_renderbuffer(size))
+        self._single = context.framebuffer(picture, context.depth_renderbuffer(size))
         self.target = self._frame
-        self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-        self._object: _MeshBuffers | None = None
-        self._image: moderngl.Texture | None = None
-        self.set_material(SurfaceMaterial())
-        self._grid = _MeshBuffers(self.context, *_grid_mesh())
-
-    def release(self) -> None:
-        """Release the framebuffers, meshes and shaders, but not the OpenGL context."""
-        for mesh in (self._object, self._grid):
-            if mesh is not None:
-                mesh.release()
-        pictures = (*self._frame.color_attachments, *self.resolved.color_attachments)
-        for attachment in (*pictures, self._frame.depth_attachment, self._single.depth_attachment):
-            if attachment is not None:
-                attachment.release()
-        for frame in (self._frame, self.resolved, self._single):
-            frame.release()
-        if self._image is not None:
-            self._image.release()
-        self._programs.release()
-
-    def set_material(self, material: SurfaceMaterial) -> None:
-        """Set the object's colour and texture."""
-        if self._image is not None:
-            self._image.release()
-            self._image = None
-        if material.image is not None:
-            height, width = material.image.shape[:2]
-            rows = np.ascontiguousarray(material.image[::-1])
-            self._image = self.context.texture((width, height), 3, rows, alignment=1)
-            self._image.build_mipmaps()
-            self._image.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-            self._image.repeat_x = self._image.repeat_y = False
+        context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         self._texture = TEXTURES[material.texture]
-        self._material = {
+        self._material: dict[str, object] = {
             "object_colour": material.colour,
             "texture_pitch_m": material.pitch_m,
             "image_from_world": tuple(material.image_from_world.T.ravel().tolist()),
             "object_from_world": tuple(material.object_from_world.T.ravel().tolist()),
         }
+        self._image: moderngl.Texture | None = None
+        if material.image is not None:
+            height, width = material.image.shape[:2]
+            rows = np.ascontiguousarray(material.image[::-1])
+            self._image = context.texture((width, height), 3, rows, alignment=1)
+            self._image.build_mipmaps()
+            self._image.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+            self._image.repeat_x = self._image.repeat_y = False
+        self._object = _MeshBuffers(context, surface)
+        self._grid = _MeshBuffers(context, _grid_surface())
 
-    def set_mesh(
-        self, rest: Floats, triangles: NDArray[np.int32], normals: Floats | None = None
-    ) -> None:
-        """Set the mesh of the object at rest.
+    def set_shape(self, moved: Singles) -> None:
+        """Set the current positions (m) and normals of the object's vertices, as an array (n, 6).
 
-        rest (n, 3): vertices, world frame, m. triangles (t, 3): counter-clockwise as seen
-        from outside. normals (n, 3): unit normals at rest; None if all normals are along z.
+        The normals may have any length. Raises ValueError if the array has another shape.
         """
-        if self._object is not None:
-            self._object.release()
-        self._object = _MeshBuffers(self.context, rest, triangles, normals)
-
-    def set_shape(self, positions: Floats, normals: Floats) -> None:
-        """Set the current positions (n, 3), m, and unit normals (n, 3) of the object's vertices.
-
-        Raises RuntimeError if `set_mesh` has not been called.
-        """
-        if self._object is None:
-            raise RuntimeError("the canvas has no mesh; call set_mesh before set_shape")
-        self._object.move(_interleaved(positions, normals))
-
-    def set_moved(self, moved: NDArray[np.float32]) -> None:
-        """Set positions (m) and normals of the object's vertices, given as one array (n, 6).
-
-        The normals may have any length. Raises RuntimeError if `set_mesh` has not been called.
-        """
-        if self._object is None:
-            raise RuntimeError("the canvas has no mesh; call set_mesh before set_moved")
         self._object.move(moved)
-
-    def draw(self, view: EyeView, look: DrawStyle) -> None:
-        """Draw the image for one eye, and wait until it is complete."""
-        self.begin(multisampled=True)
-        self.draw_into(self.target, view, look)
-        self.resolve()
-        self.context.finish()
 
     def draw_unresolved(self, view: EyeView, look: DrawStyle) -> None:
         """Draw an image without averaging the samples of each pixel.
@@ -256,11 +207,11 @@ class Canvas:
     def draw_into(self, frame: moderngl.Framebuffer, view: EyeView, look: DrawStyle) -> None:
         """Draw the object, or a pattern on the imaginary screen, into a cleared framebuffer."""
         mesh = self._grid if look.pattern in SCREEN_PATTERNS else self._object
-        if look.pattern == "black" or mesh is None:
+        if look.pattern == "black":
             return
         frame.use()
         # A projector behind the screen draws a mirrored image, which reverses front faces.
-        mirrored = _determinant(view.clip_from_screen) < 0.0
+        mirrored = np.linalg.det(view.clip_from_screen) < 0.0
         self.context.front_face = "cw" if mirrored else "ccw"
         program, uniforms = self._program(view, look)
         set_view(uniforms, view)
@@ -292,7 +243,7 @@ class Canvas:
             self.context.copy_framebuffer(self.resolved, self._frame)
 
     def read(self) -> Image:
-        """Return the last image (height, width, 3), which starts with the top row."""
+        """Return the last image (height, width, 3), starting with the top row."""
         data = self.resolved.read(components=3, alignment=1)
         rows = np.frombuffer(data, np.uint8).reshape(self.height_px, self.width_px, 3)
         return np.ascontiguousarray(rows[::-1])
@@ -301,10 +252,8 @@ class Canvas:
         """Return the vertex positions after the image correction, as the shader computes them.
 
         The result (n, 4) contains positions (m) and validity (0 or 1). Tests compare the result
-        with a reference. Raises RuntimeError if `set_mesh` has not been called.
+        with a reference.
         """
-        if self._object is None:
-            raise RuntimeError("the canvas has no mesh; call set_mesh before shifted_points")
         text = shader_text("object.vert.glsl", CORRECTED=view.screen is not None, LENS=False)
         program = self.context.program(vertex_shader=text, varyings=("shifted",))
         set_view(Uniforms(program), view)
@@ -357,10 +306,6 @@ class Programs:
             self._variants[key] = program, Uniforms(program)
         return self._variants[key]
 
-    def release(self) -> None:
-        for program, _ in self._variants.values():
-            program.release()
-
 
 def set_view(uniforms: Uniforms, view: EyeView) -> None:
     """Set the uniforms of the vertex shader for the image of one eye."""
@@ -392,23 +337,15 @@ class _MeshBuffers:
     written for each frame.
     """
 
-    def __init__(
-        self,
-        context: moderngl.Context,
-        rest: Floats,
-        triangles: NDArray[np.int32],
-        normals: Floats | None = None,
-    ) -> None:
-        self.count = len(rest)
+    def __init__(self, context: moderngl.Context, surface: ObjectSurface) -> None:
+        self.count = len(surface.rest_world_m)
         self._context = context
-        if normals is None:
-            normals = np.tile([0.0, 0.0, 1.0], (self.count, 1))
-        content = _interleaved(rest, normals)
+        content = surface.interleaved
         self._rest, self._moving = context.buffer(content), context.buffer(content, dynamic=True)
-        self._triangles = context.buffer(np.ascontiguousarray(triangles, np.int32))
+        self._triangles = context.buffer(np.ascontiguousarray(surface.triangles, np.int32))
         self._arrays: dict[tuple[int, bool], moderngl.VertexArray] = {}
 
-    def move(self, moved: NDArray[np.float32]) -> None:
+    def move(self, moved: Singles) -> None:
         """Set the current positions (m) and normals of the vertices, given as one array (n, 6).
 
         Raises ValueError if the array has another shape.
@@ -433,32 +370,15 @@ class _MeshBuffers:
             )
         return self._arrays[key]
 
-    def release(self) -> None:
-        for array in self._arrays.values():
-            array.release()
-        for buffer in (self._rest, self._moving, self._triangles):
-            buffer.release()
 
-
-def _determinant(matrix: Floats) -> float:
-    """Return the determinant of a (3, 3) matrix. This function is faster than
-    `numpy.linalg.det`.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
-    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
-
-
-def _interleaved(positions: Floats, normals: Floats) -> NDArray[np.float32]:
-    return np.ascontiguousarray(np.concatenate([positions, normals], axis=1), np.float32)
-
-
-def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
-    """Return vertices (n, 3), m, and triangles (t, 3) of a square of 300 mm on the plane z = 0."""
+def _grid_surface() -> ObjectSurface:
+    """Return a square of 300 mm on the plane z = 0."""
     cells = 60
     axis = np.linspace(-0.15, 0.15, cells + 1)
     x, y = np.meshgrid(axis, axis)
     points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    return points, triangulate_grid(cells + 1, cells + 1)
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    return ObjectSurface(points, normals, triangulate_grid(cells + 1, cells + 1))
 
 
 def shader_text(name: str, **macros: int) -> str:

@@ -17,8 +17,8 @@ MIN_AGE_S, MAX_AGE_S = 0.1, 0.5
 class MaxAge:
     """The maximum age at which messages about poses, fingertips, eyes and soft bodies are used.
 
-    seconds: current maximum age. It is either a fixed value, or
-    `PERIODS` measured periods of the camera, limited to the range `MIN_AGE_S` to `MAX_AGE_S`.
+    seconds: current maximum age, which is a fixed value or `PERIODS` measured periods of the
+    camera. The second value is limited to the range `MIN_AGE_S` to `MAX_AGE_S`.
     """
 
     def __init__(self, given_s: float | None = None) -> None:

@@ -68,17 +68,13 @@ def _no_display(why: str) -> WindowError:
     )
 
 
-def monitor_names() -> list[str]:
-    """Return the names of the monitors, ordered by number. Number 0 is the primary monitor."""
-    return [_text(glfw.get_monitor_name(monitor)) for monitor in glfw.get_monitors()]
-
-
 def find_monitor(monitor: str | int) -> Any:
-    """Return the GLFW monitor with a number or name.
+    """Return the GLFW monitor with a number or name. Number 0 is the primary monitor.
 
     Raises WindowError if there is no such monitor, or if several monitors have this name.
     """
-    monitors, names = glfw.get_monitors(), monitor_names()
+    monitors = glfw.get_monitors()
+    names = [_text(glfw.get_monitor_name(one)) for one in monitors]
     key = monitor
     if isinstance(monitor, str) and monitor not in names and monitor.isdigit():
         key = int(monitor)
@@ -116,22 +112,19 @@ def refresh_period_s(monitor: Any) -> float:
 
 
 def hidden_window() -> Any:
-    """Return an invisible window, whose OpenGL context is used for drawing.
+    """Return an invisible window with an OpenGL context for drawing.
 
     Raises WindowError if the window cannot be opened.
     """
     return _create((1, 1), {glfw.VISIBLE: False})
 
 
-def open_window(
-    size: tuple[int, int], monitor: Any | None, share: Any, *, stereo: bool
-) -> tuple[Any, bool]:
+def open_window(size: tuple[int, int], monitor: Any | None, share: Any) -> tuple[Any, bool]:
     """Open a window that shares graphics objects with the window `share`.
 
     size: width and height, px. monitor: monitor of a full-screen window; None for an ordinary
-    window. stereo: whether to request quad buffering (separate buffers for each eye). Return the
-    window, and whether it is quad-buffered. Raises WindowError if the monitor has no mode of this
-    size.
+    window. Return the window, and whether it is quad-buffered (has separate buffers for each eye).
+    Raises WindowError if the monitor has no mode of this size.
     """
     width, height = size
     if monitor is not None:
@@ -144,14 +137,11 @@ def open_window(
                 "set one of these sizes in the scene and calibrate the projector again"
             )
     hints = {**ON_A_PROJECTOR, glfw.VISIBLE: True}
-    if stereo:
-        try:
-            window = _create(size, {**hints, glfw.STEREO: True}, monitor, share)
-        except WindowError:
-            pass  # Quad buffering is not supported, so the images of the eyes alternate.
-        else:
-            return window, True
-    return _create(size, hints, monitor, share), False
+    try:
+        return _create(size, {**hints, glfw.STEREO: True}, monitor, share), True
+    except WindowError:
+        # Quad buffering is not supported, so the images of the eyes alternate.
+        return _create(size, hints, monitor, share), False
 
 
 def _create(

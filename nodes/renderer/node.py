@@ -30,7 +30,7 @@ from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 
 
 class Renderer(Node):
-    """The renderer node, which draws a frame for each soft-body message, at most at `rate_hz`.
+    """Draw a frame for each soft-body message, at most at `rate_hz`.
 
     If there are no recent soft-body messages, fingertip messages trigger frames. If there are no
     recent messages of both types, a timer triggers frames. The node publishes a frame after it was
@@ -75,9 +75,7 @@ class Renderer(Node):
         self._output.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
-        if self._frame_renderer is not None:
-            self._frame_renderer.scene_renderer.release()
-            self._frame_renderer = None
+        self._frame_renderer = None
         if scene.projector is None:
             self.note = "no image: the scene has no projector"
             return

@@ -49,6 +49,11 @@ class ObjectSurface:
     normals_world: Floats
     triangles: Indices
 
+    @property
+    def interleaved(self) -> Singles:
+        """Return the positions (m) and normals of the vertices as one array (n, 6)."""
+        return np.concatenate([self.rest_world_m, self.normals_world], axis=1, dtype=np.float32)
+
     @staticmethod
     def placed(
         points: Floats, normals: Floats, triangles: NDArray[np.integer], world_from_object: Floats
@@ -233,20 +238,16 @@ class DeformationTransfer:
         self._skin = skin_vertices.astype(np.float32)
         self._normals = VertexNormals(skin_triangles, len(skin_vertices))
         self._rest_normals = self._normals(self._skin)
-        self._rest = np.concatenate(
-            [surface.rest_world_m, surface.normals_world], axis=1, dtype=np.float32
-        )
+        self._rest = surface.interleaved
         self._moves = np.empty((self.vertices, 6), np.float32)
 
-    def apply(self, displacement: Singles | None) -> Singles:
+    def apply(self, displacement: Singles) -> Singles:
         """Return positions (m) and normals, (n, 6), of the deformed drawn surface.
 
-        displacement (s, 3): displacement of the skin's vertices, m; None for the surface at rest.
-        The length of the normals is arbitrary. Raises ValueError for a wrong shape of the array, or
-        for values that are not finite.
+        displacement (s, 3): displacement of the skin's vertices, m. The length of the normals is
+        arbitrary. Raises ValueError for a wrong shape of the array, or for values that are not
+        finite.
         """
-        if displacement is None:
-            return self._rest
         if displacement.shape != self._skin.shape:
             raise ValueError(
                 f"soft_body.displacement_world_m: expected {len(self._skin)} vertices as in the "

@@ -93,7 +93,7 @@ def open_output(
 
 
 class ProjectorWindow:
-    """A full-screen window on the projector's monitor, which shows images from a separate thread.
+    """A full-screen window on the projector's monitor. A separate thread shows the images.
 
     All methods must be called on the main thread.
     """
@@ -137,9 +137,7 @@ class ProjectorWindow:
         if self._presenter is not None and self._slots[0].textures[0].size == size:
             return
         self._shut()
-        self._window, self.quad_buffered = open_window(
-            size, self._monitor, self._hidden, stereo=True
-        )
+        self._window, self.quad_buffered = open_window(size, self._monitor, self._hidden)
         at = self._monitor if self._monitor is not None else glfw.get_primary_monitor()
         self.period_s = self._swap_interval * refresh_period_s(at) if at else 0.0
         glfw.make_context_current(self._hidden)

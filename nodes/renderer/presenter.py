@@ -38,7 +38,7 @@ The time is 0 for an image that a newer image replaced before it was shown."""
 
 @dataclass(slots=True)
 class Slot:
-    """The textures of one frame, and the mode in which they are shown.
+    """The textures of one frame, and the stereo mode of the frame.
 
     In the mode frame_sequential, the textures contain the images for the left and the right eye.
     Other modes use only the first texture. tag: object of the caller that identifies the frame.

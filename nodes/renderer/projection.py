@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
 
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.renderer.gl import (
@@ -80,14 +79,6 @@ class EyePicture:
         )
         return EyePicture(multisampled, context.framebuffer([image]), image)
 
-    def release(self) -> None:
-        """Release the framebuffers."""
-        for frame in {self.samples, self.resolved}:
-            for attachment in (*frame.color_attachments, frame.depth_attachment):
-                if attachment is not None:
-                    attachment.release()
-            frame.release()
-
 
 class TwoPassProjector:
     """A renderer of the image correction in two passes."""
@@ -147,15 +138,17 @@ class TwoPassProjector:
         self._context.enable(moderngl.CULL_FACE)
 
     def _sheet_array(self, sheet: SheetMesh, program: moderngl.Program) -> moderngl.VertexArray:
-        """Return the OpenGL vertex array of the sheet. Update its buffers first if the sheet has
-        changed.
-        """
+        """Write the vertices of the sheet to its buffers, and return its OpenGL vertex array."""
         if self._buffers is None or sheet is not self._drawn:
             vertices = np.ascontiguousarray(sheet.vertices, np.float32)
-            if self._buffers is None or not self._has_triangles(sheet.triangles):
-                self._release_sheet()
+            same = self._drawn is not None and np.array_equal(
+                self._drawn.triangles, sheet.triangles
+            )
+            if self._buffers is None or not same:
                 triangles = np.ascontiguousarray(sheet.triangles, np.int32)
+                self._arrays = {}
                 self._buffers = self._context.buffer(vertices), self._context.buffer(triangles)
+                self._context.gc()  # Release the replaced buffers.
             else:
                 self._buffers[0].orphan()
                 self._buffers[0].write(vertices)
@@ -166,23 +159,3 @@ class TwoPassProjector:
                 program, content, self._buffers[1]
             )
         return self._arrays[program.glo]
-
-    def _has_triangles(self, triangles: NDArray[np.int32]) -> bool:
-        """Return whether the buffers contain the given triangles (t, 3).
-
-        Equal grids usually share one array. Therefore the contents of arrays are rarely compared.
-        """
-        drawn = None if self._drawn is None else self._drawn.triangles
-        return drawn is triangles or (drawn is not None and np.array_equal(drawn, triangles))
-
-    def _release_sheet(self) -> None:
-        for part in (*self._arrays.values(), *(self._buffers or ())):
-            part.release()
-        self._arrays, self._buffers = {}, None
-
-    def release(self) -> None:
-        """Release all buffers, but not the OpenGL context."""
-        self._release_sheet()
-        for picture in self._pictures.values():
-            picture.release()
-        self._programs.release()

@@ -63,9 +63,8 @@ projector, with and without multisampling. On a software driver, the variant wit
 needs a quarter less time for equally smooth edges."""
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
-"""The margin (m) of the rectangle around the object in the eye's image, and the step (m) to which
-the edges of the rectangle are rounded. Rounding prevents flicker of the outline when the object
-moves."""
+"""The margin (m) around the object in the eye's image, and the step (m) to which the edges of the
+image are rounded. Rounding prevents flicker of the outline when the object moves."""
 MAX_WINDOW_M = 0.3
 """The maximum distance of the edges of the drawn rectangle from the centre of the screen."""
 MIN_REPORTED_FRACTION = 0.005
@@ -131,11 +130,10 @@ class SceneRenderer:
         if first_pass is None:
             first_pass = 0 if is_software(context) else SAMPLES
         samples = SAMPLES if samples is None else samples
-        self.canvas = Canvas(context, projector.width_px, projector.height_px, samples=samples)
-        self.canvas.set_mesh(
-            self._surface.rest_world_m, self._surface.triangles, self._surface.normals_world
-        )
-        self.canvas.set_material(self._material())
+        # Release the graphics objects of earlier scene renderers that no longer exist.
+        context.gc_mode = "context_gc"
+        context.gc()
+        self.canvas = Canvas(context, size, self._surface, self._material(), samples=samples)
         self.basis, self.sheet_shape, self.note = basis, sheet_shape, ""
         self.occluded_fraction = 0.0
         self.check_marks = NO_MARKS
@@ -150,10 +148,7 @@ class SceneRenderer:
         self.mesh_id: str | None = None
 
     def _material(self) -> SurfaceMaterial:
-        appearance, object_from_world = (
-            self.scene.object.appearance,
-            inverse(self._world_from_object),
-        )
+        appearance, object_from_world = self.scene.object.appearance, self._object_from_world
         front = apply(object_from_world, self._surface.rest_world_m)[:, :2]
         low, extent = front.min(axis=0), np.ptp(front, axis=0)
         image_from_object = np.diag([*(1.0 / extent), 1.0, 1.0])
@@ -168,7 +163,7 @@ class SceneRenderer:
         )
 
     def set_skin(self, skin: Skin) -> None:
-        """Set the surface mesh of the soft-body solver, whose displacement deforms the object."""
+        """Set the surface mesh whose displacement by the soft-body solver deforms the object."""
         vertices = skin.vertices_world_m.astype(np.float64)
         self._deformation = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
@@ -182,7 +177,7 @@ class SceneRenderer:
         if body is self._drawn_body:
             return
         if body is None:
-            self.canvas.set_shape(self._surface.rest_world_m, self._surface.normals_world)
+            self.canvas.set_shape(self._surface.interleaved)
             self._box_world = _box_around(self._surface.rest_world_m)
         elif self._deformation is None:
             raise ValueError(
@@ -191,7 +186,7 @@ class SceneRenderer:
             )
         else:
             moved = self._deformation.apply(body.displacement_world_m)
-            self.canvas.set_moved(moved)
+            self.canvas.set_shape(moved)
             self._box_world = _box_around(moved[:, :3])
         self._drawn_body = body
 
@@ -257,9 +252,9 @@ class SceneRenderer:
         """Draw the projector's image, and return it (height, width, 3) if `read` is true.
 
         eyes (1 or 2, 3): positions, world frame, m; None for the eyes of the scene. Two eyes share
-        the image, except in the mode frame_sequential. This mode has two images, of which the image
-        of the left eye is returned. drawn: function that receives the index of each image when the
-        image is in `canvas.resolved`. Raises ValueError if the sheet's pose is not finite.
+        the image, except in the mode frame_sequential. This mode has two images. The image of the
+        left eye is returned. drawn: function that receives the index of each image when the image
+        is in `canvas.resolved`. Raises ValueError if the sheet's pose is not finite.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite; check the poses of the arms")
@@ -430,11 +425,6 @@ class SceneRenderer:
         low = np.floor(low / WINDOW_STEP_M) * WINDOW_STEP_M
         high = np.ceil(high / WINDOW_STEP_M) * WINDOW_STEP_M
         return ScreenRectangle(float(low[0]), float(low[1]), *(float(side) for side in high - low))
-
-    def release(self) -> None:
-        """Release all graphics objects, but not the OpenGL context."""
-        self.canvas.release()
-        self._projection.release()
 
 
 def _box_around(points: NDArray[np.floating]) -> Floats:

@@ -54,18 +54,20 @@ def estimate_sheet(
     world_from_right_edge: Floats,
     *,
     height_m: float,
-    twist_world: Floats,
-    ahead_s: float,
     finger_tip: Floats | None,
+    twist_world: Floats | None = None,
+    ahead_s: float = 0.0,
 ) -> SheetPose | None:
     """Predict the pose and the pushed point of the sheet from the measured poses (4, 4) of its
     edges.
 
-    twist_world (6,): linear (m/s) and angular (rad/s) velocity of the sheet. ahead_s: time from the
-    measurement to the prediction. finger_tip (3,): predicted fingertip, world frame, m, or None.
-    The fingertip pushes the sheet if it is below the plane and within the outline of the sheet.
-    Return None if the edges are closer than `MIN_EDGE_DISTANCE_M`, or if a value is not finite.
+    finger_tip (3,): predicted fingertip, world frame, m, or None. The fingertip pushes the sheet if
+    it is below the plane and within the outline of the sheet. twist_world (6,): linear (m/s) and
+    angular (rad/s) velocity of the sheet; None for a sheet at rest. ahead_s: time from the
+    measurement to the prediction. Return None if the edges are closer than `MIN_EDGE_DISTANCE_M`,
+    or if a value is not finite.
     """
+    twist_world = np.zeros(6) if twist_world is None else twist_world
     left, right = world_from_left_edge, world_from_right_edge
     if not all(np.isfinite(each).all() for each in (left, right, twist_world)):
         return None
@@ -87,7 +89,7 @@ def estimate_sheet(
 def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
     """Return the shape of the sheet for which a method corrects the image.
 
-    Return None for the methods none and two_pass, which need no such screen.
+    Return None for the methods none and two_pass, because these methods need no screen.
     """
     if method in ("none", "two_pass"):
         return None

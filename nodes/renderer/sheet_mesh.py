@@ -22,6 +22,7 @@ MAX_TRIANGLES_DEPTH_M = 0.0035
 """The maximum push depth (m) for a sheet mesh of four triangles. At this depth, the rms error of
 the image is half a millimetre."""
 
+HALVINGS = 5
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
 """The vertex indices of the triangles between adjacent corners (0 to 3) and the pushed point (4).
 """
@@ -56,15 +57,13 @@ def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)
 
 
-def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
-    """Divide the triangles of a mesh without changing its surface.
+def refine_mesh(mesh: SheetMesh) -> SheetMesh:
+    """Halve the edges of a mesh `HALVINGS` times without changing its surface.
 
     The lens distortion is applied only at vertices, so a finer mesh is more accurate.
-
-    halvings: number of times that each edge is halved.
     """
     vertices, triangles = mesh.vertices, mesh.triangles
-    for _ in range(halvings):
+    for _ in range(HALVINGS):
         edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         unique, of_edge = np.unique(edges, axis=0, return_inverse=True)
         a, b, c = triangles.T
@@ -78,8 +77,7 @@ def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
 
 
 _grid_triangles = cache(triangulate_grid)
-"""A variant of `triangulate_grid` with a cache. Equal grids share one array, which makes
-comparisons fast."""
+"""A variant of `triangulate_grid` with a cache."""
 
 
 def deflected_mesh(
@@ -134,8 +132,8 @@ def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
     """Estimate the fraction, from 0 to 1, of the sheet's visible area that is dark due to folds.
 
     A triangle gets no light if it faces away from the projector, or if the projector sees it
-    edge-on. The area of such a triangle counts twice, because its shadow has about the same area.
-    eye, projector (3,): positions, world frame, m.
+    edge-on. The area of a dark triangle counts twice, because the triangle casts a shadow of about
+    the same area. eye, projector (3,): positions, world frame, m.
     """
     # One array for each coordinate is several times faster than an array of points.
     coordinates = np.ascontiguousarray(mesh.vertices.T)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from flexsheet.messages.notes import NodeNote
 from flexsheet.messages.types import ArmState, Fingertip, SheetTarget
 from flexsheet.nodes.arrays import Floats
@@ -57,7 +55,7 @@ class SheetPosePredictor:
                 height_m=scene_renderer.scene.sheet.height_m,
                 twist_world=target.message.twist_world
                 if moving and target.message is not None
-                else np.zeros(6),
+                else None,
                 ahead_s=age_s + horizon_s,
                 finger_tip=finger_tip,
             )

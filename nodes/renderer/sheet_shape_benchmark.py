@@ -1,7 +1,7 @@
 """Measure the time and the error of the methods that compute the shape of a pushed sheet.
 
-The error is the difference in height between the mesh of a method and a reference sheet. It is
-computed at the points of the reference. The caller provides the reference.
+The error is the difference in height between the mesh of a method and a reference sheet. The error
+is computed at the points of the reference. The caller provides the reference.
 """
 
 from __future__ import annotations
@@ -73,13 +73,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
             continue
         tip = np.array([x * spec.width_m, y * spec.height_m, -depth])
         edges = edge_poses(np.eye(4), stretch * spec.width_m)
-        sheet = estimate_sheet(
-            *edges,
-            height_m=spec.height_m,
-            twist_world=np.zeros(6),
-            ahead_s=0.0,
-            finger_tip=tip,
-        )
+        sheet = estimate_sheet(*edges, height_m=spec.height_m, finger_tip=tip)
         assert sheet is not None
         position = (float(tip[0]), float(tip[1]))
 
@@ -95,12 +89,8 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
             rows, columns = pushed.rest_m.shape[:2]
             return SheetMesh(pushed.positions[0].reshape(-1, 3), triangulate_grid(rows, columns))
 
-        shapes: dict[str, Callable[[SheetPose], SheetMesh]] = {
-            "four_triangles": pyramid_mesh,
-        }
-        in_range = {
-            "four_triangles": depth <= MAX_TRIANGLES_DEPTH_M,
-        }
+        shapes: dict[str, Callable[[SheetPose], SheetMesh]] = {"four_triangles": pyramid_mesh}
+        in_range = {"four_triangles": depth <= MAX_TRIANGLES_DEPTH_M}
         if basis is not None:
             shapes |= {"reduced_order": partial(deflected_mesh, basis=basis), "membrane": elements}
             in_range |= {

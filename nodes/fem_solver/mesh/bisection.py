@@ -52,9 +52,9 @@ def bisect(
     """Bisect tetrahedra (e, 4) until none of them is too large.
 
     too_large: function that returns whether each tetrahedron is too large, for given vertices (n,
-    3) and tetrahedra. Adjacent tetrahedra are also bisected, so that they share whole faces. Raise
-    UnfitMeshError if more than `MAX_TETRAHEDRA` tetrahedra or edges shorter than 1/64 of a cell are
-    required.
+    3) and tetrahedra. Adjacent tetrahedra are also bisected, because neighbours must share whole
+    faces. Raises UnfitMeshError if more than `MAX_TETRAHEDRA` tetrahedra or edges shorter than 1/64
+    of a cell are required.
     """
     while True:
         if len(tetrahedra) > MAX_TETRAHEDRA:
@@ -66,10 +66,7 @@ def bisect(
         square = np.square(ends[:, :, 0] - ends[:, :, 1]).sum(axis=2)
         longest_edges = square.argmax(axis=1)
         middles = ends.sum(axis=2)
-        known_keys = np.sort(_keys(2 * vertices))
-        wanted_keys = _keys(middles.reshape(-1, 3))
-        positions = np.minimum(np.searchsorted(known_keys, wanted_keys), len(known_keys) - 1)
-        hanging = (known_keys[positions] == wanted_keys).reshape(-1, 6).any(axis=1)
+        hanging = (_find(2 * vertices, middles.reshape(-1, 3)) >= 0).reshape(-1, 6).any(axis=1)
         split = np.flatnonzero(hanging | too_large(vertices, tetrahedra))
         if not len(split):
             return vertices, tetrahedra

@@ -17,19 +17,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexsheet.nodes.arrays import Floats, Ints
+from flexsheet.nodes.fem_solver.mesh.grading import BACK_COARSENING, DEPTH_GROWTH, RAMP_RAD
 from flexsheet.nodes.fem_solver.mesh.solid import (
     EDGES,
     SAME_M,
     SUBTRIANGLES,
     SolidMesh,
     add_midside_nodes,
+    orient_tetrahedra,
     skin_faces,
 )
 
-BACK_COARSENING = 2.0
-DEPTH_GROWTH = 0.35
-"""The increase of the element size per depth below the curved side (m/m)."""
-RAMP_RAD = 0.6
 FOCUS_GROWTH = 0.35
 """The increase of the element size per distance (m/m) from the focus, which is the point of the
 push."""
@@ -102,15 +100,47 @@ def cylinder_mesh(
     swapped = 1 if focus is None else int(np.abs(stations - focus.x_m).argmin())
     corners, tetrahedra = _extrude(points, triangles, stations, swapped)
     layer = np.repeat(np.arange(len(stations)), len(points))
-    return _finish_mesh(
-        corners,
-        tetrahedra,
-        layer,
-        radius_m=radius_m,
-        length_m=length_m,
-        half_support=half_support,
-        touch_angle=touch_angle_rad,
-        mirror_axes=mirror_axes,
+    nodes, elements = add_midside_nodes(corners, tetrahedra)
+    level = np.empty(len(nodes), dtype=np.int64)
+    level[: len(corners)] = 2 * layer
+    level[elements[:, 4:]] = layer[tetrahedra[:, EDGES]].sum(axis=2)
+
+    # Move the nodes of the curved side onto the true cylinder.
+    faces = skin_faces(nodes, elements, mirror_axes)
+    on_cap = np.abs(np.abs(nodes[:, 0]) - 0.5 * length_m) < 1e-9 * length_m
+    side = faces[~on_cap[faces[:, :3]].all(axis=1)]
+    rim = np.unique(side)
+    nodes[rim, 1:] *= (radius_m / np.hypot(nodes[rim, 1], nodes[rim, 2]))[:, None]
+
+    # Sort the nodes by level, position along the axis, and angle.
+    angle = np.arctan2(nodes[:, 1], nodes[:, 2])
+    order = np.lexsort((angle, nodes[:, 0], level))
+    new = np.empty(len(nodes), dtype=np.int64)
+    new[order] = np.arange(len(nodes))
+    nodes, angle = nodes[order], angle[order]
+    elements, faces, side, rim = new[elements], new[faces], new[side], np.sort(new[rim])
+
+    fixed = np.zeros(len(nodes), dtype=bool)
+    fixed[rim] = np.abs(angle[rim]) >= np.pi - half_support - 1e-9
+    skin = np.unique(faces)
+    touchable = np.zeros(len(nodes), dtype=bool)
+    touchable[rim] = np.abs(angle[rim]) <= touch_angle_rad + 1e-9
+    touchable &= ~fixed
+    contact_faces = side[touchable[side].all(axis=1)]
+    contact_nodes = np.unique(contact_faces)
+    normals = nodes[contact_nodes] / radius_m
+    normals[:, 0] = 0.0
+    return SolidMesh(
+        nodes=nodes,
+        elements=elements,
+        fixed=fixed,
+        skin=skin,
+        skin_triangles=np.searchsorted(skin, faces[:, SUBTRIANGLES].reshape(-1, 3)).astype(
+            np.int32
+        ),
+        contact_nodes=contact_nodes,
+        contact_normals=normals,
+        contact_faces=np.searchsorted(contact_nodes, contact_faces),
     )
 
 
@@ -315,62 +345,4 @@ def _extrude(points: Floats, triangles: Ints, x: Floats, swapped: int) -> tuple[
                 ]
             )
         )
-    elements = np.concatenate(tetrahedra)
-    sides = corners[elements[:, 1:]] - corners[elements[:, :1]]
-    negative = np.linalg.det(sides) < 0
-    elements[negative] = elements[negative][:, [0, 2, 1, 3]]
-    return corners, elements
-
-
-def _finish_mesh(
-    corners: Floats,
-    tetrahedra: Ints,
-    layer: Ints,
-    *,
-    radius_m: float,
-    length_m: float,
-    half_support: float,
-    touch_angle: float,
-    mirror_axes: tuple[int, ...],
-) -> SolidMesh:
-    """Build the mesh of 10-node elements, curve its edges, and find fixed and touchable nodes."""
-    nodes, elements = add_midside_nodes(corners, tetrahedra)
-    level = np.empty(len(nodes), dtype=np.int64)
-    level[: len(corners)] = 2 * layer
-    level[elements[:, 4:]] = layer[tetrahedra[:, EDGES]].sum(axis=2)
-
-    faces = skin_faces(nodes, elements, mirror_axes)
-    on_cap = np.abs(np.abs(nodes[:, 0]) - 0.5 * length_m) < 1e-9 * length_m
-    side = faces[~on_cap[faces[:, :3]].all(axis=1)]
-    rim = np.unique(side)
-    nodes[rim, 1:] *= (radius_m / np.hypot(nodes[rim, 1], nodes[rim, 2]))[:, None]
-
-    angle = np.arctan2(nodes[:, 1], nodes[:, 2])
-    order = np.lexsort((angle, nodes[:, 0], level))
-    new = np.empty(len(nodes), dtype=np.int64)
-    new[order] = np.arange(len(nodes))
-    nodes, angle = nodes[order], angle[order]
-    elements, faces, side, rim = new[elements], new[faces], new[side], np.sort(new[rim])
-
-    fixed = np.zeros(len(nodes), dtype=bool)
-    fixed[rim] = np.abs(angle[rim]) >= np.pi - half_support - 1e-9
-    skin = np.unique(faces)
-    touchable = np.zeros(len(nodes), dtype=bool)
-    touchable[rim] = np.abs(angle[rim]) <= touch_angle + 1e-9
-    touchable &= ~fixed
-    contact_faces = side[touchable[side].all(axis=1)]
-    contact_nodes = np.unique(contact_faces)
-    normals = nodes[contact_nodes] / radius_m
-    normals[:, 0] = 0.0
-    return SolidMesh(
-        nodes=nodes,
-        elements=elements,
-        fixed=fixed,
-        skin=skin,
-        skin_triangles=np.searchsorted(skin, faces[:, SUBTRIANGLES].reshape(-1, 3)).astype(
-            np.int32
-        ),
-        contact_nodes=contact_nodes,
-        contact_normals=normals,
-        contact_faces=np.searchsorted(contact_nodes, contact_faces),
-    )
+    return corners, orient_tetrahedra(corners, np.concatenate(tetrahedra))

@@ -25,7 +25,6 @@ from flexsheet.nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, lo
 from flexsheet.nodes.fem_solver.mesh.quality import MIN_RADIUS_RATIO, radius_ratios
 from flexsheet.nodes.fem_solver.mesh.smoothing import (
     SPRINGS_OFF_SURFACE,
-    make_surface_query,
     smooth_mesh,
 )
 from flexsheet.nodes.fem_solver.mesh.solid import (
@@ -112,7 +111,7 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
             start_points,
             cells,
             hull,
-            make_surface_query(shape),
+            shape,
             springs=SPRINGS_OFF_SURFACE,
             anchor=0.0,
         )

@@ -36,7 +36,7 @@ from flexsheet.nodes.fem_solver.mesh.solid import (
     make_solid_mesh,
     restrict_touchable,
 )
-from flexsheet.nodes.fem_solver.mesh.supports import select_fixed
+from flexsheet.nodes.fem_solver.mesh.supports import require_fixation, select_fixed
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.models.shapes import GEOMETRIES, Shape, make_shape
 from flexsheet.nodes.models.shapes.triangles import volume_m3
@@ -100,14 +100,6 @@ class MeshSpec:
     @property
     def grading(self) -> Grading:
         return Grading(self.skin_spacing_m, self.touch_angle_rad, self.towards_user)
-
-
-@dataclass(frozen=True, slots=True)
-class MeshBudget:
-    """The approximate number of nodes of a mesh, and the memory that meshing needs, in bytes."""
-
-    nodes: int
-    bytes: int
 
 
 def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
@@ -175,23 +167,14 @@ def _rounded(vector: Floats) -> Vector:
     return x, y, z
 
 
-def mesh_budget(spec: MeshSpec) -> MeshBudget:
-    """Estimate the resources that are needed to build a mesh. The estimate takes at most a second.
-
-    Raises UnfitMeshError for a skin spacing that does not fit the object or requires more than
-    `MAX_NODES` nodes.
-    """
-    return _budget(spec, make_shape(dict(spec.geometry)))
-
-
-def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
-    """Estimate the number of nodes of the mesh, within a factor of two.
+def estimate_node_count(spec: MeshSpec, shape: Shape) -> int:
+    """Estimate the number of nodes of the mesh of a shape, within a factor of two.
 
     Nodes are half an element size apart. Therefore the number of inner nodes is about the integral
     of (2 / element size)^3 over the volume. The number of skin nodes is about the integral of (2 /
     element size)^2 over the surface. Measured factors such as `INNER_FACTOR` correct both numbers.
-    Raises UnfitMeshError for a skin spacing that does not fit the object or requires more than
-    `MAX_NODES` nodes.
+    The estimate takes at most a second. Raises UnfitMeshError for a skin spacing that does not fit
+    the object or requires more than `MAX_NODES` nodes.
     """
     low, high = _box(spec)
     spacing, thickness = spec.skin_spacing_m, float((high - low).min())
@@ -222,14 +205,14 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     skin = weight / shell * np.sum((2.0 / on_skin[(depth > 0.0) & (depth <= shell)]) ** 2)
     usual = {"cylinder": CYLINDER_FACTOR, "mesh": MESH_FACTOR}.get(spec.geometry.shape, 1.0)
     nodes = int(usual * (INNER_FACTOR * inner + SKIN_FACTOR * skin)) + 100
-    budget = MeshBudget(nodes, nodes * BYTES_PER_NODE)
     if nodes > MAX_NODES:
         raise UnfitMeshError(
             f"skin_spacing_m: {spacing:g} requires about {nodes} nodes "
-            f"({budget.bytes / 2**30:.1f} GiB of memory), but the maximum is {MAX_NODES}; "
+            f"({nodes * BYTES_PER_NODE / 2**30:.1f} GiB of memory), but the maximum is "
+            f"{MAX_NODES}; "
             "increase skin_spacing_m"
         )
-    return budget
+    return nodes
 
 
 def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
@@ -239,25 +222,16 @@ def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
     return low - margin, high + np.array([margin, margin, 0.0])
 
 
-def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
-    """Mesh the object of a scene in the mesh frame.
-
-    skin_spacing_m: distance between skin nodes. Raises UnfitMeshError for an object, a spacing or a
-    support that cannot be meshed. Raises ValueError if the axis of a cylinder points to the user.
-    """
-    return build_mesh(mesh_spec(scene, skin_spacing_m))
-
-
 def build_mesh(spec: MeshSpec) -> SolidMesh:
-    """Build the mesh that a specification describes.
+    """Build the mesh that a specification describes, in the mesh frame (`world_from_mesh`).
 
-    Raises UnfitMeshError for a skin spacing that does not fit the object or requires more than
-    `MAX_NODES` nodes. Also raise this error if the object is too thin for the elements, or if the
-    support fixes too few nodes or all touchable skin.
+    Raises UnfitMeshError if the skin spacing does not fit the object or requires more than
+    `MAX_NODES` nodes, if the object is too thin for the elements, or if the support fixes too few
+    nodes or all touchable skin.
     """
     geometry = spec.geometry
     shape = make_shape(dict(geometry))
-    _budget(spec, shape)
+    estimate_node_count(spec, shape)
     if isinstance(geometry, Cylinder):
         return _cylinder(geometry, spec)
     if isinstance(geometry, Plane):
@@ -300,9 +274,10 @@ def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
         touch_angle_rad=spec.touch_angle_rad,
         skin_spacing_m=spec.skin_spacing_m,
     )
-    if strip:
-        return mesh
     points = mesh.nodes[mesh.skin]
+    if strip:
+        require_fixation(spec.support.kind, points, mesh.fixed[mesh.skin])
+        return mesh
     normals = np.column_stack([np.zeros(len(points)), points[:, 1:] / cylinder.radius_m])
     fixed = np.zeros(len(mesh.nodes), dtype=bool)
     fixed[mesh.skin] = _select_fixed(spec, points, normals)

@@ -1,6 +1,4 @@
-"""Define the element sizes of a mesh, which are small at touchable skin and larger at the back and
-inside.
-"""
+"""Define the element sizes of a mesh: small at touchable skin, larger at the back and inside."""
 
 from __future__ import annotations
 
@@ -9,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flexsheet.nodes.arrays import Bools, Floats, Ints
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
@@ -63,7 +62,5 @@ class Grading:
 
 def longest_edges(points: Floats, tetrahedra: Ints) -> Floats:
     """Return the length (e,) of the longest edge of each tetrahedron, in the unit of the points."""
-    corners = points[tetrahedra]
-    pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-    square = [np.square(corners[:, i] - corners[:, j]).sum(axis=1) for i, j in pairs]
-    return np.asarray(np.sqrt(np.max(square, axis=0)))
+    ends = points[tetrahedra[:, EDGES]]
+    return np.asarray(np.linalg.norm(ends[:, :, 0] - ends[:, :, 1], axis=2).max(axis=1))

@@ -24,7 +24,6 @@ from flexsheet.nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, lo
 from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
 from flexsheet.nodes.fem_solver.mesh.smoothing import (
     SPRINGS_ON_SURFACE,
-    make_surface_query,
     smooth_mesh,
 )
 from flexsheet.nodes.fem_solver.mesh.solid import (
@@ -82,7 +81,7 @@ def mesh_by_map(template: CuboidMap, shape: Shape, grading: Grading) -> tuple[Fl
                 corners,
                 tetrahedra,
                 np.flatnonzero(on_hull),
-                make_surface_query(shape),
+                shape,
                 springs=SPRINGS_ON_SURFACE,
                 anchor=anchor,
             )

@@ -19,10 +19,6 @@ from flexsheet.nodes.arrays import Floats, Ints
 from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
 from flexsheet.nodes.models.shapes import Shape
 
-Surface = Callable[[Floats], tuple[Floats, Floats]]
-"""A function that returns the surface points nearest to points (n, 3), and their outward
-normals."""
-
 SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """The spring stiffness in each round for a boundary whose initial distance from the surface is up
 to one element. The unit of length is the median edge length."""
@@ -41,21 +37,11 @@ _REGULAR = np.array(
 _FROM_REGULAR = np.linalg.inv(_REGULAR)
 
 
-def make_surface_query(shape: Shape) -> Surface:
-    """Return a function that finds the nearest surface points of a shape and their normals."""
-
-    def nearest(points: Floats) -> tuple[Floats, Floats]:
-        found = shape.closest(points)
-        return found.point, found.normal
-
-    return nearest
-
-
 def smooth_mesh(
     corners: Floats,
     tetrahedra: Ints,
     hull: Ints,
-    surface: Surface,
+    shape: Shape,
     *,
     springs: tuple[float, ...],
     anchor: float,
@@ -63,18 +49,18 @@ def smooth_mesh(
     """Improve the shape of tetrahedra, and return the new positions (n, 3), m, of their corners.
 
     corners (n, 3), m, tetrahedra (e, 4): mesh with positive volumes. hull: indices of the corners
-    that move to the surface. surface: function that finds the nearest surface points. springs:
-    spring stiffness in each round. anchor: stiffness of springs from each corner to its initial
-    position. These springs preserve the variation of element sizes. If an element would have a
-    radius ratio below `MIN_FINAL_RADIUS_RATIO`, its corners are not moved fully onto the surface.
+    that move to the surface of `shape`. springs: spring stiffness in each round. anchor: stiffness
+    of springs from each corner to its initial position. These springs preserve the variation of
+    element sizes. If an element would have a radius ratio below `MIN_FINAL_RADIUS_RATIO`, its
+    corners are not moved fully onto the surface.
     """
     sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
     unit = float(np.median(np.linalg.norm(sides, axis=1)))
     start_points = corners / unit
     points = start_points
     for spring in springs:
-        feet, normals = surface(points[hull] * unit)
-        feet = feet / unit
+        found = shape.closest(points[hull] * unit)
+        feet, normals = found.point / unit, found.normal
 
         def energy(
             x: Floats, pull: tuple[Floats, Floats, float] = (feet, normals, spring)
@@ -90,7 +76,7 @@ def smooth_mesh(
         points = _minimize(points, energy)
     points = points * unit
     targets = points.copy()
-    targets[hull] = surface(points[hull])[0]
+    targets[hull] = shape.closest(points[hull]).point
     while True:
         flat = radius_ratios(targets, tetrahedra) < MIN_FINAL_RADIUS_RATIO
         moved = np.unique(tetrahedra[flat])

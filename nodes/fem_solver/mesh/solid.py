@@ -112,7 +112,7 @@ def skin_faces(nodes: Floats, elements: Ints, mirror_axes: tuple[int, ...]) -> I
 def add_midside_nodes(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
     """Convert tetrahedra (e, 4) to 10-node elements with straight edges.
 
-    Return the nodes (n, 3), which start with the corners, and the elements (e, 10).
+    Return the nodes (n, 3), starting with the corners, and the elements (e, 10).
     """
     pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
@@ -191,7 +191,7 @@ def make_solid_mesh(
 def restrict_touchable(mesh: SolidMesh, touchable: Bools) -> SolidMesh:
     """Return a copy of the mesh that has fewer touchable nodes.
 
-    touchable (n,): whether each node may remain touchable. Fixed nodes are always excluded. Raise
+    touchable (n,): whether each node may remain touchable. Fixed nodes are always excluded. Raises
     UnfitMeshError if no touchable face remains.
     """
     good = (touchable & ~mesh.fixed)[mesh.contact_nodes]

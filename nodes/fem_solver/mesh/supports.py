@@ -47,13 +47,15 @@ def select_fixed(
                 points <= support.max_m + TOLERANCE_M
             )
             chosen = np.asarray(inside.all(axis=1))
-    _require_fixation(support.kind, points, chosen)
+    require_fixation(support.kind, points, chosen)
     return chosen
 
 
-def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
-    """Raise UnfitMeshError if all chosen points are collinear, because the body could rotate about
-    this line.
+def require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
+    """Raise UnfitMeshError if all fixed points are collinear, because the body could rotate freely.
+
+    kind: kind of the support. points (n, 3): skin points, m. chosen (n,): whether each point is
+    fixed.
     """
     some = points[chosen]
     extent = float(np.ptp(points, axis=0).max())

@@ -380,6 +380,33 @@ def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
     return np.asarray(slanted & inside & (t > 1e-9) & (t < 1.0 - 1e-9))
 
 
+def intersect_rays(
+    origin: Floats, rays: Floats, corners: Floats
+) -> tuple[NDArray[np.intp], Floats]:
+    """Intersect lines through a point with triangles.
+
+    origin (3,): common point of the lines. rays (n, 3): directions. corners (m, 3, 3): triangles.
+    Return the index (n,) of the triangle that each line intersects, and the barycentric weights (n,
+    3) of its corners. The weights are NaN if the line misses all triangles. Source: Möller and
+    Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997.
+    """
+    first, along, up = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(along, up)
+    from_first = origin - first
+    # Each matrix product computes a scalar triple product for all rays and triangles.
+    volume = -rays @ normal.T
+    v = rays @ np.cross(up, from_first).T
+    w = rays @ np.cross(from_first, along).T
+    volume = np.where(np.abs(volume) < 1e-15, np.nan, volume)
+    v, w = v / volume, w / volume
+    inside = np.minimum(np.minimum(v, w), 1.0 - v - w)
+    hit = np.nanargmax(inside, axis=1)
+    rows = np.arange(len(rays))
+    v, w = v[rows, hit], w[rows, hit]
+    weights = np.column_stack([1.0 - v - w, v, w])
+    return hit, np.where(inside[rows, hit][:, None] >= -1e-9, weights, np.nan)
+
+
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
     """Return the barycentric coordinates (n, 3) of the points in triangles nearest to `points` (n,
     3).
