@@ -34,7 +34,6 @@ from flexsheet.launch.experiments.simulated_time import (
     touch_in_simulated_time,
 )
 from flexsheet.launch.experiments.stroke import object_pose
-from flexsheet.launch.experiments.true_geometry import pose_matrix
 from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
@@ -52,7 +51,7 @@ from flexsheet.messages.types import (
     TwinFinger,
 )
 from flexsheet.nodes.models.motion import SheetMotion
-from flexsheet.nodes.models.rigid import apply, inverse, transform
+from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.models.shapes import make_shape
 from flexsheet.nodes.planner import hand_bounds
 from flexsheet.nodes.planner.node import Planner

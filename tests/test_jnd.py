@@ -59,9 +59,9 @@ def run(session: StaircaseSession, mind: SimulatedParticipant, *, until: int = 1
 
     if until <= session.plan.trials:
         with pytest.raises(KeyboardInterrupt):
-            asyncio.run(run_session(session, present, lambda done, total: None))
+            asyncio.run(run_session(session, present))
     else:
-        asyncio.run(run_session(session, present, lambda done, total: None))
+        asyncio.run(run_session(session, present))
 
 
 def test_the_weber_fraction_of_20_participants_is_recovered(tmp_path: Path) -> None:
@@ -227,7 +227,7 @@ def test_the_operator_can_interrupt(tmp_path: Path) -> None:
     presenter, _ = make_presenter(iter(["\n", "\n", "1\n", "\n", "Q\n"]))
     session = open_session(tmp_path)
     with pytest.raises(ExperimentError, match="run the same command again"):
-        asyncio.run(run_session(session, presenter.present, lambda done, total: None))
+        asyncio.run(run_session(session, presenter.present))
     assert session.done == open_session(tmp_path).done == 1
 
 

@@ -13,7 +13,8 @@ from flexsheet.launch.experiments.stroke import SampledMotion
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.nodes.models.rigid import transform
-from flexsheet.nodes.twin.sheet_pull import SheetPull, true_friction, true_rubber
+from flexsheet.nodes.twin import sheet_pull
+from flexsheet.nodes.twin.sheet_pull import SheetPull, true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 from tests.scenes import set_density
 from tests.test_compliance_experiment import held
@@ -38,9 +39,16 @@ def test_the_true_density_is_the_scenes_unless_stated() -> None:
     assert density_of(apparatus(sheet={"density_kg_per_m3": 0.0})) == 0.0
 
 
-def test_the_true_friction_is_that_of_the_apparatus() -> None:
-    assert true_friction(None) is None
-    assert true_friction(apparatus(sheet={"friction_coefficient": 0.4})) == 0.4
+def test_the_true_friction_is_that_of_the_apparatus(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[float | None] = []
+    monkeypatch.setattr(
+        sheet_pull,
+        "solve",
+        lambda *_, **options: given.append(options["friction_coefficient"]),
+    )
+    for one in (None, apparatus(sheet={"friction_coefficient": 0.4})):
+        sheet_pull.solve_sheet(SCENE, one, (np.eye(4), np.eye(4)))
+    assert given == [None, 0.4]
 
 
 def test_the_pull_relaxes_and_has_hysteresis() -> None:

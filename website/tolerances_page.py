@@ -5,7 +5,6 @@ from __future__ import annotations
 from flexsheet.nodes.twin.tolerance_table import (
     NOT_SIMULATED,
     TOLERANCES,
-    Always,
     Distribution,
     HalfNormal,
     LogNormal,
@@ -68,8 +67,8 @@ def _format(distribution: Distribution, scale: float) -> str:
         case LogUniform(low, high):
             return f"log-U({low * scale:.4g}, {high * scale:.4g})"
         case OneOf(values):
-            return " or ".join(f"{value * scale:.4g}" for value in values)
-        case Always(value):
-            return value if isinstance(value, str) else f"{value * scale:.4g}"
+            return " or ".join(
+                value if isinstance(value, str) else f"{value * scale:.4g}" for value in values
+            )
         case _:
             raise TypeError(f"unknown distribution {distribution!r}")

@@ -170,7 +170,7 @@ def _simulate(plan: SessionPlan, folder: Path, repeats: int) -> list[dict[str, A
 
             name = plan.participant if repeats == 1 else f"{plan.participant}-{seed}"
             session = _open(replace(plan, participant=name, seed=seed), folder)
-            asyncio.run(run_session(session, present, lambda done, total: None))
+            asyncio.run(run_session(session, present))
             true = mind.perception.weber_fraction
             row = session.result()
             error = 100.0 * (row["weber_fraction"] / true - 1.0)
@@ -195,7 +195,7 @@ def _measure(
     words.print(INSTRUCTIONS)
 
     async def run(presenter: PairPresenter) -> None:
-        await run_session(session, presenter.present, lambda done, total: None)
+        await run_session(session, presenter.present)
 
     # A spinner would overwrite the operator's input. A bag is not recorded, because recorded motion
     # can identify a person.

@@ -23,8 +23,7 @@ class ExperimentError(FlexsheetError, RuntimeError):
 
 
 class ExperimentInterruptedError(ExperimentError):
-    """Raised after SIGINT or SIGTERM has interrupted an experiment and its nodes have been
-    stopped."""
+    """Raised after a signal has interrupted an experiment and its nodes have been stopped."""
 
     code = "experiment-interrupted"
     remedy = "Start the experiment again; a sweep continues with the trials that are missing."

@@ -32,7 +32,6 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingerPath, Force, SoftBody, TwinArms, TwinFinger
-from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.planner.compliance import (
     FORCE_JND_FLOOR_N,
     TARGET_ERROR_RATIO,
@@ -40,9 +39,9 @@ from flexsheet.nodes.planner.compliance import (
     WEBER_RATIO_BARE,
 )
 from flexsheet.nodes.twin.force_history import ForceHistory, apply_history
-from flexsheet.nodes.twin.membrane import CELLS, solve
+from flexsheet.nodes.twin.membrane import CELLS, make_edge_plane
 from flexsheet.nodes.twin.paths import map_to_surface
-from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_pull import find_clamps, solve_sheet
 from flexsheet.nodes.twin.truth import apply_apparatus
 
 Floats = NDArray[np.float64]
@@ -102,9 +101,11 @@ class RestInterval:
 class Press:
     """The finger path of one push.
 
-    place: name of the pushed position. place_m: distance along the object and arc length around it
-    from its front. surface, normal: point (3,) and normal (3,) of the undeformed object at this
-    position, in the world frame. holds: evaluated rests; empty if the finger does not rest.
+    place: name of the pushed position.
+    place_m: distance along the object and arc length around it from its front.
+    surface, normal: point (3,) and normal (3,) of the undeformed object at this position, in the
+        world frame.
+    holds: evaluated rests; empty if the finger does not rest.
     """
 
     path: FingerPath
@@ -187,10 +188,11 @@ def make_compliance_procedure(progress: Progress, method: TableMethod = "quick_t
 class ComplianceRecording:
     """The data of a compliance experiment, read from a bag.
 
-    windows_ns: start and end of each finger path, by label. edges: true flange poses of both arms,
-    flattened to rows (16,). curves: object force against depth, arrays (m, 2), which were published
-    at `curve_times_ns`. methods: the soft body's method that computed each curve. forces: times
-    (ns) and values (N) of the valid measured contact forces (k, 2).
+    windows_ns: start and end of each finger path, by label.
+    edges: true flange poses of both arms, flattened to rows (16,).
+    curves: object force against depth, arrays (m, 2), published at `curve_times_ns`.
+    methods: the soft body's method that computed each curve.
+    forces: times (ns) and values (N) of the valid measured contact forces (k, 2).
     """
 
     scene: Scene
@@ -258,9 +260,12 @@ def read_bag(bag: Path) -> ComplianceRecording:
 class ForceSample:
     """The forces on the finger at one time.
 
-    depth_m: true finger depth. wanted_n: published force of the object. felt_n: force of the sheet.
-    normal_offset_m: depth of the sheet's centre below the undeformed surface. method: method of the
-    soft body. reference: force of the object from an independent solver, or None.
+    depth_m: true finger depth.
+    wanted_n: published force of the object.
+    felt_n: force of the sheet.
+    normal_offset_m: depth of the sheet's centre below the undeformed surface.
+    method: method of the soft body.
+    reference: force of the object from an independent solver, or None.
     """
 
     depth_m: float
@@ -274,8 +279,8 @@ class ForceSample:
     def error_ratio(self) -> float:
         """Return the relative error of the felt force.
 
-        The error is relative to the reference force, or to the wanted force if there is no
-        reference. The divisor is at least FORCE_JND_FLOOR_N.
+        The error is relative to the reference force, or to the wanted force without a reference.
+        The divisor is at least FORCE_JND_FLOOR_N.
         """
         expected_n = self.wanted_n if self.reference is None else self.reference.force_n
         return _relative_error(self.felt_n, expected_n)
@@ -293,25 +298,19 @@ def _relative_error(force_n: float, expected_n: float) -> float:
 
 
 class ForceReference:
-    """An evaluator that computes the true forces in a recording with the simulator's membrane
-    model."""
+    """A model of the true forces in a recording; it uses the simulator's membrane."""
 
     def __init__(self, recorded: ComplianceRecording) -> None:
-        scene = apply_apparatus(recorded.scene, recorded.apparatus)
-        self._recorded, self._radius_m = recorded, scene.finger.radius_m
-        self._clamps = (
-            pose_matrix(scene.arms.left.flange_from_edge),
-            pose_matrix(scene.arms.right.flange_from_edge),
-        )
-        self._rubber = true_rubber(scene.sheet, recorded.apparatus)
-        self._friction = true_friction(recorded.apparatus)
+        self._recorded = recorded
+        self._scene = apply_apparatus(recorded.scene, recorded.apparatus)
+        self._clamps = find_clamps(self._scene)
         self._ratios: dict[str, tuple[Times, Floats]] = {}
         self._curves: dict[str, ReferenceForceCurve | None] = {}
 
     def evaluate(self, at_ns: int, press: Press) -> ForceSample:
         """Return the true forces at the time `at_ns`.
 
-        press: push to which this time belongs; the depth is measured from its surface point.
+        press: push that contains this time. The depth is measured from its surface point.
         """
         tip, left, right = self._read_poses(at_ns)
         depth_m = float((press.surface - tip) @ press.normal)
@@ -331,8 +330,7 @@ class ForceReference:
         )
 
     def _read_poses(self, at_ns: int) -> tuple[Floats, Floats, Floats]:
-        """Return the true fingertip (3,) and the poses (4, 4) of both sheet edges at the time
-        `at_ns`."""
+        """Return the true fingertip (3,) and the poses (4, 4) of both edges at the time `at_ns`."""
         times = np.array([at_ns])
         left, right = (
             edges.interpolate(times)[0].reshape(4, 4) @ clamp
@@ -343,20 +341,14 @@ class ForceReference:
     def _solve_n(
         self, left: Floats, right: Floats, tip: Floats, press: Press, cells: int = CELLS
     ) -> float:
-        """Return the force (N) of a purely elastic sheet on the finger, along the normal of the
-        push.
+        """Return the force (N) of a purely elastic sheet on the finger, along the push.
 
-        left, right: poses (4, 4) of the sheet's edges. tip: fingertip (3,). cells: membrane
-        elements per side.
+        left, right: poses (4, 4) of the sheet's edges.
+        tip: fingertip (3,).
+        cells: membrane elements per side.
         """
-        pressed = solve(
-            self._rubber,
-            left,
-            right,
-            finger_tip=tip,
-            finger_radius_m=self._radius_m,
-            friction_coefficient=self._friction,
-            cells=cells,
+        pressed = solve_sheet(
+            self._scene, self._recorded.apparatus, (left, right), tip, cells=cells
         )
         return float(pressed.finger_force_n @ press.normal)
 
@@ -374,11 +366,11 @@ class ForceReference:
         return float(np.interp(at_ns, times, ratios))
 
     def _follow_history(self, press: Press) -> tuple[Times, Floats]:
-        """Return the ratio of the rubber's force to the force of an elastic sheet during a push.
+        """Return times (n,), ns, and the ratios (n,) of the rubber's force to an elastic force in a
+        push.
 
-        The result contains the times (n,) in ns and the ratios (n,). The membrane is solved at a
-        few depths only, with the edges at the deepest point of the push. This is sufficient,
-        because the ratio depends only on the shape of the force curve.
+        The membrane is solved at a few depths only, with the edges at the deepest point of the
+        push. This is sufficient, because the ratio depends only on the shape of the force curve.
         """
         begin_ns, end_ns = self._recorded.windows_ns[press.path.label]
         times = np.arange(begin_ns, end_ns + 1, round(HISTORY_STEP_S * 1e9))
@@ -389,7 +381,7 @@ class ForceReference:
         depths_m = float(indented_m.max()) * np.linspace(0.0, 1.0, HISTORY_DEPTHS)
         if depths_m[-1] <= 0.0:
             return times, np.ones(len(times))
-        normal = _sheet_normal(left, right)
+        normal = make_edge_plane(left, right)[:3, 2]
         at_surface = tip - ((tip - middle) @ normal) * normal
         curve_n = [0.0] + [
             self._solve_n(left, right, at_surface - depth * normal, press, HISTORY_CELLS)
@@ -407,22 +399,13 @@ def _interpolate_curve_n(rows: Floats, depth_m: float) -> float:
     return float(curve(np.clip(depth_m, 0.0, rows[-1, 0])))
 
 
-def _sheet_normal(left: Floats, right: Floats) -> Floats:
-    """Return the unit normal (3,) of the unloaded sheet, which points to the user.
-
-    left, right: poses (4, 4) of the sheet's edges.
-    """
-    normal = np.cross(right[:3, 3] - left[:3, 3], left[:3, 1] + right[:3, 1])
-    return np.asarray(normal / np.linalg.norm(normal))
-
-
 def _indentation_m(tip: Floats, left: Floats, right: Floats) -> float:
     """Return the depth (m) of the fingertip behind the plane of the unloaded sheet; at least 0.
 
     tip: fingertip (3,). left, right: poses (4, 4) of the sheet's edges.
     """
-    middle = 0.5 * (left[:3, 3] + right[:3, 3])
-    return max(float((middle - tip) @ _sheet_normal(left, right)), 0.0)
+    plane = make_edge_plane(left, right)
+    return max(float((plane[:3, 3] - tip) @ plane[:3, 2]), 0.0)
 
 
 def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
@@ -476,10 +459,12 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
 
 
 def _measure_n(forces: Floats, begin_ns: int, hold: RestInterval) -> float | None:
-    """Return the mean force (N) that a gauge measured in a rest; None if there is no measurement.
+    """Return the mean force (N) that a gauge measured in a rest; None without a measurement.
 
-    forces: (k, 2), times (ns) and forces (N). begin_ns: start of the finger path. Because gauges
-    are slow, the averaging interval is longer than the interval for the true force.
+    The averaging interval is longer than that of the true force, because gauges are slow.
+
+    forces: (k, 2), times (ns) and forces (N).
+    begin_ns: start of the finger path.
     """
     since_s = 1e-9 * (forces[:, 0] - begin_ns)
     chosen = forces[(since_s > hold.end_s - MEASURED_S) & (since_s < hold.end_s), 1]

@@ -61,8 +61,8 @@ def run_demo(
 ) -> DemoResult:
     """Run the demo on a graph, and return its results.
 
-    The finger makes strokes of 10 s and 30 s, or follows `path` if it is given. Images of a tilted
-    and of a pushed sheet are captured. folder: where the bag and the figures are written.
+    The finger makes strokes of 10 s and 30 s, or follows `path`. Images of a tilted and of a pushed
+    sheet are captured. The bag and the figures are written to `folder`.
     """
     bag = folder / "demo.mcap"
     procedure = chain_procedures(
@@ -99,12 +99,13 @@ def summarize(
     recording = stroke.read_recording(bag)
     eye_images = image.read_images(bag)
     views, plot, latency = (folder / f"{name}.png" for name in ("eye", "stroke", "latency"))
-    tilted = [
-        image.find_image(eye_images, image.TILT.label(TILT_DEG, name)) for name in TILT_CORRECTIONS
-    ]
-    pushed = [
-        image.find_image(eye_images, image.PUSH.label(DEPTH_MM, name)) for name in PUSH_CORRECTIONS
-    ]
+    tilted, pushed = (
+        [find_recorded(eye_images, "image", series.label(value, name)) for name in corrections]
+        for series, value, corrections in (
+            (image.TILT, TILT_DEG, TILT_CORRECTIONS),
+            (image.PUSH, DEPTH_MM, PUSH_CORRECTIONS),
+        )
+    )
     draw_eye_views(
         [(f"sheet tilted {TILT_DEG}°", tilted), (f"sheet pushed {DEPTH_MM} mm", pushed)], views
     )

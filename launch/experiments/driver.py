@@ -34,6 +34,7 @@ from flexsheet.messages.types import (
     Status,
     TwinEye,
     TwinFinger,
+    Viewpoint,
 )
 from flexsheet.nodes import node_class
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
@@ -212,12 +213,14 @@ class Driver:
     async def wait_for_table(
         self, scene: Scene, method: TableMethod, progress: Callable[[str], None]
     ) -> None:
-        """Wait until the soft body uses a table that is at least as accurate as `method`.
+        """Wait until the soft body uses a table at least as accurate as `method`.
 
-        If the cache has no such table, a node uses a less accurate method while it computes the
-        table. Return at once if the scene or the parameters of all nodes select such a method.
-        progress: function that receives the node's progress and remaining time. Raises
-        ExperimentError after `MAX_TABLE_WAIT_S`, and if the table cannot be computed.
+        Without a cached table, a node uses a less accurate method while it computes the table.
+        Return at once if no node uses a table for the scene.
+
+        progress: function that receives the node's progress and remaining time.
+
+        Raises ExperimentError after `MAX_TABLE_WAIT_S`, and if the table cannot be computed.
         """
         solvers = {name: p for name, p in self._solvers() if _computes_table(p, scene)}
         if not solvers:
@@ -305,63 +308,39 @@ class Driver:
         shading: Shading = "flat",
         *,
         pattern: Pattern = "object",
-    ) -> TwinEye:
-        """Display the object with an image correction, and return the simulated eye's image.
+        both_eyes: bool = False,
+    ) -> None:
+        """Display the object with an image correction, and wait for the simulated eye's image.
 
         label: label of the image. shading: "flat" for a sharp outline in measurements, "soft" for
-        figures.
+        figures. both_eyes: whether to wait for an image of each eye, instead of a single image.
         """
         self.show(
             Display(
                 correction=correction,
-                stereo="mono",
+                stereo="frame_sequential" if both_eyes else "mono",
                 shading=shading,
                 pattern=pattern,
                 marks=False,
-                pixels_every=PIXELS_EVERY,
+                pixels_every=EYE_PIXELS_EVERY if both_eyes else PIXELS_EVERY,
                 label=label,
             )
         )
-
-        def received() -> bool:
-            eye = self._newest.get("twin/eye")
-            return isinstance(eye, TwinEye) and eye.label == label
-
-        await self.wait_for(received, f'the eye\'s image of "{label}"', IMAGE_WAIT_S)
-        # Stop sending pixels in frames until the next image.
-        self.show(Display(correction=correction, stereo="side_by_side"))
-        eye = self._newest["twin/eye"]
-        assert isinstance(eye, TwinEye)
-        return eye
-
-    async def capture_both_eyes(self, label: str, correction: Correction, pattern: Pattern) -> None:
-        """Display the object alternately to both simulated eyes, and wait for both images."""
-        self.show(
-            Display(
-                correction=correction,
-                stereo="frame_sequential",
-                shading="flat",
-                pattern=pattern,
-                marks=False,
-                pixels_every=EYE_PIXELS_EVERY,
-                label=label,
-            )
-        )
-        missing = {"left", "right"}
+        viewpoints: set[Viewpoint] = set()
 
         def received() -> bool:
             eye = self._newest.get("twin/eye")
             if isinstance(eye, TwinEye) and eye.label == label:
-                missing.discard(eye.viewpoint)
-            return not missing
+                viewpoints.add(eye.viewpoint)
+            return len(viewpoints) == (2 if both_eyes else 1)
 
-        await self.wait_for(received, f'the images of "{label}" for both eyes', IMAGE_WAIT_S)
+        await self.wait_for(received, f'the eye\'s image of "{label}"', IMAGE_WAIT_S)
+        # Stop sending pixels in frames until the next image.
         self.show(Display(correction=correction, stereo="side_by_side"))
 
 
 def _computes_table(parameters: FemSolverParameters, scene: Scene) -> bool:
-    """Return whether a solver node uses a table for a scene, and computes the table if it is
-    missing."""
+    """Return whether a solver node uses a table for a scene and computes a missing table."""
     method, _ = choose_method(
         scene,
         parameters.method,

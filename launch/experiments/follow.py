@@ -1,14 +1,14 @@
 """Simulate a sheet that follows a recorded finger, and compute a lower bound for its error.
 
 The bound is the optimum of a linear program over the whole recording, with the limits of the same
-arms. It assumes that
+arms. The linear program makes these assumptions:
 
-- the future of the finger is known, so that delays, tracking and prediction cause no error;
-- the sheet rolls on the undeformed object without slip, with a constant stretch;
-- joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
-  limited as in the arm bridges; there is no servo lag and no limit of the jerk;
-- outside of contact the sheet may move freely;
-- joint angles change linearly with small deviations of the contact point.
+- The future of the finger is known. Therefore delays, tracking and prediction cause no error.
+- The sheet rolls on the undeformed object without slip, with a constant stretch.
+- Joint positions, speeds and accelerations, and the speed of the ends of the clamped edges, are
+    limited as in the arm bridges. There is no servo lag and no limit of the jerk.
+- Without contact, the sheet may move freely.
+- Joint angles change linearly with small deviations of the contact point.
 
 Three simplifications only make the bound smaller. The limits apply to differences between time
 steps. The length of a deviation is replaced by its largest component along fixed directions.
@@ -18,7 +18,7 @@ Windows of the recording are solved independently.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
@@ -39,7 +39,7 @@ from flexsheet.launch.experiments.run import (
     run_experiment,
 )
 from flexsheet.launch.experiments.simulated_time import follow_in_simulated_time
-from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges
+from flexsheet.launch.experiments.true_geometry import place_edges
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.apparatus import Apparatus, nominal_apparatus
 from flexsheet.messages.scene import Scene
@@ -53,6 +53,7 @@ from flexsheet.nodes.models.rigid import (
     transform,
 )
 from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.twin.arms import PlacedArm
 from flexsheet.nodes.twin.finger import validate_path
 from flexsheet.nodes.twin.paths import map_to_surface
 from flexsheet.nodes.twin.truth import apply_apparatus
@@ -88,10 +89,12 @@ SPEED_DIRECTIONS = SPEED_DIRECTIONS[SPEED_DIRECTIONS.sum(axis=1) > 0.0]
 class LimitedMotion:
     """A linear model of m limited quantities of a mechanism, such as joint angles.
 
-    The quantities depend linearly on k deviations from a nominal motion of n time steps. values:
-    (n, m), quantities in the nominal motion. slopes: (n, m, k), derivatives with respect to the
-    deviations. max_rate, max_acceleration, low, high: (m,), limits of the quantities; infinite if
-    there is none.
+    The quantities depend linearly on k deviations from a nominal motion of n time steps.
+
+    values: (n, m), quantities in the nominal motion.
+    slopes: (n, m, k), derivatives with respect to the deviations.
+    max_rate, max_acceleration, low, high: (m,), limits of the quantities; infinite if there is
+        none.
     """
 
     values: Floats
@@ -107,9 +110,12 @@ def find_least_deviation(
 ) -> Floats | None:
     """Find the motion with the least weighted mean deviation from a nominal motion.
 
-    weights: (n,), weights of the time steps. step_s: time step. max_deviation: limit of each
-    component of a deviation. Returns the lengths (n,) of the deviations, whose weighted mean is a
-    lower bound; None if no motion fulfils the limits.
+    Return the lengths (n,) of the deviations; their weighted mean is a lower bound. Return None if
+    no motion fulfils the limits.
+
+    weights: (n,), weights of the time steps.
+    step_s: time step.
+    max_deviation: limit of each component of a deviation.
     """
     steps, _, deviations = motion.slopes.shape
     scale = max_deviation
@@ -184,7 +190,7 @@ class RolledSheet:
     """A sheet that touches the object at a point.
 
     point (3,), rotation (3, 3): contact point and orientation of the sheet, in the object's frame.
-    on_sheet_m: the contact point in the sheet's coordinates, (x, y, 0).
+    on_sheet_m: contact point in the sheet's coordinates, (x, y, 0).
     """
 
     point: Floats
@@ -192,8 +198,7 @@ class RolledSheet:
     on_sheet_m: Floats
 
     def pose(self, lifted_m: float = 0.0) -> Floats:
-        """Return the pose object_from_sheet (4, 4), displaced along the sheet's normal by
-        `lifted_m`."""
+        """Return the pose object_from_sheet (4, 4) after a shift `lifted_m` along the normal."""
         contact = self.on_sheet_m - np.array([0.0, 0.0, lifted_m])
         return transform(self.rotation, self.point - self.rotation @ contact)
 
@@ -205,33 +210,27 @@ class RolledSheet:
         before = self.rotation[:, 2]
         axis = np.cross(before, normal)
         sine, cosine = float(np.linalg.norm(axis)), float(before @ normal)
-        turn = np.eye(3)
-        if sine > 0.0:
-            turn = rotation_from_vector(axis * (np.arctan2(sine, cosine) / sine))
-        half = rotation_from_vector(
-            np.zeros(3) if sine == 0.0 else axis * (0.5 * np.arctan2(sine, cosine) / sine)
-        )
+        turn_rad = axis * (np.arctan2(sine, cosine) / sine) if sine > 0.0 else axis
+        turn, half = rotation_from_vector(turn_rad), rotation_from_vector(0.5 * turn_rad)
         moved = (half @ self.rotation).T @ (point - self.point)
         on_sheet = self.on_sheet_m + np.array([moved[0], moved[1], 0.0])
         return RolledSheet(point, turn @ self.rotation, on_sheet)
 
 
 class FollowedContact:
-    """A model of the sheet motion that follows a finger exactly, and of deviations from this
-    motion."""
+    """A model of the sheet's motion that follows a finger exactly, and of small deviations."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None = None) -> None:
         true_scene = apply_apparatus(scene, apparatus or nominal_apparatus(scene))
         self._scene = true_scene
         self._shape = make_shape(dict(scene.object.geometry))
         self._world_from_object = pose_matrix(scene.object.world_from_object)
-        self._arms = ArmModel.of(true_scene.arms.left), ArmModel.of(true_scene.arms.right)
+        self._arms = PlacedArm.of(true_scene.arms.left), PlacedArm.of(true_scene.arms.right)
         low, high = scene.sheet.min_stretch_ratio, scene.sheet.max_stretch_ratio
         self._distance_m = scene.sheet.width_m * 0.5 * (low + high)
 
     def contact_heights_m(self, positions_world: Floats) -> Floats:
-        """Return the heights (n,), in m, of fingertip positions (n, 3) above the undeformed
-        object."""
+        """Return the heights (n,), m, of fingertips (n, 3) above the undeformed object."""
         local = apply(inverse(self._world_from_object), positions_world)
         return self._shape.closest(local).height_m
 
@@ -267,7 +266,7 @@ class FollowedContact:
 
         The three deviations (m) of the contact are along the sheet's x and y on the object, and
         along its normal. For each nominal sheet, the method appends to `reachable` whether the arms
-        reach the sheet. The values of unreachable sheets are NaN.
+        reach it. The values of unreachable sheets are NaN.
         """
         joints = np.full((len(sheets), 4, 2, 6), np.nan)
         ends = np.full((len(sheets), 4, 2, 2, 3), np.nan)
@@ -331,10 +330,14 @@ def bound_errors(
 ) -> dict[str, Any]:
     """Return a lower bound of the contact error for a finger path, in mm.
 
-    times_s: (n,), increasing. positions_world: (n, 3), true fingertip, m. The result contains the
-    mean and the 95 % quantile (p95) over the steps in contact. They belong to the motion with the
-    least mean. Steps whose exact sheet the arms cannot reach, and windows without a solution, have
-    an error of zero. Raises ExperimentError if the path never touches the object.
+    The result contains the mean and the 95 % quantile (p95) over the steps in contact, for the
+    motion with the least mean. Steps whose exact sheet is out of reach, and windows without a
+    solution, count as zero.
+
+    times_s: (n,), increasing.
+    positions_world: (n, 3), true fingertip, m.
+
+    Raises ExperimentError if the path never touches the object.
     """
     followed = FollowedContact(scene, apparatus)
     grid = np.arange(times_s[0], times_s[-1], STEP_S)
@@ -357,14 +360,7 @@ def bound_errors(
     windows = _windows(np.array(reachable))
     for number, window in enumerate(windows):
         progress(f"lower bound: {number + 1} of {len(windows)} windows")
-        part = LimitedMotion(
-            motion.values[window],
-            motion.slopes[window],
-            motion.max_rate,
-            motion.max_acceleration,
-            motion.low,
-            motion.high,
-        )
+        part = replace(motion, values=motion.values[window], slopes=motion.slopes[window])
         weights = contact[window].astype(np.float64)
         if not weights.any():
             continue
@@ -410,8 +406,7 @@ def run_follow(
 ) -> dict[str, Any]:
     """Let the sheet follow a finger path, and return the results of `experiment follow --json`.
 
-    bag: file in which to record the running graph; None: follow the path in simulated time, without
-    a running graph.
+    bag: file in which the running graph is recorded; None to follow the path in simulated time.
     """
     plan = load_graph(launch_file, settings=settings, apparatus=apparatus)
     scene, truth = require_scene(plan), plan.apparatus_message()

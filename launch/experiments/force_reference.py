@@ -58,10 +58,10 @@ class ReferenceForceCurve:
 def find_reference_curve(
     scene: Scene, along_m: float, around_m: float, file: Path = REFERENCE_FILE
 ) -> ReferenceForceCurve | None:
-    """Return the stored curve for a position on the object of a scene; None if there is no such
-    curve.
+    """Return the stored curve for a position on the object of a scene; None if there is none.
 
-    along_m: position along the axis. around_m: arc length from the side that faces the user.
+    along_m: position along the axis.
+    around_m: arc length from the side that faces the user.
     """
     geometry, support = scene.object.geometry, scene.object.support
     material = scene.object.material

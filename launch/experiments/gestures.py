@@ -73,9 +73,10 @@ def gesture_path(name: str, scene: Scene) -> FingerPath:
 def finger_path(launch_file: Path, name_or_file: str, settings: Sequence[str] = ()) -> FingerPath:
     """Return a finger path in the scene of a launch file.
 
-    name_or_file: name of a gesture, or CSV file with a recorded path. settings: settings of the
-    launch file, as in `load_graph`; "scene=FILE" replaces the scene. Raises ExperimentError if the
-    path is unknown or invalid.
+    name_or_file: name of a gesture, or CSV file with a recorded path.
+    settings: settings of the launch file, as in `load_graph`. "scene=FILE" replaces the scene.
+
+    Raises ExperimentError if the path is unknown or invalid.
     """
     scene = load_graph(launch_file, settings=settings).scene_message()
     if scene is None:
@@ -106,8 +107,10 @@ def make_gestures_procedure(names: Sequence[str], progress: Progress) -> Procedu
 
 @dataclass(frozen=True, slots=True)
 class TrueFinger:
-    """The true finger motion at the exposures: times (n,) in ns, positions (m) and velocities (n,
-    3)."""
+    """The true finger motion at the exposures.
+
+    times_ns (n,): times. positions, velocities (n, 3): in m and m/s.
+    """
 
     times_ns: Times
     positions: Floats
@@ -189,9 +192,11 @@ def read_gestures(bag: Path) -> GestureRecording:
 def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
     """Return the jumps (n-1,) between consecutive position estimates, in standard deviations.
 
-    errors: (n, 3) m, errors of the estimates. A jump is the difference of two errors, so it does
-    not contain the finger's motion. covariances: (n, 3, 3) m^2, covariances of the estimates. The
-    standard deviation is taken along the jump, for independent estimates.
+    A jump is the difference of two errors, so it does not contain the finger's motion. The standard
+    deviation is taken along the jump, for independent estimates.
+
+    errors: (n, 3), errors of the estimates, m.
+    covariances: (n, 3, 3), covariances of the estimates, m^2.
     """
     jumps = np.diff(errors, axis=0)
     lengths = np.linalg.norm(jumps, axis=1)
@@ -202,7 +207,7 @@ def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
 
 
 def error_mm(errors: Floats) -> dict[str, float | None]:
-    """Return rms, 99 % quantile and maximum of the lengths (mm) of errors (n, 3), which are in m.
+    """Return rms, 99 % quantile and maximum (mm) of the lengths of errors (n, 3) in m.
 
     All values are None if there are no errors.
     """
@@ -239,8 +244,9 @@ def _stack_rows(points: Sequence[Floats]) -> Floats:
 def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
     """Return the tracking errors (mm) and delays (ms) of one gesture; unknown values are None.
 
-    missing: number of exposures without a fingertip. reasons: number of invalid fingertips, by
-    reason. jump: jumps between consecutive valid fingertips, see `jump_sigmas`.
+    missing: number of exposures without a fingertip.
+    reasons: number of invalid fingertips, by reason.
+    jump: jumps between consecutive valid fingertips, see `jump_sigmas`.
     """
     begin_ns, end_ns = find_recorded(recorded.windows_ns, "gesture", name)
     exposures = recorded.truth.times_ns
@@ -290,8 +296,7 @@ def _summarize_jumps(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any
 def _evaluate_prediction(
     truth: TrueFinger, times_ns: Times, tips: Sequence[Fingertip], lead_s: float
 ) -> dict[str, Any]:
-    """Return the error and lag of positions that were predicted for `lead_s` after each
-    exposure."""
+    """Return the error and lag of positions predicted for `lead_s` after each exposure."""
     ahead_ns = times_ns + round(lead_s * 1e9)
     true = truth.interpolate(ahead_ns)
     known = np.isfinite(true).all(axis=1)

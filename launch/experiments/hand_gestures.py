@@ -66,9 +66,10 @@ It is a tenth of the smallest force that a fingertip can perceive.
 
 
 def _press(depth_m: float, hold_s: float, lift_s: float) -> tuple[Floats, Floats]:
-    """Return the finger motion of a push that is held and then released.
+    """Return the finger motion of a push, a rest and a release.
 
-    Returns times (n,) in s and positions (n, 3) in m, in coordinates of the object's surface.
+    Returns times (n,), s, and surface positions (n, 3), m.
+
     hold_s, lift_s: durations of the rest and of the release.
     """
     return minimum_jerk(
@@ -98,10 +99,7 @@ def _place(scene: Scene, label: str, times_s: Floats, points: Floats) -> FingerP
 
 
 def make_tap(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that taps six times, three times a second, to a fixed depth of 4 mm.
-
-    depth_m: not used.
-    """
+    """Return a finger path of six taps to a depth of 4 mm, three per second; ignore `depth_m`."""
     above, below = (0.0, 0.0, TAP_LIFT_M), (0.0, 0.0, -TAP_M)
     moves = [move for _ in range(TAPS) for move in ((0.11, below), (0.06, below), (0.16, above))]
     return _make_path(scene, "tap", minimum_jerk(above, moves))
@@ -143,8 +141,7 @@ def make_stroke(scene: Scene, depth_m: float) -> FingerPath:
 
 
 def make_slip(scene: Scene, depth_m: float) -> FingerPath:
-    """Return a finger path that pushes to half of `depth_m`, slides off the object's end, and
-    lifts."""
+    """Return a finger path that pushes to half of `depth_m` and slides off the object's end."""
     times, places = _press(0.5 * depth_m, 2.5, 0.8)
     points = map_to_surface(scene, places)
     ends = map_to_surface(scene, np.array([[0.0, 0.0, 0.0], [0.005, 0.0, 0.0]]))
@@ -170,10 +167,10 @@ HAND_GESTURES: dict[str, tuple[Callable[[Scene, float], FingerPath], int]] = {
 
 @dataclass(frozen=True, slots=True)
 class FeltForce:
-    """The force that a finger feels, and the force of the object at the finger's depth.
+    """The felt force and the object's force at the finger's depth.
 
     times_s, depths_m, felt_n, wanted_n: arrays (n,) with one element per time step. wanted_n: force
-    of the object.
+        of the object.
     """
 
     times_s: Floats
@@ -204,9 +201,10 @@ def compute_felt_force(scene: Scene, recorded: TouchRecording, curve: Floats) ->
 def evaluate_touch(recorded: TouchRecording, force: FeltForce, touches: int) -> dict[str, Any]:
     """Return the force errors and the numbers of contacts of one gesture.
 
-    touches: number of touches that the gesture consists of. chatter (in the result): number of
-    touches in excess of this. transient_n: largest force error within TRANSIENT_S after the start
-    of a touch.
+    The key `chatter` is the number of detected touches minus `touches`. The key `transient_n` is
+    the largest force error within TRANSIENT_S after the start of a touch.
+
+    touches: number of touches that the gesture consists of.
     """
     touching = force.felt_n > MIN_CONTACT_N
     active = touching | (force.wanted_n > MIN_CONTACT_N)
@@ -243,19 +241,19 @@ def hand_gestures_result(
     curve: Floats,
     progress: Progress,
     *,
-    hands: int = 1,
-    seed: int = 0,
-    names: Sequence[str] = tuple(HAND_GESTURES),
-    cache_dir: Path | None = None,
+    hands: int,
+    seed: int,
 ) -> tuple[dict[str, Any], dict[tuple[str, str], FeltForce]]:
     """Simulate gestures with random hands; return the results, and the forces for a chart.
 
-    hands: number of hands of each kind, which are finger, wrist and arm. curve: (m, 2), depths (m)
-    and forces (N) of the object. The keys of the forces are (kind of hand, gesture).
+    The keys of the forces are (kind of hand, gesture).
+
+    hands: number of hands of each kind (finger, wrist, arm).
+    curve: (m, 2), depths (m) and forces (N) of the object.
     """
     progress("computing the reaction of the sheet (only once)")
-    reaction = load_or_compute_reaction(scene, None, cache_dir)
-    bounds = load_or_compute_bounds(scene.camera.rate_hz, cache_dir)
+    reaction = load_or_compute_reaction(scene, None)
+    bounds = load_or_compute_bounds(scene.camera.rate_hz, None)
     depth_m = DEPTH_FRACTION * scene.working_range.push_depth_m
 
     def make_finger(impedance: HandImpedance, path: VoluntaryPath) -> CoupledFinger:
@@ -266,10 +264,9 @@ def hand_gestures_result(
     for number, hand in enumerate(draw_hands(hands, seed)):
         ratio = hand.damping_ns_per_m / _critical_damping(hand)
         impedance = HandImpedance(hand.mass_kg, hand.stiffness_n_per_m, ratio)
-        kind = f"{1e3 * hand.mass_kg:.0f} g"
+        kind = _name_hand(impedance)
         progress(f"hand {number + 1} of {3 * hands}: {kind}, {hand.stiffness_n_per_m:.0f} N/m")
-        for name in names:
-            make_path, touches = HAND_GESTURES[name]
+        for name, (make_path, _) in HAND_GESTURES.items():
             recorded = touch_in_simulated_time(
                 scene,
                 make_path(scene, depth_m),
@@ -277,9 +274,8 @@ def hand_gestures_result(
                 partial(make_finger, impedance),
                 bounds=bounds,
             )
-            force = compute_felt_force(scene, recorded, curve)
-            forces[kind, name] = force
-            rows.append(_make_row(name, impedance, evaluate_touch(recorded, force, touches)))
+            forces[kind, name] = compute_felt_force(scene, recorded, curve)
+            rows.append(_make_row(name, impedance, recorded, forces[kind, name]))
     return _make_result(scene, seed, rows), forces
 
 
@@ -295,9 +291,10 @@ def run_gestures(
     """Start a graph, perform the gestures in it, and return the results and the felt forces.
 
     The results have the format of `hand_gestures_result`. The force is sampled only at the camera's
-    exposures, so shorter peaks are missed. curve: (m, 2), depths (m) and forces (N) of the object.
-    apparatus: file with the true parameters of the simulated hardware, which include the hand's
-    impedance.
+    exposures, so shorter peaks are missed.
+
+    curve: (m, 2), depths (m) and forces (N) of the object.
+    apparatus: file with the true parameters of the simulated hardware and of the hand.
     """
     coupled = [*settings, *make_settings(launch_file, "twin_finger", "hand=coupled")]
     plan = load_graph(launch_file, settings=coupled, apparatus=apparatus)
@@ -315,14 +312,11 @@ def run_gestures(
     bag = folder / "gestures.mcap"
     run_experiment(launch_file, coupled, bag, procedure, progress, apparatus=apparatus)
     hand = HandImpedance.of(truth)
-    kind = f"{1e3 * hand.mass_kg:.0f} g"
     rows: list[dict[str, Any]] = []
     forces: dict[tuple[str, str], FeltForce] = {}
     for name, recorded in read_touches(bag).items():
-        force = compute_felt_force(scene, recorded, curve)
-        forces[kind, name] = force
-        touches = HAND_GESTURES[name][1]
-        rows.append(_make_row(name, hand, evaluate_touch(recorded, force, touches)))
+        force = forces[_name_hand(hand), name] = compute_felt_force(scene, recorded, curve)
+        rows.append(_make_row(name, hand, recorded, force))
     return {**_make_result(scene, None, rows), "bag": str(bag)}, forces
 
 
@@ -330,13 +324,19 @@ def _critical_damping(hand: Hand | HandImpedance) -> float:
     return 2.0 * math.sqrt(hand.mass_kg * hand.stiffness_n_per_m)
 
 
-def _make_row(gesture: str, hand: HandImpedance, figures: dict[str, Any]) -> dict[str, Any]:
+def _name_hand(hand: HandImpedance) -> str:
+    return f"{1e3 * hand.mass_kg:.0f} g"
+
+
+def _make_row(
+    gesture: str, hand: HandImpedance, recorded: TouchRecording, force: FeltForce
+) -> dict[str, Any]:
     return {
         "gesture": gesture,
         "mass_kg": hand.mass_kg,
         "damping_ns_per_m": hand.damping_ratio * _critical_damping(hand),
         "stiffness_n_per_m": hand.stiffness_n_per_m,
-        **figures,
+        **evaluate_touch(recorded, force, HAND_GESTURES[gesture][1]),
     }
 
 
@@ -353,7 +353,7 @@ def _make_result(scene: Scene, seed: int | None, rows: list[dict[str, Any]]) -> 
 
 
 def read_touches(bag: Path) -> dict[str, TouchRecording]:
-    """Return the touches of a simulated hand that the sheet's force moves, by label of the path."""
+    """Read the touches of a simulated hand from a bag; return them by label of the path."""
     fingers: dict[int, TwinFinger] = {}
     phases: dict[int, Phase] = {}
     valid_at: list[int] = []

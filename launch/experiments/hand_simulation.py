@@ -46,11 +46,14 @@ ENERGY_FRACTION = 0.05
 class Cases:
     """The hands and control loops that are simulated together; each field has shape (n,).
 
-    delay_s: time from exposure to the sheet's motion. jitter_s: maximum additional delay of a
-    measurement, uniformly distributed; a measurement that a newer one overtakes is lost. depth_m:
-    finger depth at equilibrium. gain: factor by which the sheet's motion around equilibrium is
-    scaled. bandwidth_rad_per_s: natural frequency of the filter of the measured depth; infinite if
-    there is no filter. lead_s: time by which the filtered depth is extrapolated.
+    delay_s: time from exposure to the sheet's motion.
+    jitter_s: maximum additional delay of a measurement, uniformly distributed. A measurement that a
+        newer one overtakes is lost.
+    depth_m: finger depth at equilibrium.
+    gain: factor of the sheet's motion around equilibrium.
+    bandwidth_rad_per_s: natural frequency of the filter of the measured depth; infinite without a
+        filter.
+    lead_s: time by which the filtered depth is extrapolated.
     """
 
     mass_kg: Floats
@@ -72,10 +75,11 @@ class Motion:
     """The result of a simulation of n hands.
 
     decay_per_s (n,): decay rate of the oscillation between the second and the last quarter of the
-    time; infinite if the oscillation has decayed completely. amplitude_m (n,): amplitude in the
-    last quarter. energy_ratio (n,): largest energy that the sheet delivers to the finger in any 2
-    s, relative to the energy at release. The energy that a passive sheet delivers is subtracted.
-    The first eighth of the time is ignored.
+        time; infinite if the oscillation has decayed completely.
+    amplitude_m (n,): amplitude in the last quarter.
+    energy_ratio (n,): largest energy that the sheet delivers to the finger in any 2 s, relative to
+        the energy at release. The energy from a passive sheet is subtracted, and the first eighth
+        of the time is ignored.
     """
 
     decay_per_s: Floats
@@ -140,7 +144,8 @@ class HeldOffset:
         self._seen = np.array([seen, self._seen[0]])
         filtered = np.sum(self._gains * self._seen + self._feedback * self._filtered, axis=0)
         self._filtered = np.array([filtered, self._filtered[0]])
-        wanted = self._scale(self._offset(np.maximum(filtered, 0.0)))
+        offsets_m = self._offset(np.maximum(filtered, 0.0))
+        wanted = self._rest_m + self._cases.gain * (offsets_m - self._rest_m)
         rate = (wanted - self._last) / self._period_s
         self._last = wanted
         late = self._random.integers(0, self._jitters, endpoint=True)
@@ -149,9 +154,6 @@ class HeldOffset:
         self._due[rows, self._columns] = True
         self._queued[rows, 0, self._columns] = wanted
         self._queued[rows, 1, self._columns] = rate
-
-    def _scale(self, offsets_m: Floats) -> Floats:
-        return np.asarray(self._rest_m + self._cases.gain * (offsets_m - self._rest_m))
 
     def advance(self, step: int) -> Floats:
         """Return the sheet's offsets (n,), in m, at a time step.
@@ -172,9 +174,11 @@ def simulate_release(
 ) -> Motion:
     """Release the fingers at a distance of RELEASE_M from equilibrium, and simulate their motion.
 
-    force: sheet force (N) as a function of the sheet's indentation (m). offset: sheet offset (m) as
-    a function of the finger depth (m); the sheet must be indented at equilibrium. period_s: camera
-    period. seconds: simulated duration.
+    force: sheet force (N) as a function of the sheet's indentation (m).
+    offset: sheet offset (m) as a function of the finger depth (m). The sheet must be indented at
+        equilibrium.
+    period_s: camera period.
+    seconds: simulated duration.
     """
     step_s = period_s / STEPS_PER_PERIOD
     steps = round(seconds / step_s)

@@ -1,9 +1,9 @@
 """Measure the size errors of the image on an inclined sheet and on a pushed sheet.
 
-These are the experiments of Furukawa et al. 2007, section VI, Figs. 11 and 13. A case is a pair of
-an angle or depth, and a correction. A correction is a method that corrects the image for the
-sheet's shape. The renderer's frames and the simulated eye's images contain the label of their case.
-The results are computed from the eye's images in the bag.
+These are the experiments of Furukawa et al. 2007, section VI, Figs. 11 and 13. A correction is a
+method that corrects the image for the sheet's shape. A case is a pair of an angle or depth, and a
+correction. Its label is stored in the renderer's frames and in the simulated eye's images. The
+results are computed from the eye's images in the bag.
 """
 
 from __future__ import annotations
@@ -54,8 +54,7 @@ def reach_path(
 
 
 def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
-    """Return a finger path to a point above the cylinder where the sheet is inclined by an
-    angle."""
+    """Return a finger path to a point above the cylinder where the sheet is inclined."""
     return reach_path(scene, f"tilt {theta_deg:+g} deg", [(float(np.radians(theta_deg)), HOVER_M)])
 
 
@@ -82,10 +81,12 @@ def push_path(
 class Series:
     """An image experiment in which one quantity varies.
 
-    key: result column of the varied quantity. name: format string of a case's name, which contains
-    the value. path: function that makes the finger path for a value. sizes: function that measures
-    sizes (m) of the cylinder in an image. size_names: symbols of the sizes in the paper. values:
-    default values of the quantity.
+    key: result column of the quantity.
+    name: format string of a case's name with the value.
+    path: function that makes the finger path for a value.
+    sizes: function that measures sizes (m) of the cylinder in an image.
+    size_names: symbols of the sizes in the paper.
+    values: default values of the quantity.
     """
 
     key: str
@@ -185,17 +186,9 @@ def size_errors_mm(
     return [float(error) for error in np.abs(measured - expected) * 1e3]
 
 
-def find_image(images: dict[str, EyeImage], label: str) -> EyeImage:
-    """Return the image with the given label.
-
-    Raises ExperimentError if the bag did not contain such an image.
-    """
-    return find_recorded(images, "image", label)
-
-
 def make_error_map(images: dict[str, EyeImage], label: str) -> ErrorMap:
     """Compute the image errors at all visible points of a case, from the images of both `RAMPS`."""
-    x, y = (find_image(images, make_pattern_label(label, pattern)) for pattern in RAMPS)
+    x, y = (find_recorded(images, "image", make_pattern_label(label, pattern)) for pattern in RAMPS)
     return error_map(x.seen, y.seen, x.metres_per_px)
 
 
@@ -204,7 +197,7 @@ def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, Er
 
     def errors_of(viewpoint: Viewpoint) -> ErrorMap:
         x, y = (
-            find_image(images, make_eye_key(make_eyes_label(label, pattern), viewpoint))
+            find_recorded(images, "image", make_eye_key(make_eyes_label(label, pattern), viewpoint))
             for pattern in RAMPS
         )
         return error_map(x.seen, y.seen, x.metres_per_px)
@@ -215,9 +208,9 @@ def make_eye_maps(images: dict[str, EyeImage], label: str) -> tuple[ErrorMap, Er
 def summarize_eyes(left: ErrorMap, right: ErrorMap) -> dict[str, float | None]:
     """Return the mean image errors (mm) of both eyes, and of the disparity.
 
-    The disparity error is the right eye's error minus the left eye's, horizontal and vertical. It
-    is computed at screen positions at which both eyes see the object. A mean is None if there are
-    no points.
+    The disparity error is the error of the right eye minus the error of the left eye. It is
+    computed where both eyes see the object, separately in the horizontal and the vertical
+    direction. A mean is None if there are no points.
     """
     disparity_mm = 1e3 * np.abs(right.errors_m - left.errors_m)
     across_mm, up_mm = (
@@ -250,7 +243,7 @@ def make_rows(
     result = []
     for value in series.values:
         for correction in CORRECTIONS:
-            image = find_image(images, series.label(value, correction))
+            image = find_recorded(images, "image", series.label(value, correction))
             errors = size_errors_mm(image, series.sizes)
             row: dict[str, Any] = {series.key: value, "method": correction}
             row.update(

@@ -60,8 +60,7 @@ INTERVAL_QUANTILES = (0.025, 0.975)
 
 
 class StaircaseEstimator:
-    """The posterior distribution of Weber fraction, lapse rate and bias, used to select
-    increments."""
+    """The posterior distribution of Weber fraction, lapse rate and bias."""
 
     def __init__(self) -> None:
         sigmas = np.log1p(WEBER_FRACTIONS) / ndtri(CRITERION)
@@ -88,11 +87,11 @@ class StaircaseEstimator:
         self._posterior /= self._posterior.sum()
 
     def choose(self, stiffer: int) -> int:
-        """Return the index of the increment that gives the most information about the Weber
-        fraction.
+        """Return the index of the increment with the most information about the Weber fraction.
 
-        This increment has the least expected entropy of the posterior after the answer. stiffer:
-        interval (1 or 2) that contains the stiffer object.
+        This increment has the least expected entropy of the posterior after the answer.
+
+        stiffer: interval (1 or 2) that contains the stiffer object.
         """
         right = np.einsum("swn,wn->sw", self._correct[stiffer], self._posterior)
         expected = _expected_entropy(right) + _expected_entropy(self._marginal - right)
@@ -130,9 +129,10 @@ def _expected_entropy(joint: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SessionPlan:
-    """The settings of a session; they must not change when an interrupted session continues.
+    """The settings of a session. An interrupted session must continue with the same settings.
 
-    participant: random code, not a name. scene: name and hash of the scene's geometry.
+    participant: random code, not a name.
+    scene: name and hash of the scene's geometry.
     reference_pa: Young's modulus of the reference object.
     """
 
@@ -145,11 +145,13 @@ class SessionPlan:
 
 @dataclass(frozen=True, slots=True)
 class PairTrial:
-    """A trial, in which a pair of objects with different stiffness is presented.
+    """A trial with a pair of objects of different stiffness.
 
-    number: number of the trial, from 1. increment: index in INCREMENTS. stiffer: interval with the
-    stiffer object, 1 or 2. moduli_pa: Young's moduli in both intervals. catch: whether the trial
-    checks attention.
+    number: number of the trial, from 1.
+    increment: index in INCREMENTS.
+    stiffer: interval with the stiffer object, 1 or 2.
+    moduli_pa: Young's moduli in both intervals.
+    catch: whether the trial checks attention.
     """
 
     number: int
@@ -163,9 +165,10 @@ class PairTrial:
 class PairAnswer:
     """The answer of the participant, with measurements of both intervals.
 
-    stiffer: interval that the participant named, 1 or 2. response_s: time of the answer after the
-    end of the second interval. depths_m, forces_n: maximum push depth and maximum measured force in
-    each interval; None if not measured.
+    stiffer: interval that the participant named, 1 or 2.
+    response_s: time from the end of the second interval to the answer.
+    depths_m, forces_n: maximum push depth and maximum measured force in each interval; None if not
+        measured.
     """
 
     stiffer: int
@@ -202,7 +205,7 @@ Present = Callable[[PairTrial], Awaitable[PairAnswer]]
 
 
 class StaircaseSession:
-    """The trials of one participant, and the CSV file in which they are stored.
+    """The trials of one participant, stored in a CSV file.
 
     Raises ExperimentError if an existing file belongs to another session or is damaged.
     """
@@ -231,8 +234,7 @@ class StaircaseSession:
         return PairTrial(number, increment, stiffer, moduli, catch)
 
     def record(self, trial: PairTrial, answer: PairAnswer) -> None:
-        """Append a trial and its answer to the file, flush the file to disk, and update the
-        estimate."""
+        """Append a trial and its answer to the file on disk, and update the estimate."""
         correct = answer.stiffer == trial.stiffer
         row = TrialRow(
             participant=self.plan.participant,
@@ -319,8 +321,7 @@ class StaircaseSession:
         self._count(trial, int(cells["answer"]) == trial.stiffer)
 
     def result(self) -> dict[str, Any]:
-        """Return the estimated Weber fraction and lapse rate, as a row of the result of `jnd
-        --json`."""
+        """Return the estimated Weber fraction and lapse rate as a row for `jnd --json`."""
         low, high = self.estimator.interval
         return {
             "participant": self.plan.participant,
@@ -344,13 +345,10 @@ def _csv_line(cells: Sequence[object]) -> str:
     return text.getvalue()
 
 
-async def run_session(
-    session: StaircaseSession, present: Present, progress: Callable[[int, int], None]
-) -> None:
-    """Present the remaining trials of a session, and store the answers immediately.
+async def run_session(session: StaircaseSession, present: Present) -> None:
+    """Present the remaining trials of a session, and store each answer immediately.
 
     present: coroutine function that presents a trial and returns the answer.
     """
     while (trial := session.next_trial()) is not None:
-        progress(session.done, session.plan.trials)
         session.record(trial, await present(trial))

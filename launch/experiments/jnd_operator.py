@@ -51,8 +51,7 @@ class PeakMonitor:
 
 
 class PairPresenter:
-    """A presenter of object pairs, which changes Young's modulus of the object in a running
-    graph."""
+    """A presenter of object pairs; it changes the object's stiffness in a running graph."""
 
     def __init__(self, driver: Driver, scene: Scene, ask: Ask) -> None:
         self._driver, self._scene, self._ask = driver, scene, ask
@@ -110,8 +109,7 @@ def replace_modulus(scene: Scene, modulus_pa: float) -> Scene:
 
 
 async def open_terminal() -> Ask:
-    """Return a coroutine function that prints a question on stderr and reads an answer from
-    stdin."""
+    """Return a coroutine function that prints a question and reads an answer from stdin."""
     reader = asyncio.StreamReader()
     await asyncio.get_running_loop().connect_read_pipe(
         lambda: asyncio.StreamReaderProtocol(reader), sys.stdin

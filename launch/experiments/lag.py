@@ -20,11 +20,8 @@ def estimate_lag_s(
     leader_times_s: Floats | None = None,
     max_lag_s: float = 0.15,
 ) -> float | None:
-    """Estimate the lag (s) of `follower` behind `leader`; it is negative if the follower is ahead.
-
-    times_s: (n,), increasing, not necessarily uniform. follower, leader: positions (n,) or (n, k),
-    m, at these times. leader_times_s: times (m,) of the leader if they differ from `times_s`; they
-    must cover its range.
+    """Estimate the lag (s) of `follower` behind `leader`; the lag is negative if the follower is
+    ahead.
 
     The lag maximizes the normalized cross-correlation over all axes. The leader is interpolated by
     a cubic spline and shifted. Samples of the follower are omitted if the leader does not cover
@@ -32,12 +29,16 @@ def estimate_lag_s(
     refines the result. Mean and linear trend are removed from both motions, since in uniform motion
     a lag cannot be distinguished from an offset. If slow and fast parts have different lags, larger
     motions dominate. For ten seconds at 60 Hz and 0.5 mm of motion per axis, the standard error is
-    0.6 ms with white noise of 0.1 mm. The standard error is 1.9 ms with noise of 0.3 mm.
+    0.6 ms with white noise of 0.1 mm, and 1.9 ms with noise of 0.3 mm.
 
-    Returns None if the motion is only a linear trend, or the correlation is below MIN_CORRELATION.
-    Also returns None if the best shift is at the end of the range. Raises ValueError for invalid
-    times, values that are not finite or differ in number, and durations up to four times
-    `max_lag_s`.
+    times_s: (n,), increasing, not necessarily uniform.
+    follower, leader: positions (n,) or (n, k), m, at these times.
+    leader_times_s: times (m,) of the leader, if they differ from `times_s`. They must cover the
+        range of `times_s`.
+
+    Returns None if the motion is only a linear trend, the correlation is below MIN_CORRELATION, or
+    the best shift is at the end of the range. Raises ValueError for invalid times, values that are
+    not finite or differ in number, and durations up to four times `max_lag_s`.
     """
     follower_rows, leader_rows = (_to_rows(values) for values in (follower, leader))
     leader_s = times_s if leader_times_s is None else leader_times_s

@@ -64,8 +64,7 @@ def _find_box(maps: list[ErrorMap]) -> tuple[slice, slice]:
 
 
 def draw_cross_errors(errors: CrossErrors, path: Path) -> None:
-    """Draw arrows from the touched points to the positions at which each eye sees the drawn
-    crosses.
+    """Draw arrows from touched points to the positions at which each eye sees the drawn crosses.
 
     The arrows are magnified by CROSS_MAGNIFICATION.
     """

@@ -23,8 +23,9 @@ Floats = NDArray[np.float64]
 class NodeCalibrations:
     """The calibrations of stereo camera, sheet and marker that the nodes use.
 
-    A field that is None means that the nodes use the values of the scene. stamp_offset_s: time that
-    the camera node adds to timestamps.
+    The nodes use the values of the scene instead of fields that are None.
+
+    stamp_offset_s: time that the camera node adds to timestamps.
     """
 
     stereo: StereoCalibration | None = None
@@ -53,9 +54,9 @@ class NodeCalibrations:
         return NodeCalibrations(stereo, sheet, marker, stamp_offset_s)
 
     def find_marker_offset_m(self, scene: Scene) -> Floats:
-        """Return the vector (3,) from the finger pad to the marker, in m and in world axes.
+        """Return the vector (3,), m, from the finger pad to the marker, in world axes.
 
-        If there is no marker calibration, the vector of the scene is returned.
+        The marker calibration takes precedence over the scene.
         """
         marker = scene.finger if self.marker is None else self.marker
         turned = world_from_finger(scene.finger.direction_world)

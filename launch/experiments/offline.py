@@ -1,14 +1,14 @@
 """Evaluate the errors of an apparatus without running the nodes.
 
-An apparatus is a set of true parameters of the simulated hardware. The nodes' methods get the
-parameters of the scene, and the simulator's models get the parameters of the apparatus. The errors
+An apparatus is a set of true parameters of the simulated hardware. The nodes' methods use the
+parameters of the scene, and the simulator's models use the parameters of the apparatus. The errors
 of fingertip, sheet, image and felt force are computed at rest. The errors of fingertip and sheet
 can also be computed for a constant speed of the finger, at which wrong exposure times cause errors.
 
 Only the force model of the rubber depends on time: it simulates a push in and out. Therefore servo
-lag, delays, frame rate, tremor and backlash have no effect. An experiment with running nodes
-measures these effects. Images have no noise. The reference values come from separate models of
-camera, arms, membrane and eye, which share no code with the nodes.
+    lag, delays, frame rate, tremor and backlash have no effect. An experiment with running nodes
+    measures these effects. Images have no noise. Separate models of camera, arms, membrane and eye
+    compute the reference values. These models share no code with the nodes.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ from flexsheet.nodes.renderer import deflection_cache
 from flexsheet.nodes.renderer.benchmarks import draw_coordinate_ramps
 from flexsheet.nodes.renderer.gl import headless_context
 from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
-from flexsheet.nodes.renderer.sheet import estimate_sheet
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
 from flexsheet.nodes.twin.error_map import error_map
 from flexsheet.nodes.twin.eye import HALF_WINDOW_M, TrueProjector, eye_rays, first_hits, seen
 from flexsheet.nodes.twin.force_history import compute_history_ratios
-from flexsheet.nodes.twin.membrane import CELLS, NotConvergedError, solve, solve_path
+from flexsheet.nodes.twin.membrane import CELLS, NotConvergedError, solve_path
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
-from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_pull import solve_sheet, true_rubber
 from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
 from flexsheet.nodes.twin.true_object import TrueBody
 from flexsheet.nodes.twin.truth import apply_apparatus
@@ -105,10 +105,12 @@ right, in metres.
 class Evaluation:
     """The errors of one apparatus; a field is None if it was not evaluated.
 
-    fingertip_m: (n, 3), measured minus true fingertip. sheet_m: (n, 3), point of the object under
-    the true finger minus the contact point of the sheet. image_m: one map (rows, columns, 2) of
-    image errors per case, NaN where the object is not visible. felt_n, expected_n: (k,), force of
-    the true sheet, and force that the planner's model of the sheet predicts for the same push.
+    fingertip_m: (n, 3), measured minus true fingertip.
+    sheet_m: (n, 3), point of the object under the true finger minus the contact point of the sheet.
+    image_m: one map (rows, columns, 2) of image errors per case; NaN where the object is not
+        visible.
+    felt_n, expected_n: (k,), force of the true sheet, and force that the planner's model of the
+        sheet predicts for the same push.
     """
 
     fingertip_m: Floats | None = None
@@ -133,8 +135,8 @@ class Evaluation:
     def change_from(self, other: Evaluation) -> dict[str, float | None]:
         """Return the mean differences from another evaluation of the same cases, by metric.
 
-        Errors of single vectors, pixels and pushes are subtracted before averaging, so that errors
-        common to both evaluations cancel. The units are those of `figures`.
+        Errors of single vectors, pixels and pushes are subtracted before averaging. Therefore
+        errors common to both evaluations cancel. The units are those of `figures`.
         """
         image = None
         if self.image_m is not None and other.image_m is not None:
@@ -168,8 +170,7 @@ def _mean_length_mm(vectors_m: Floats | None) -> float | None:
 
 
 def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
-    """Return the root mean square (mm) over all visible points of error maps; None without
-    points."""
+    """Return the root mean square (mm) over all visible points of error maps, or None."""
     squares = np.concatenate([np.sum(one**2, axis=2).ravel() for one in maps_m])
     squares = squares[np.isfinite(squares)]
     return 1e3 * float(np.sqrt(squares.mean())) if len(squares) else None
@@ -177,23 +178,20 @@ def _rms_mm(maps_m: tuple[Floats, ...]) -> float | None:
 
 @dataclass(frozen=True, slots=True)
 class CrossErrors:
-    """The position errors of crosses that are drawn at expected contact points, as the eyes see
-    them.
+    """The errors of crosses that are drawn at expected contact points, as the eyes see them.
 
-    All positions are projected from an eye onto the screen plane. places_m (n, 2): expected contact
-    points, seen from the midpoint between the true eyes. errors_m (n, 2, 2): positions (x, y) at
-    which the left and the right eye see the cross, minus the positions of the actual contact.
+    All positions are projected from an eye onto the screen plane.
+
+    places_m (n, 2): expected contact points, seen from the midpoint between the true eyes.
+    errors_m (n, 2, 2): positions (x, y) at which the left and the right eye see the cross, minus
+        the positions of the actual contact.
     """
 
     places_m: Floats
     errors_m: Floats
 
     def figures(self) -> dict[str, float]:
-        """Return the lengths of the errors (mm).
-
-        The result contains the values for each eye, for the mean of both eyes, and for the
-        disparity.
-        """
+        """Return mean and maximum lengths (mm) of the errors of the eyes and of the disparity."""
         left, right = np.moveaxis(1e3 * self.errors_m, 1, 0)
         both = np.linalg.norm(0.5 * (left + right), axis=1)
         return {
@@ -223,11 +221,9 @@ class Contact:
 class OfflineEvaluator:
     """An evaluator of the errors of apparatuses (true hardware parameters) in one scene.
 
-    metres_per_px: resolution of the images. cells: number of node intervals per side of the mesh of
-    the true sheet. correction, sheet_shape: methods of the renderer.
-
-    The methods of the class raise ExperimentError if the equations of the sheet or the arms have no
-    solution.
+    metres_per_px: resolution of the images.
+    cells: number of node intervals per side of the mesh of the true sheet.
+    correction, sheet_shape: methods of the renderer.
     """
 
     def __init__(
@@ -273,7 +269,8 @@ class OfflineEvaluator:
     ) -> Evaluation:
         """Evaluate the given metrics of an apparatus.
 
-        speed_m_per_s: speed of the finger along the object, which affects only fingertip and sheet.
+        speed_m_per_s: speed of the finger along the object. It affects only fingertip and sheet.
+
         Raises ExperimentError if the equations of the sheet or the arms have no solution.
         """
         try:
@@ -317,8 +314,7 @@ class OfflineEvaluator:
 
     @staticmethod
     def _lay_sheet(point: Floats, normal: Floats, on_sheet_m: Floats) -> Contact:
-        """Return the contact of a sheet with the given normal (3,) at the surface point `point`
-        (3,).
+        """Return the contact of a sheet with the given normal (3,) at a surface point (3,).
 
         on_sheet_m: coordinates (3,) of the contact point on the sheet.
         """
@@ -349,13 +345,8 @@ class OfflineEvaluator:
             late_s = apparatus.camera.stamp_offset_s - self._stamp_offset_s
             times_s = late_s + np.array([0.0, apparatus.camera.skew_s])
             markers = contact.point + offset_m + times_s[:, None] * velocity
-            in_left = apply(left_from_world, markers)
-            in_right = apply(camera.right_from_left, in_left)
-            pixels = [
-                rig.pixels_of(lens, rays[:2] / rays[2])
-                for lens, rays in ((camera.left, in_left[0]), (camera.right, in_right[1]))
-            ]
-            found = measure(self._geometry, pixels[0], pixels[1], covariance=UNIT_COVARIANCE_PX2)
+            pixels = rig.stereo_pixels(camera, left_from_world, markers)
+            found = measure(self._geometry, *pixels, covariance=UNIT_COVARIANCE_PX2)
             if found is None:
                 raise ExperimentError(
                     f"apparatus {apparatus.origin}: the fingertip at {contact.point} m cannot be "
@@ -367,8 +358,7 @@ class OfflineEvaluator:
     def _edges(self, contact: Contact) -> tuple[Floats, Floats]:
         """Return the poses (4, 4) of the clamped edges that bring the sheet into contact.
 
-        The edges are displaced by the sag of the sheet, so that the sheet's centre touches the
-        contact plane.
+        The edges compensate the sag of the sheet, so its centre touches the contact plane.
         """
         sheet = self._scene.sheet
         distance_m = sheet.width_m * self._stretch_ratio
@@ -389,7 +379,9 @@ class OfflineEvaluator:
         """Return the error (3,) of the sheet's contact point, in m, in the world frame.
 
         The error is the object point under the true finger minus the contact point. The arms move
-        the sheet to the measured finger, which differs from the true finger by `tip_error`.
+        the sheet to the measured finger.
+
+        tip_error: measured minus true fingertip (3,).
         """
         object_from_world = inverse(self._world_from_object)
         foot = self._shape.closest(apply(object_from_world, contact.point + tip_error))
@@ -400,18 +392,8 @@ class OfflineEvaluator:
         rolled_m[2] = 0.0
         laid = self._lay_sheet(believed, normal, rolled_m)
         left, right = arms.hold(self._edges(laid))
-        across = right[:3, 3] - left[:3, 3]
-        plane = np.cross(across, left[:3, 1] + right[:3, 1])
-        distance_m = np.linalg.norm(across)
         planes = surface.find_tangent_planes(
-            SheetPlanes(
-                0.5 * (left[:3, 3] + right[:3, 3])[None],
-                (plane / np.linalg.norm(plane))[None],
-                (across / distance_m)[None],
-                np.array([distance_m]),
-            ),
-            contact.point[None],
-            np.array([0.0, 1.0, 0.0]),
+            SheetPlanes.through(left, right), contact.point[None], np.array([0.0, 1.0, 0.0])
         )
         true_foot = self._shape.closest(apply(object_from_world, contact.point)[None])
         presented = project_presented_point(
@@ -427,7 +409,7 @@ class OfflineEvaluator:
     ) -> tuple[Floats, Floats]:
         """Return the felt forces (k,) and the forces (k,) that the planner's model predicts, in N.
 
-        A push gives two forces: one while the finger moves in, and one while it moves out.
+        Each push gives two forces, in loading and in unloading.
         """
         contact = self._touch(0.0)
         left, right = arms.hold(self._edges(contact))
@@ -443,7 +425,7 @@ class OfflineEvaluator:
             right,
             finger_tips=[contact.point - depth_m * contact.normal for depth_m in depths_m],
             finger_radius_m=scene.finger.radius_m,
-            friction_coefficient=true_friction(apparatus),
+            friction_coefficient=apparatus.sheet.friction_coefficient,
             cells=self._cells,
         )
         felt: list[float] = []
@@ -480,22 +462,9 @@ class OfflineEvaluator:
         tip_error: Floats,
     ) -> Floats:
         edges = self._edges(contact)
-        believed = estimate_sheet(
-            *edges,
-            height_m=self._scene.sheet.height_m,
-            finger_tip=None if tip is None else tip + tip_error,
-        )
-        assert believed is not None
+        believed = self._estimate_sheet(edges, None if tip is None else tip + tip_error)
         ramps = draw_coordinate_ramps(self._renderer, self._correction, believed)
-        true_edges = arms.hold(edges)
-        sheet = solve(
-            true_rubber(scene.sheet, apparatus),
-            *true_edges,
-            finger_tip=tip,
-            finger_radius_m=scene.finger.radius_m,
-            friction_coefficient=true_friction(apparatus),
-            cells=self._cells,
-        )
+        sheet = solve_sheet(scene, apparatus, arms.hold(edges), tip, cells=self._cells)
         eye = scene.eyes.centre_world_m
         x, y = (
             seen(one, sheet, scene, eye=eye, metres_per_px=self._metres_per_px) for one in ramps
@@ -503,11 +472,21 @@ class OfflineEvaluator:
         errors = error_map(x, y, self._metres_per_px).errors_m
         return self._correct_parallax(errors, eye)
 
+    def _estimate_sheet(self, edges: tuple[Floats, Floats], finger_tip: Floats | None) -> SheetPose:
+        """Return the sheet that the renderer assumes between resting edges.
+
+        edges: poses (4, 4) of the edges. finger_tip: position (3,), m, or None.
+        """
+        height_m = self._scene.sheet.height_m
+        sheet = estimate_sheet(*edges, height_m=height_m, finger_tip=finger_tip)
+        assert sheet is not None
+        return sheet
+
     def compare_crosses(self, apparatus: Apparatus) -> CrossErrors:
         """Compare crosses drawn at expected contact points with the actual contact points.
 
         Each cross marks a point of the object, and is drawn on the sheet for each eye. The sheet
-        then moves to a finger that touches it at the measured position of the cross. Raise
+        then moves to a finger that touches it at the measured position of the cross. Raises
         ExperimentError if the touched point cannot be computed.
         """
         scene = apply_apparatus(self._scene, apparatus)
@@ -527,11 +506,9 @@ class OfflineEvaluator:
         )
         targets = np.array([contact.point for contact in contacts])
         edges = self._edges(self._touch(0.0))
-        believed = estimate_sheet(*edges, height_m=self._scene.sheet.height_m, finger_tip=None)
-        assert believed is not None
-        mesh = self._renderer.sheet_mesh(believed)
+        mesh = self._renderer.sheet_mesh(self._estimate_sheet(edges, None))
         corners = mesh.vertices[mesh.triangles].astype(np.float64)
-        sheet = solve(true_rubber(scene.sheet, apparatus), *arms.hold(edges))
+        sheet = solve_sheet(scene, apparatus, arms.hold(edges))
         lamp = TrueProjector(
             require_projector(scene), sheet.positions.reshape(-1, 3), sheet.triangles()
         )
@@ -583,10 +560,10 @@ class OfflineEvaluator:
         return corrected
 
     def _parallax(self, eye: Floats) -> Floats:
-        """Return how far object points shift on the screen plane if the eye moves to `eye`.
+        """Return the shift (rows, columns, 2), m, of object points on the screen if the eye moves.
 
-        The result has shape (rows, columns, 2), in m, for the pixels of `_object_points`. It is NaN
-        where the eye of the scene sees no object.
+        The pixels are those of `_object_points`. The shift is NaN where the scene's eye sees no
+        object.
         """
         on_screen, points = self._object_points
         to_screen = eye[2] / (eye[2] - points[..., 2:])
@@ -596,9 +573,9 @@ class OfflineEvaluator:
     def _object_points(self) -> tuple[Floats, Floats]:
         """Return the points at which the ray of each pixel meets the screen plane and the object.
 
-        The rays start at the scene's eye position. Returns points on the screen plane (rows,
-        columns, 2) and on the object (rows, columns, 3), in m. The latter are NaN where a ray
-        misses the object.
+        The rays start at the scene's eye position. The first array (rows, columns, 2) contains
+        points on the screen plane, m. The second array (rows, columns, 3) contains points on the
+        object, m, and NaN where a ray misses the object.
         """
         size = round(2.0 * HALF_WINDOW_M / self._metres_per_px)
         rays = eye_rays(
@@ -618,8 +595,7 @@ class OfflineEvaluator:
 
 
 def _on_screen(eye: Floats, points: Floats) -> Floats:
-    """Project points (n, 3) from an eye (3,) to the screen plane z = 0; return (x, y) as (n, 2),
-    m."""
+    """Project points (n, 3) from an eye (3,) to (x, y) (n, 2), m, on the screen plane z = 0."""
     to_screen = eye[2] / (eye[2] - points[:, 2:])
     return np.asarray(eye[:2] + (points[:, :2] - eye[:2]) * to_screen)
 

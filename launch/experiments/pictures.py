@@ -34,8 +34,7 @@ CORRECTION_NAMES = {
 
 
 def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -> None:
-    """Draw one row per case, with the eye's image for each image correction and the expected
-    image."""
+    """Draw the eye's image for each image correction, and the expected image, one row per case."""
     columns = max(len(images) for _, images in rows) + 1
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
@@ -181,8 +180,7 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
 
 
 def draw_stability(result: dict[str, Any], path: Path) -> None:
-    """Draw the fraction of stable hands against stiffness and delay, with one panel per control
-    loop."""
+    """Draw the fraction of stable hands against stiffness and delay, one panel per control loop."""
     rows = [*result["rows"], *result["without_bounds"]]
     kinds = list(dict.fromkeys((row["kind"], row["jitter_ms"]) for row in rows))
     objects = sorted({row["object_pa"] for row in rows})

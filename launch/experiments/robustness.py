@@ -31,8 +31,7 @@ _RANGE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 
 
 def parse_seeds(text: str) -> list[int]:
-    """Parse a range of random seeds, "A-B" (both included) or "A"; raise ExperimentError if
-    invalid."""
+    """Parse random seeds "A-B" (both included) or "A"; raise ExperimentError if invalid."""
     match = _RANGE.fullmatch(text.strip())
     if match is None:
         raise ExperimentError(f'--seeds "{text}": expected A-B, such as 0-9, or one whole number')
@@ -67,8 +66,8 @@ def run_robustness(
     """Run one trial per seed, and return the results of `experiment robustness --json`.
 
     commissioned: calibrate each simulated laboratory first, in a separate folder, and evaluate it
-    in simulated time with the resulting scene and launch file. The apparatus then has the errors of
-    uncalibrated hardware, and the calibrated camera defines the world frame.
+        in simulated time with the resulting scene and launch file. The apparatus then has the
+        errors of uncalibrated hardware, and the calibrated camera defines the world frame.
     """
     if commissioned and calibrated:
         raise ExperimentError(
@@ -134,8 +133,9 @@ def summarize_commissioning(rows: Sequence[Row]) -> dict[str, Any]:
     """Compare the errors that the laboratories' reports predict with the true errors.
 
     confusion: number of laboratories by report (good or not) and by true errors (within tolerance
-    or not), in total and by metric. stated_over_true: quantiles of the ratio of predicted rms error
-    to true error. covered: fraction of true errors below the predicted 95 % quantile.
+        or not), in total and by metric.
+    stated_over_true: quantiles of the ratio of predicted rms error to true error.
+    covered: fraction of true errors below the predicted 95 % quantile.
     """
     predictions = {}
     for metric in Metric:
@@ -192,10 +192,9 @@ def _count_confusion(cases: Sequence[tuple[bool, bool]]) -> dict[str, int]:
 def summarize(rows: Sequence[Row]) -> dict[str, dict[str, float | None]]:
     """Summarize the trials by metric.
 
-    The result contains median, 95 % quantile and maximum of the metric, and the seed of the
-    maximum; None if there are no values. It also contains the number of trials with the metric, and
-    the number of trials out of tolerance. For the latter, the trials in which no self-check
-    suspected a cause are counted.
+    A summary contains median, 95 % quantile and maximum of the metric, and the seed of the maximum.
+    It also contains the number of trials with the metric, the number of trials out of tolerance,
+    and how many of these no self-check flagged. Values without trials are None.
     """
     summary: dict[str, dict[str, float | None]] = {}
     for metric in METRICS:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from flexsheet.launch.experiments import ExperimentError, ExperimentInterruptedError, image, stroke
-from flexsheet.launch.experiments.driver import Driver, TableMethod
+from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.plans.features import Feature
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -40,9 +40,9 @@ Progress = Callable[[str], None]
 Procedure = Callable[[Driver, Scene], Awaitable[None]]
 
 
-def new_folder(name: str, parent: Path = RUNS) -> Path:
+def new_folder(name: str) -> Path:
     """Create and return a new folder for an experiment, such as runs/20261121-164500-stroke."""
-    folder = parent / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
+    folder = RUNS / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
     folder.mkdir(parents=True)
     return folder
 
@@ -58,7 +58,7 @@ def require_scene(plan: ResolvedGraph) -> Scene:
 
 
 async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -> None:
-    """Start a graph, run the procedure on it, and stop the graph.
+    """Start a graph, run the procedure, and stop the graph.
 
     Raises the errors of the procedure, and NodeFailedError if a node fails permanently.
     """
@@ -112,8 +112,8 @@ def run_experiment(
 ) -> None:
     """Run a procedure on the graph of a launch file.
 
-    bag: file to which all topics are recorded; None for no recording. settings, apparatus, needed,
-    without: arguments for `load_graph`.
+    bag: file to which all topics are recorded; None for no recording.
+    settings, apparatus, needed, without: arguments for `load_graph`.
     """
     plan = load_graph(
         launch_file,
@@ -156,9 +156,10 @@ def make_settings(launch_file: Path, node_type: str, setting: str) -> list[str]:
 def make_stroke_procedure(
     seconds: Sequence[float], progress: Progress, *, path: FingerPath | None = None
 ) -> Procedure:
-    """Make a procedure that moves the finger along strokes, or along `path` if it is given.
+    """Make a procedure that moves the finger along strokes, or along a given path.
 
     seconds: durations of the strokes, s.
+    path: finger path that replaces the strokes.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -219,19 +220,18 @@ def make_image_procedure(
                     await driver.capture_image(ramp_label, correction, pattern=pattern)
                 for pattern in image.RAMPS if with_eyes else ():
                     eyes_label = image.make_eyes_label(label, pattern)
-                    await driver.capture_both_eyes(eyes_label, correction, pattern)
+                    await driver.capture_image(
+                        eyes_label, correction, pattern=pattern, both_eyes=True
+                    )
 
     return procedure
 
 
-def make_table_procedure(progress: Progress, method: TableMethod = "quick_table") -> Procedure:
-    """Make a procedure that waits until the soft body uses a table.
-
-    method: least accurate table that is accepted.
-    """
+def make_table_procedure(progress: Progress) -> Procedure:
+    """Make a procedure that waits until the soft body uses a table."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
-        await driver.wait_for_table(scene, method, progress)
+        await driver.wait_for_table(scene, "quick_table", progress)
 
     return procedure
 

@@ -30,11 +30,11 @@ SIGMAS = (-3.0, -1.0, 1.0, 3.0)
 class EvaluationKind(StrEnum):
     """The method by which the effect of a parameter was evaluated.
 
-    offline: without a simulation of the motion; the errors of sheet and fingertip are evaluated at
-    the working speed, the errors of image and force at rest. simulated_time: the errors of sheet
-    and fingertip are evaluated during strokes in simulated time. not_measured: the parameter
-    affects only images of a moving sheet or eye, which are not evaluated. not_simulated: no
-    simulator node uses the parameter.
+    OFFLINE: no motion is simulated. The errors of sheet and fingertip are evaluated at the working
+        speed, and the errors of image and force at rest.
+    SIMULATED_TIME: the errors of sheet and fingertip are evaluated in strokes in simulated time.
+    NOT_MEASURED: the parameter affects only images of a moving sheet or eye.
+    NOT_SIMULATED: no simulator node uses the parameter.
     """
 
     OFFLINE = "offline"
@@ -183,7 +183,7 @@ def _make_row(
 def rank(scene: Scene, rows: Sequence[Row]) -> list[Row]:
     """Return the measured parameters, sorted by their worst effect at a deviation of one sigma.
 
-    share: ratio of the effect to the scene's tolerance of the metric. The largest effect is first.
+    The key `share` is the ratio of the effect to the scene's tolerance of the metric.
     """
     limits = metric_tolerances(scene)
     ranked = []

@@ -31,9 +31,9 @@ BIAS_SIGMAS = 0.2
 class Perception:
     """The parameters of the perception of a simulated participant.
 
-    noise: standard deviation of the perceived logarithm of a stiffness. bias: value added to the
-    perceived logarithm of the second object's stiffness. lapse_rate: fraction of trials that are
-    answered at random.
+    noise: standard deviation of the perceived logarithm of a stiffness.
+    bias: value added to the perceived logarithm of the second object's stiffness.
+    lapse_rate: fraction of trials that are answered at random.
     """
 
     noise: float

@@ -32,7 +32,7 @@ from flexsheet.launch.experiments.stroke import (
     stroke_window_s,
     summary,
 )
-from flexsheet.launch.experiments.true_geometry import ArmModel, place_edges
+from flexsheet.launch.experiments.true_geometry import place_edges
 from flexsheet.messages.apparatus import Apparatus, ArmTruth, CameraTruth, nominal_apparatus
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
@@ -65,7 +65,7 @@ from flexsheet.nodes.triangulator.tracking import (
 )
 from flexsheet.nodes.triangulator.triangulation import StereoGeometry, measure
 from flexsheet.nodes.twin import rig
-from flexsheet.nodes.twin.arms import ArmMechanics, Servo
+from flexsheet.nodes.twin.arms import ArmMechanics, PlacedArm, Servo
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.finger import FingerMotion, find_tremor_m, validate_path
 from flexsheet.nodes.twin.hand import CoupledFinger, EdgeTrack, VoluntaryPath
@@ -104,15 +104,15 @@ SETTLING_S = 2.0
 class LoopSettings:
     """The settings of a simulation run.
 
-    tracking: tracking method. planner: parameters of the planner by name. lag_known: whether the
-    bridges know the true servo lag of the arms; otherwise they measure it. computing_s: time from
-    the end of the camera's read-out to the published target. calibrations: calibrated parameters
-    that the nodes use, which differ from the true ones. If it is None, the nodes know camera,
-    marker and exposure times exactly. with_images: whether the marker is detected in rendered
-    camera images; otherwise the true pixels of the marker with added noise are used.
+    planner: parameters of the planner by name.
+    lag_known: whether the bridges know the true servo lag of the arms; otherwise they measure it.
+    computing_s: time from the end of the camera's read-out to the published target.
+    calibrations: calibrated parameters that the nodes use. If None, the nodes know camera, marker
+        and exposure times exactly.
+    with_images: whether the marker is detected in rendered images; otherwise noise is added to the
+        true pixels of the marker.
     """
 
-    tracking: str = "adaptive"
     seed: int = 0
     planner: Mapping[str, Any] = field(default_factory=dict)
     lag_known: bool = False
@@ -122,8 +122,7 @@ class LoopSettings:
 
 
 class MeasuredFinger:
-    """A simulated camera that measures marker pixels with noise, with the triangulator's
-    tracking."""
+    """A simulated camera that measures noisy marker pixels and tracks the finger."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus, settings: LoopSettings) -> None:
         given, self._truth = settings.calibrations, apparatus.camera
@@ -141,7 +140,7 @@ class MeasuredFinger:
         self._random = np.random.default_rng(settings.seed)
         speed_m_per_s = scene.finger.max_speed_m_per_s
         self._tracker = Tracker(
-            TRACKING_METHODS[settings.tracking](speed_m_per_s), TrackingSettings(speed_m_per_s)
+            TRACKING_METHODS["adaptive"](speed_m_per_s), TrackingSettings(speed_m_per_s)
         )
         self._horizons_s = make_horizons_s(PREDICTION_S)
 
@@ -157,14 +156,9 @@ class MeasuredFinger:
             late_s += truth.exposure_jitter_s * float(random.standard_normal())
         marker = position_world + self._marker_m
         markers = marker + np.array([[late_s], [late_s + truth.skew_s]]) * velocity
-        in_left = apply(self._left_from_world, markers)
-        in_right = apply(self._camera.right_from_left, in_left)
         pixels = [
-            rig.pixels_of(lens, point[:2] / point[2]) + PIXEL_NOISE_PX * random.standard_normal(2)
-            for lens, point in (
-                (self._camera.left, in_left[0]),
-                (self._camera.right, in_right[1]),
-            )
+            exact + PIXEL_NOISE_PX * random.standard_normal(2)
+            for exact in rig.stereo_pixels(self._camera, self._left_from_world, markers)
         ]
         covariance = PIXEL_NOISE_PX**2 * np.eye(2)
         found = measure(self._geometry, *pixels, covariance=covariance)
@@ -263,25 +257,22 @@ class SimulatedArm:
         self._now_s = 0.0
 
     def sheet_to(self, other: SimulatedArm) -> SheetMotion:
-        """Return the motion of the sheet between two arms, computed from joint angles as in a
-        bridge."""
+        """Return the motion of the sheet between two arms, from joint angles as in a bridge."""
         edges = [arm._geometry.world_from_edge(arm._servo.joints_rad) for arm in (self, other)]
         return self._geometry.sheet_between(*edges)
 
     @property
     def lag_s(self) -> float:
-        """Return the servo lag (s) that the bridge has measured, or that it knows in advance."""
+        """Return the servo lag (s) that the bridge uses: measured, or known in advance."""
         return self._lag.lag_s if self._known_lag_s is None else self._known_lag_s
 
     @property
     def lag_uncertainty_s(self) -> float | None:
-        """Return the standard deviation (s) of the measured servo lag; None if it is not known
-        yet."""
+        """Return the standard deviation (s) of the measured servo lag; None if unknown."""
         return None if self._lag.estimate is None else self._lag.estimate.uncertainty_s
 
     def advance(self, until_s: float) -> Floats:
-        """Advance the simulated servo to a time (s), and return the true joint angles (6,), in
-        rad."""
+        """Advance the simulated servo to a time (s), and return the true joint angles (6,), rad."""
         while self._pending and self._pending[0][0] <= until_s:
             due_s, joints_rad = self._pending.popleft()
             self._run_servo(due_s)
@@ -297,8 +288,9 @@ class SimulatedArm:
     def command(self, target: SheetMotion, valid_at_s: float, now_s: float, step_s: float) -> None:
         """Send the command of one arm cycle to the servo.
 
-        target: motion of the sheet for the time `valid_at_s`. now_s: present time. step_s: duration
-        of the cycle. All times are in seconds.
+        target: motion of the sheet for the time `valid_at_s`, s.
+        now_s: present time.
+        step_s: duration of the cycle.
         """
         goal = extrapolate_goal(
             target, now_s - valid_at_s + self.lag_s, 0.0, max_extrapolation_s=MAX_EXTRAPOLATION_S
@@ -345,7 +337,7 @@ class SimulatedSheet:
             SimulatedArm(scene, "left", truth.left, sheet, lag_known=known, seed=seed),
             SimulatedArm(scene, "right", truth.right, sheet, lag_known=known, seed=seed),
         )
-        self._models = ArmModel.of(true_scene.arms.left), ArmModel.of(true_scene.arms.right)
+        self._models = PlacedArm.of(true_scene.arms.left), PlacedArm.of(true_scene.arms.right)
         self._pull = SheetPull.of(true_scene.sheet, apparatus)
         self._width_m = scene.sheet.width_m
         self.rows: tuple[list[tuple[int, Floats]], ...] = ([], [])
@@ -355,7 +347,7 @@ class SimulatedSheet:
     def record(self, now_s: float) -> None:
         """Advance the servos to a time (s), and record the true poses of the sheet's edges."""
         flanges = [
-            model.world_from_base @ model.mechanics.forward(arm.advance(now_s))
+            model.world_from_flange(arm.advance(now_s))
             for model, arm in zip(self._models, self.arms, strict=True)
         ]
         clamps = [model.flange_from_edge for model in self._models]
@@ -456,9 +448,9 @@ def follow_in_simulated_time(
 ) -> dict[str, Any]:
     """Simulate the sheet's motion along a finger path, and return the errors of the sheet.
 
-    The keys are those of `FollowedFinger.figures`. In addition, `servo_lag_ms` contains the servo
-    lags that the two bridges have measured at the end, and `servo_lag_uncertainty_ms` their
-    standard deviations.
+    The result has the keys of `FollowedFinger.figures`. The key `servo_lag_ms` contains the servo
+    lags that the two bridges have measured at the end. The key `servo_lag_uncertainty_ms` contains
+    their standard deviations.
     """
     truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     finger = validate_path(path.times_s, path.positions_world_m, path.joined_by)
@@ -586,10 +578,12 @@ def stroke_in_simulated_time(
 class TouchRecording:
     """A recorded touch of a simulated hand that the sheet pushes.
 
-    times_s (n,): times of the exposures. positions_m (n, 3): true fingertip. phases (n,): contact
-    phase of the planner. delay_s: time from an exposure to the sheet's motion. steps (k, 3): time
-    (s), indentation of the sheet (m) and its force (N) of each time step. watchdog_triggers: number
-    of oscillations that the planner stopped; None if unknown.
+    times_s (n,): times of the exposures.
+    positions_m (n, 3): true fingertip.
+    phases (n,): contact phase of the planner.
+    steps (k, 3): time (s), indentation of the sheet (m) and its force (N) of each time step.
+    watchdog_triggers: number of oscillations that the planner stopped; None if unknown.
+    delay_s: time from an exposure to the sheet's motion.
     """
 
     times_s: Floats
@@ -607,21 +601,20 @@ def touch_in_simulated_time(
     make_finger: Callable[[VoluntaryPath], CoupledFinger],
     *,
     bounds: OffsetBoundsTable,
-    apparatus: Apparatus | None = None,
     settings: LoopSettings | None = None,
 ) -> TouchRecording:
     """Simulate a hand that moves along a voluntary path while the sheet pushes the finger.
 
-    curve: (m, 2), depths (m) and forces (N) of the object. make_finger: function that makes the
-    simulated finger from its voluntary path. bounds: the planner's bounds on the sheet's offset.
+    curve: (m, 2), depths (m) and forces (N) of the object.
+    make_finger: function that makes the simulated finger from its voluntary path.
+    bounds: the planner's bounds on the sheet's offset.
     """
-    truth, given = apparatus or nominal_apparatus(scene), settings or LoopSettings()
     voluntary = validate_path(path.times_s, path.positions_world_m, path.joined_by)
     compliance = ComplianceController(
         scene, make_force_model(scene.sheet), "force_curve", bounds=bounds
     )
     compliance.update(make_soft_body(curve), in_contact=False)
-    loop = SimulatedLoop(scene, truth, given, compliance)
+    loop = SimulatedLoop(scene, nominal_apparatus(scene), settings or LoopSettings(), compliance)
     finger = make_finger(lambda at_s: voluntary.at(at_s - SETTLING_S))
     finger.log, edges = [], EdgeTrack()
     times_s, positions, phases = list[float](), list[Floats](), list[Phase]()

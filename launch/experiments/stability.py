@@ -79,10 +79,10 @@ An infinite bandwidth means that the depth is not filtered.
 class StabilitySettings:
     """The settings of the experiment.
 
-    hands: number of random hands per group of HAND_RANGES, sampled with `seed`. rates_hz: camera
-    rates at which the critical slope is measured. object_ratios: factors by which the stiffness of
-    the scene's object is multiplied. delays_s, jitters_s: delays of the control loop and their
-    jitter.
+    hands: number of random hands per group of HAND_RANGES, sampled with `seed`.
+    delays_s, jitters_s: delays of the control loop and their jitter.
+    rates_hz: camera rates at which the critical slope is measured.
+    object_ratios: factors of the stiffness of the scene's object.
     """
 
     hands: int = 4
@@ -143,11 +143,9 @@ def make_cases(trials: Sequence[Trial], gains: Floats) -> Cases:
 
 
 def find_critical_slopes(trials: Sequence[Trial], *, towards_finger: bool) -> Floats:
-    """Return the smallest slopes (n,) of the offset at which the hands of the trials are not
-    stable.
+    """Return the smallest slopes (n,) of the offset at which the hands become unstable.
 
-    A slope above 1.5 is returned as NaN. The slopes are simulated for a linear sheet. All trials
-    must have the same period.
+    A slope above 1.5 is returned as NaN. The sheet is linear. All trials must have the same period.
     """
     slopes = np.geomspace(0.03, MAX_BOUNDARY_SLOPE, SLOPES)
     motion = simulate_release(
@@ -229,11 +227,10 @@ def measure_map(
 ) -> list[dict[str, Any]]:
     """Simulate random hands that push objects of several stiffnesses; return table rows.
 
-    There is one row for each object, hand, delay, jitter and kind of control loop. The planner
-    knows the mean delay, to which the jitter adds half of its range.
-
-    Kinds: "bounded" is the planner's control loop; "unbounded" has no stability bounds and no depth
-    filter; "predicted" is like "unbounded", but predicts the depth over the delay.
+    There is one row per object, hand, delay, jitter and kind of control loop. "bounded" is the
+    planner's control loop. "unbounded" has no stability bounds and no depth filter. "predicted"
+    also predicts the depth over the delay. The planner knows the mean delay. The jitter adds half
+    of its range to the delay.
     """
     material = scene.object.material
     if material is None:

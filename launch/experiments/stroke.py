@@ -1,8 +1,8 @@
 """Stroke the virtual cylinder with a finger, and measure the error of the sheet.
 
 This is the experiment of Furukawa et al. 2007, section V and Table I. D is the point of the object
-nearest to the finger, and D' is the contact point of the sheet. The errors (Fig. 9) are delta d,
-the distance from D to D', and delta theta, the angle between the normals at D and D'. "Light" is
+nearest to the finger, and D' is the contact point of the sheet. The errors (Fig. 9) are the
+distance delta d from D to D', and the angle delta theta between the normals at D and D'. "Light" is
 the time at which the projector shows an image.
 """
 
@@ -167,7 +167,7 @@ def stroke_window_s(seconds: float) -> tuple[float, float]:
 
 
 def object_pose(scene: Scene) -> Floats:
-    """Return the pose of a scene's object as the matrix world_from_object (4, 4)."""
+    """Return the pose world_from_object (4, 4) of a scene's object."""
     return pose_matrix(scene.object.world_from_object)
 
 
@@ -181,8 +181,8 @@ class SampledMotion:
     def interpolate(self, times_ns: NDArray[np.int64]) -> Floats:
         """Return the values (m, k) at the given times (m,) in ns, by linear interpolation.
 
-        Times are converted to floats relative to the first sample, because floats of the time since
-        the computer's start cannot resolve nanoseconds.
+        Times are converted to floats relative to the first sample, because a float cannot store the
+        time since the computer's start in ns exactly.
         """
         zero = self.times_ns[0]
         x, xp = (times_ns - zero).astype(np.float64), (self.times_ns - zero).astype(np.float64)
@@ -195,7 +195,7 @@ class SampledMotion:
 
 
 def make_motion(samples: list[tuple[int, Floats]], name: str) -> SampledMotion:
-    """Make a motion from samples (time in ns, value), which are sorted; repeated times are dropped.
+    """Make a motion from samples (time in ns, value); sort them and drop repeated times.
 
     name: name of the samples in the error text. Raises ExperimentError for fewer than two samples.
     """
@@ -215,13 +215,14 @@ class StrokeRecording:
     """The data of a stroke experiment, read from a bag.
 
     fingertip, measured, finger: filtered, measured and true position of the fingertip.
+    windows_ns: start and end of each finger path, by label.
     measured_edges, true_edges: left and right clamped edge of the sheet. A row (9,) is the centre,
-    y axis and z axis of an edge in the world frame. delays_s: delays from the centre of an exposure
-    to the events that it caused, by event. drops: number of lost or refused messages, without
-    messages that a `latest` reader skipped. apparatus: origin of the true parameters of the
-    simulated hardware. surface, true_surface: shape of the unloaded sheet, by the scene and by the
-    apparatus. loads: times (ns) at which the computers reported their load, and whether they were
-    overloaded.
+        y axis and z axis of an edge in the world frame.
+    delays_s: delays from the centre of an exposure to the events that it caused, by event.
+    drops: number of lost or refused messages, without those that a `latest` reader skipped.
+    apparatus: origin of the true parameters of the simulated hardware.
+    surface, true_surface: shape of the unloaded sheet, by the scene and by the apparatus.
+    loads: times (ns) of load reports of the computers, and whether the computer was overloaded.
     """
 
     scene: Scene
@@ -238,19 +239,6 @@ class StrokeRecording:
     surface: SheetSurface | None = None
     true_surface: SheetSurface | None = None
     loads: tuple[tuple[int, bool], ...] = ()
-
-    def arm_delays_s(self) -> Floats:
-        """Return the delays (n,), in s, from exposures to the commands sent to both arms."""
-        both = [self.delays_s.get(event, NO_VALUES) for event in ARM_EVENTS.values()]
-        return np.concatenate(both)
-
-
-def group_by_event(delays: dict[tuple[str, int], float]) -> dict[str, Floats]:
-    """Group delays with keys (event, exposure) into arrays (n,) by event."""
-    events: dict[str, list[float]] = {}
-    for (event, _), delay_s in delays.items():
-        events.setdefault(event, []).append(delay_s)
-    return {event: np.array(values) for event, values in events.items()}
 
 
 def make_edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats:
@@ -274,7 +262,7 @@ def frame_events(frame: Frame, published_ns: int) -> list[tuple[LatencyEvent, in
 
 
 def list_events(message: Message, header: Header) -> list[tuple[LatencyEvent, int, int]]:
-    """Return the events in a message that are needed for latency measurements.
+    """Return the events in a message whose latency is measured.
 
     An event is a tuple of its kind, the exposure that caused it (ns), and its time (ns).
     """
@@ -295,19 +283,6 @@ def list_events(message: Message, header: Header) -> list[tuple[LatencyEvent, in
     return []
 
 
-def _find_windows_ns(
-    times_by_label: dict[str, list[tuple[int, float]]],
-) -> dict[str, tuple[int, int]]:
-    """Return the start and end (ns) of each finger path, by label.
-
-    times_by_label: samples (timestamp in ns, time since the start of the path in s).
-    """
-    return {
-        label: (samples[-1][0] - round(samples[-1][1] * 1e9), samples[-1][0])
-        for label, samples in times_by_label.items()
-    }
-
-
 def read_recording(bag: Path) -> StrokeRecording:
     """Read the data of a stroke from a bag; raise ExperimentError if data are missing."""
     scene: Scene | None = None
@@ -315,21 +290,17 @@ def read_recording(bag: Path) -> StrokeRecording:
     fingertip: list[tuple[int, Floats]] = []
     measured: list[tuple[int, Floats]] = []
     finger: list[tuple[int, Floats]] = []
-    times_by_label: dict[str, list[tuple[int, float]]] = {}
+    windows_ns: dict[str, tuple[int, int]] = {}
     flanges: dict[str, list[tuple[int, Floats]]] = {
         key: [] for key in ("left", "right", "true_left", "true_right")
     }
-    delays: dict[tuple[str, int], float] = {}
+    delays: dict[str, dict[int, float]] = {}
     frames = DrawnFrames([], [], [])
     frame: Frame | None = None
-
-    def add_delay(event: str, source_ns: int, event_ns: int) -> None:
-        delays.setdefault((event, source_ns), (event_ns - source_ns) * 1e-9)
-
     losses: dict[tuple[str, int, str], int] = {}
     for _, message, header, _ in BagReader(bag):
-        for event in list_events(message, header):
-            add_delay(*event)
+        for event, source_ns, event_ns in list_events(message, header):
+            delays.setdefault(event, {}).setdefault(source_ns, (event_ns - source_ns) * 1e-9)
         match message:
             case Scene():
                 scene = message
@@ -340,9 +311,8 @@ def read_recording(bag: Path) -> StrokeRecording:
                 measured.append((header.source_ns, message.measured_world_m))
             case TwinFinger():
                 finger.append((header.source_ns, message.position_world_m))
-                times_by_label.setdefault(message.path_label, []).append(
-                    (header.source_ns, message.path_time_s)
-                )
+                begin_ns = header.source_ns - round(message.path_time_s * 1e9)
+                windows_ns[message.path_label] = begin_ns, header.source_ns
             case ArmState():
                 flanges[message.side].append((header.source_ns, message.world_from_flange))
             case TwinArms():
@@ -367,7 +337,7 @@ def read_recording(bag: Path) -> StrokeRecording:
         return make_motion(rows, f"arm {key}")
 
     true_arms = apply_apparatus(scene, apparatus).arms
-    delays_s = group_by_event(delays)
+    delays_s = {event: np.array(list(found.values())) for event, found in delays.items()}
     if apparatus is not None:
         late_s = find_display_delay_s(frame, apparatus)
         frames = frames.shifted(round(1e9 * late_s))
@@ -378,7 +348,7 @@ def read_recording(bag: Path) -> StrokeRecording:
         fingertip=make_motion(fingertip, "fingertip"),
         measured=make_motion(measured, "fingertip"),
         finger=make_motion(finger, "twin/finger"),
-        windows_ns=_find_windows_ns(times_by_label),
+        windows_ns=windows_ns,
         measured_edges=apply_compliance(
             scene, (make_edges("left", scene.arms.left), make_edges("right", scene.arms.right))
         ),
@@ -397,8 +367,9 @@ def read_recording(bag: Path) -> StrokeRecording:
 
 
 def read_loads(bag: Path) -> tuple[tuple[int, bool], ...]:
-    """Return the times (ns) at which computers reported their load, and whether they were
-    overloaded."""
+    """Return the times (ns) of the computers' load reports, and whether each computer was
+    overloaded.
+    """
     return tuple(
         (header.source_ns, is_busy(message))
         for _, message, header, _ in BagReader(bag, topics=["host"])
@@ -478,10 +449,12 @@ Flatter surfaces have many points with nearly the same normal.
 def project_presented_point(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
     """Return the contact points D' (n, 3), in m, of a sheet on an object of any shape.
 
-    foot: points of the object nearest to the finger. centre, normal: (n, 3), point and normal of
-    the sheet's plane. D' is the surface point that has the plane's normal, projected onto the
-    plane. Along a direction without curvature, D' has the position of the foot. The error of this
-    approximation is of second order in the angle between the normals.
+    D' is the surface point that has the plane's normal, projected onto the plane. Along a direction
+    without curvature, D' has the position of the foot. The error of this approximation is of second
+    order in the angle between the normals.
+
+    foot: points of the object nearest to the finger.
+    centre, normal: (n, 3), point and normal of the sheet's plane.
     """
     curvatures, directions = principal_curvatures(foot.shape_operator, foot.normal)
     slopes = np.einsum("nki,ni->nk", directions, normal)
@@ -506,12 +479,14 @@ def sheet_errors(
 ) -> tuple[Floats, Floats]:
     """Return the sheet's errors delta d (n,) in m and delta theta (n,) in rad at `times_ns`.
 
-    finger, edges: motions of the fingertip and of both clamped edges. normal_offset_m (n,):
-    commanded depth of the sheet below the undeformed surface. The errors are relative to the
-    surface at this depth, so the finger's push depth is not an error. On a cylinder, delta theta is
-    the angle about its axis, as in Furukawa et al. 2007; on other shapes it is the angle between
-    the normals. shape: shape of the scene's object, if already computed. surface: shape of the
-    unloaded sheet; None if it is flat.
+    The errors are relative to the surface at the commanded depth of the sheet. Therefore the push
+    depth is not an error. On a cylinder, delta theta is the angle about its axis, as in Furukawa et
+    al. 2007. On other shapes, delta theta is the angle between the normals.
+
+    finger, edges: motions of the fingertip and of both clamped edges.
+    normal_offset_m: (n,), commanded depth of the sheet below the undeformed surface.
+    shape: shape of the scene's object, if already computed.
+    surface: shape of the unloaded sheet; None for a flat sheet.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.interpolate(times_ns))
@@ -521,9 +496,8 @@ def sheet_errors(
     if not isinstance(scene.object.geometry, Cylinder):
         foot = (shape or make_shape(dict(scene.object.geometry))).closest(points)
         normal = planes.normals
-        on_surface = (
-            foot.point - np.broadcast_to(normal_offset_m, len(points))[:, None] * foot.normal
-        )
+        offset_m = np.broadcast_to(normal_offset_m, len(points))[:, None]
+        on_surface = foot.point - offset_m * foot.normal
         sine = np.linalg.norm(np.cross(foot.normal, normal), axis=1)
         cosine = np.einsum("ni,ni->n", foot.normal, normal)
         error = on_surface - project_presented_point(foot, planes.points, normal)
@@ -537,10 +511,10 @@ def sheet_errors(
 
 
 def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> SampledMotion:
-    """Return the measured positions, smoothed from the first to the last of `times_ns`.
+    """Return the measured positions from the first to the last of `times_ns`, smoothed.
 
-    The smoother also uses later measurements, so its error estimates a lower bound for causal
-    filters. It fits a cubic smoothing spline per coordinate, by generalized cross-validation.
+    A cubic smoothing spline is fitted to each coordinate by generalized cross-validation. It also
+    uses later measurements, so its error estimates a lower bound for causal filters.
     """
     inside = (measured.times_ns >= times_ns[0]) & (measured.times_ns <= times_ns[-1])
     times, values = measured.times_ns[inside], measured.values[inside]
@@ -576,11 +550,11 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 class StrokeErrors:
     """The errors of a stroke as functions of time, in m and rad.
 
-    seconds: (n,), times of the measured errors since the start of the stroke. These are exposures
-    with a valid fingertip. true_seconds: (m,), times of the true errors. These are all exposures,
-    since the sheet also has an error while no fingertip is found. smoother_m, fingertip_m: (n,),
-    errors of the offline smoother and of the fingertip. arcs_m: (m, 2), arc lengths around the
-    object to the true contact line and to the true finger.
+    seconds: (n,), times of exposures with a valid fingertip, since the start of the stroke. The
+        measured errors belong to these times.
+    true_seconds: (m,), times of all exposures, to which the true errors belong.
+    smoother_m, fingertip_m: (n,), errors of the offline smoother and of the fingertip.
+    arcs_m: (m, 2), arc lengths around the object to the true contact line and to the true finger.
     """
 
     seconds: Floats
@@ -639,15 +613,12 @@ def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
         scene, recording.finger, recording.true_edges, exposures, surface=recording.true_surface
     )
     smooth = smooth_motion(recording.measured, times)
-    world_from_object = object_pose(scene)
     true_points = recording.finger.interpolate(times)
     return StrokeErrors(
         seconds=np.asarray((times - begin_ns) * 1e-9, dtype=np.float64),
         delta_d_m=delta_d,
         delta_theta_rad=delta_theta,
-        smoother_m=tangential_distance(
-            scene, world_from_object, smooth.interpolate(times), true_points
-        ),
+        smoother_m=tangential_distance(scene, smooth.interpolate(times), true_points),
         fingertip_m=np.linalg.norm(recording.fingertip.interpolate(times) - true_points, axis=1),
         true_seconds=np.asarray((exposures - begin_ns) * 1e-9, dtype=np.float64),
         true_delta_d_m=true_d,
@@ -664,42 +635,39 @@ def compute_arcs(
     times_ns: NDArray[np.int64],
     points: Floats,
 ) -> Floats:
-    """Return the arc lengths (n, 2), in m, around the cylinder to two sets of points.
+    """Return arc lengths (n, 2), in m, around the cylinder.
 
-    The first column belongs to the sheet's contact line, the second one to `points` (n, 3), which
-    are in m in the world frame. edges: motions of both clamped edges.
+    The first column belongs to the contact line of the sheet, the second column to `points` (n, 3),
+    m, in the world frame. edges: motions of both clamped edges.
     """
-    world_from_object = object_pose(scene)
-    local = apply(inverse(world_from_object), points)
-    planes = compute_sheet_planes(edges, world_from_object, times_ns)
-    _, angles = find_presented_points(planes, local[:, 0])
-    both = np.stack([angles, np.arctan2(local[:, 1], local[:, 2])], axis=1)
+    planes = compute_sheet_planes(edges, object_pose(scene), times_ns)
+    _, angles = find_presented_points(planes, np.zeros(len(points)))
+    both = np.stack([angles, _compute_angles(scene, points)], axis=1)
     return np.asarray(require_cylinder(scene).radius_m * both)
 
 
-def tangential_distance(
-    scene: Scene, world_from_object: Floats, points: Floats, others: Floats
-) -> Floats:
+def _compute_angles(scene: Scene, points: Floats) -> Floats:
+    """Return the angles (n,), rad, of world points (n, 3) around the axis of the cylinder."""
+    local = apply(inverse(object_pose(scene)), points)
+    return np.asarray(np.arctan2(local[:, 1], local[:, 2]))
+
+
+def tangential_distance(scene: Scene, points: Floats, others: Floats) -> Floats:
     """Return the distances (n,), in m, between pairs of points that are projected on the cylinder.
 
     points, others: (n, 3). Distances along the cylinder's axis are ignored.
     """
-    object_from_world = inverse(world_from_object)
-    on_surface = []
-    for array in (points, others):
-        local = apply(object_from_world, array)
-        angle = np.arctan2(local[:, 1], local[:, 2])
-        radius = require_cylinder(scene).radius_m
-        on_surface.append(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]))
-    return np.asarray(np.linalg.norm(on_surface[0] - on_surface[1], axis=1))
+    angles = _compute_angles(scene, points) - _compute_angles(scene, others)
+    return np.asarray(2.0 * require_cylinder(scene).radius_m * np.abs(np.sin(0.5 * angles)))
 
 
 def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, float | None]:
     """Return the lags (ms) of the displayed image behind reality; unknown lags are None.
 
-    fingertip, sheet: lag of the drawn fingertip, and of the drawn rotation of the sheet about the
-    object, estimated by cross-correlation with the true motion. object: median age of the finger
-    measurement that deforms the drawn object, minus the solver's prediction horizon.
+    fingertip: lag of the drawn fingertip, estimated by cross-correlation with the true motion.
+    sheet: lag of the drawn rotation of the sheet about the object, estimated in the same way.
+    object: median age of the finger measurement that deforms the drawn object, minus the solver's
+        prediction horizon.
     """
     span = stroke_span_ns(recording, seconds)
     world_from_object = object_pose(recording.scene)
@@ -746,9 +714,8 @@ def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, floa
 
 
 def compute_busy_fraction(recording: StrokeRecording, seconds: float) -> float | None:
-    """Return the fraction of time during a stroke in which a computer was overloaded.
-
-    The result is None if no computer reported its load during the stroke.
+    """Return the fraction of load reports during a stroke that state an overload; None without
+    reports.
     """
     begin_ns, finish_ns = stroke_span_ns(recording, seconds)
     busy = [one for at_ns, one in recording.loads if begin_ns <= at_ns <= finish_ns]
@@ -763,6 +730,11 @@ def stroke_result(
     lag_ms: lag of the true sheet behind the true finger, estimated by cross-correlation.
     """
     lag = estimate_lag_s(errors.true_seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
+
+    def summarize_delays(*events: LatencyEvent) -> dict[str, float | None]:
+        found = [recording.delays_s.get(event, NO_VALUES) for event in events]
+        return percentiles_ms(np.concatenate(found))
+
     return {
         "seconds": seconds,
         "apparatus": recording.apparatus,
@@ -777,16 +749,10 @@ def stroke_result(
         "visible_lag_ms": visible_lag_ms(recording, seconds),
         "fingertip_mm": summary(errors.fingertip_m, 1e3),
         "latency_ms": {
-            "exposure_to_arm": percentiles_ms(recording.arm_delays_s()),
-            "exposure_to_frame": percentiles_ms(
-                recording.delays_s.get(LatencyEvent.FRAME_DRAWN, NO_VALUES)
-            ),
-            "exposure_to_frame_begun": percentiles_ms(
-                recording.delays_s.get(LatencyEvent.FRAME_BEGUN, NO_VALUES)
-            ),
-            "exposure_to_light": percentiles_ms(
-                recording.delays_s.get(LatencyEvent.LIGHT, NO_VALUES)
-            ),
+            "exposure_to_arm": summarize_delays(*ARM_EVENTS.values()),
+            "exposure_to_frame": summarize_delays(LatencyEvent.FRAME_DRAWN),
+            "exposure_to_frame_begun": summarize_delays(LatencyEvent.FRAME_BEGUN),
+            "exposure_to_light": summarize_delays(LatencyEvent.LIGHT),
         },
         "drops": recording.drops,
         "busy_fraction": compute_busy_fraction(recording, seconds),

@@ -56,8 +56,10 @@ def make_variants(
 ) -> list[Variant]:
     """Return the variants to measure; the first one is the given configuration.
 
-    Scene, launch and apparatus files of the other variants are written to the folder. ablations:
-    include variants without single methods. radii: include a larger cylinder.
+    The files of the other variants are written to the folder.
+
+    ablations: whether to include variants without single methods.
+    radii: whether to include a larger cylinder.
     """
     scene = require_scene(load_graph(launch_file))
     variants = [Variant("as configured", launch_file, apparatus=apparatus)]
@@ -97,10 +99,9 @@ def _make_ablations(
 
 
 def write_radius_variant(launch_file: Path, folder: Path, radius_m: float) -> Path:
-    """Write a launch file whose scene has a cylinder of another radius; return the path of the
-    copy.
+    """Write a launch file with a cylinder of another radius, and return its path.
 
-    The front of the cylinder does not move. Relative paths in the copy become absolute.
+    The front of the cylinder does not move. Relative paths become absolute.
     """
     graph = load_graph(launch_file)
     added_m = radius_m - require_cylinder(require_scene(graph)).radius_m
@@ -207,9 +208,10 @@ def summarize_strokes(rows: Sequence[Row]) -> dict[str, Any]:
 def summarize_means(strokes: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
     """Summarize the errors of repeated strokes.
 
-    mean: mean of the strokes' mean errors. std: mean of their standard deviations. max: largest
-    error. interval: half the width of the mean's confidence interval; None for fewer than two
-    strokes.
+    mean: mean of the strokes' mean errors.
+    std: mean of their standard deviations.
+    max: largest error.
+    interval: half the width of the mean's confidence interval; None for fewer than two strokes.
     """
     means = np.array([one["mean"] for one in strokes])
     interval = None

@@ -59,9 +59,9 @@ def describe_graph(
 
 
 def open_sweep(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Create the folder of a sweep, or check that it contains a sweep with the same settings.
+    """Create the folder of a sweep, or check that an existing sweep has the same settings.
 
-    Raises ExperimentError if a setting differs; its text names the first such setting.
+    Raises ExperimentError for the first setting that differs.
     """
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / SETTINGS_FILE
@@ -90,14 +90,9 @@ def _read_json(file: Path) -> dict[str, Any]:
 
 def read_rows(folder: Path, names: Mapping[str, Any]) -> dict[str, Row]:
     """Return the result rows of successful trials, by trial name."""
-    rows = {
-        name: _read_json(folder / f"{name}.json") for name in names if _row_exists(folder, name)
-    }
+    files = {name: folder / f"{name}.json" for name in names}
+    rows = {name: _read_json(file) for name, file in files.items() if file.exists()}
     return {name: row for name, row in rows.items() if "error" not in row}
-
-
-def _row_exists(folder: Path, name: str) -> bool:
-    return (folder / f"{name}.json").exists()
 
 
 def run_sweep(
@@ -111,10 +106,11 @@ def run_sweep(
 ) -> dict[str, Row]:
     """Run all trials that have no result row yet; return all rows by name, in the trials' order.
 
-    trials: JSON description of each trial for `trial.run_trial`. workers: number of simultaneous
-    trials on this computer; ignored if a scheduler is given. scheduler: address of the scheduler
-    that runs the trials. A failed trial has a row with the key `error`, and does not stop other
-    trials.
+    A failed trial has a row with the key `error`, and does not stop other trials.
+
+    trials: description of each trial for the module `trial`, by name.
+    workers: number of simultaneous trials on this computer; ignored if a scheduler is given.
+    scheduler: address of the scheduler that runs the trials.
     """
     open_sweep(folder, settings)
     done = read_rows(folder, trials)

@@ -40,6 +40,7 @@ from flexsheet.messages.types import FingerPath, SoftBody
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
+from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse
 from flexsheet.nodes.models.shapes import Nearest, make_shape
 from flexsheet.nodes.planner.compliance import FORCE_JND_FLOOR_N
@@ -50,9 +51,8 @@ from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import make_force_model
 from flexsheet.nodes.planner.trajectory import SheetTrajectoryPlanner
 from flexsheet.nodes.twin.force_history import compute_history_ratios
-from flexsheet.nodes.twin.membrane import solve
 from flexsheet.nodes.twin.paths import map_to_surface, touchable
-from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_pull import solve_sheet
 from flexsheet.nodes.twin.sheet_surface import SheetSurface
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -94,10 +94,12 @@ finger; true minus computed sheet.
 """
 
 
-def make_stroke(scene: Scene, seconds: float, label: str = STROKE) -> FingerPath:
+def make_stroke(scene: Scene, seconds: float) -> FingerPath:
     """Return a finger path that strokes back and forth around the object.
 
-    The maximum speed is that of the scene's working range. seconds: duration of the stroke.
+    The maximum speed is the speed of the scene's working range.
+
+    seconds: duration of the stroke.
     """
     half_m = 0.5 * STROKED_RATIO * touchable(scene)[1]
     frequency_rad_per_s = scene.working_range.speed_m_per_s / half_m
@@ -107,7 +109,7 @@ def make_stroke(scene: Scene, seconds: float, label: str = STROKE) -> FingerPath
     first, last = ([*place[:2], HOVER_M] for place in (places[0], places[-1]))
     lift_s = HOVER_M / max(scene.working_range.speed_m_per_s, compliance.PUSH_M_PER_S)
     return FingerPath(
-        label=label,
+        label=STROKE,
         times_s=np.concatenate([[0.0], APPROACH_S + times, [APPROACH_S + seconds + lift_s]]),
         positions_world_m=map_to_surface(scene, np.vstack([first, places, last])),
         wander_m=stroke.WANDER_M,
@@ -119,8 +121,10 @@ def make_stroke(scene: Scene, seconds: float, label: str = STROKE) -> FingerPath
 class ErrorEvaluator:
     """An evaluator of configurations in one scene with one apparatus (true hardware parameters).
 
-    seconds: duration of the stroke. seed: random seed of the finger. Results of methods that
-    several configurations have in common are computed only once.
+    Results of methods that several configurations have in common are computed only once.
+
+    seconds: duration of the stroke.
+    seed: random seed of the finger.
     """
 
     scene: Scene
@@ -133,9 +137,11 @@ class ErrorEvaluator:
     def evaluate(self, methods: Methods, planner: Mapping[str, Any]) -> dict[str, Any]:
         """Return mean, 95 % quantile and maximum of each error of a configuration.
 
-        An error is None if the scene does not have the required device or object. methods: all
-        methods of the configuration. planner: further parameters of the planner. budget (in the
-        result): fraction of the sheet's mean square error that each stage of `STAGES` causes.
+        An error is None if the scene does not have the required device or object. The key `budget`
+        contains the fraction of the sheet's mean square error that each stage of `STAGES` causes.
+
+        methods: all methods of the configuration.
+        planner: further parameters of the planner.
         """
         has_image, has_force = self.scene.projector is not None, self.scene.object.material
         moving = (methods.marker, methods.tracking, *planner.items())
@@ -186,30 +192,24 @@ class ErrorEvaluator:
         return summarize_errors(found[np.isfinite(found)])
 
     def _force(self, methods: Methods) -> dict[str, float] | None:
-        """Return the errors (%) of the force that the finger feels while it rests at several
-        depths.
+        """Return the errors (%) of the felt force while the finger rests at several depths.
 
-        The reference is the stored solution of an independent solver. If there is no solution for
-        the scene, the reference is the force of the configuration's own soft body.
+        The reference is the stored solution of an independent solver. Without a solution for the
+        scene, the reference is the force of the configuration's own soft body.
         """
         scene, truth = self.scene, apply_apparatus(self.scene, self.apparatus)
         press = compliance.make_presses(scene)[0]
         body = load_body(scene, methods.soft_body)
         expected = find_reference_curve(scene, *press.place_m)
-        rubber, friction = true_rubber(truth.sheet, self.apparatus), true_friction(self.apparatus)
-        arms, push = ArmPair(scene, self.apparatus), self._make_push(methods, body)
+        arms = ArmPair(scene, self.apparatus)
+        chosen = scene.model_copy(update={"methods": methods})
+        push = RestingPush(chosen, self.apparatus, self.calibrations, body)
         ratios, errors = compute_history_ratios(self.apparatus), list[float]()
         for hold in press.holds:
             tip = press.surface - hold.depth_m * press.normal
             motion = push.rest_at(tip, press.surface)
             edges = place_edges(motion.world_from_sheet, scene.sheet.width_m * motion.stretch_ratio)
-            sheet = solve(
-                rubber,
-                *arms.hold(edges),
-                finger_tip=tip,
-                finger_radius_m=truth.finger.radius_m,
-                friction_coefficient=friction,
-            )
+            sheet = solve_sheet(truth, self.apparatus, arms.hold(edges), tip)
             reference = None if expected is None else expected.force(hold.depth_m)
             curve = body.force_curve
             wanted_n = float(np.interp(hold.depth_m, curve[:, 0], curve[:, 1]))
@@ -221,56 +221,49 @@ class ErrorEvaluator:
             ).tolist()
         return summarize_errors(np.array(errors))
 
-    def _make_push(self, methods: Methods, body: SoftBody) -> RestingPush:
-        scene, given = self.scene.model_copy(update={"methods": methods}), self.calibrations
-        mode = PlannerParameters().choose_compliance(scene)
+
+class RestingPush:
+    """A planned sheet motion for a finger that pushes and then rests."""
+
+    def __init__(
+        self, scene: Scene, apparatus: Apparatus, calibrations: NodeCalibrations, body: SoftBody
+    ) -> None:
+        """Make the planner and its compliance controller.
+
+        scene: scene with the methods of the configuration. body: undeformed soft body.
+        """
+        settings, force = PlannerParameters(), scene.methods.sheet_force
+        mode = settings.choose_compliance(scene)
         model = (
-            load_force_model(scene, methods.sheet_force or "scaled", None)[0]
-            if given.sheet is None
-            else make_force_model(scene.sheet, given.sheet)
+            load_force_model(scene, force or "scaled", None)[0]
+            if calibrations.sheet is None
+            else make_force_model(scene.sheet, calibrations.sheet)
         )
         bounds = load_or_compute_bounds(scene.camera.rate_hz, None)
-        controller = ComplianceController(
+        self._controller = ComplianceController(
             scene, model, mode, bounds=bounds if mode == "force_curve" else None
         )
-        controller.update(body, in_contact=False)
-        offset = OfflineEvaluator(scene, given).evaluate(
-            self.apparatus, frozenset({Metric.FINGERTIP})
-        )
+        self._controller.update(body, in_contact=False)
+        metrics = frozenset({Metric.FINGERTIP})
+        offset = OfflineEvaluator(scene, calibrations).evaluate(apparatus, metrics)
         assert offset.fingertip_m is not None
-        planner = SheetTrajectoryPlanner(scene, PlannerParameters())
-        return RestingPush(planner, controller, offset.fingertip_m[0])
+        self._measured_m = offset.fingertip_m[0]
+        self._planner = SheetTrajectoryPlanner(scene, settings)
 
-
-@dataclass(slots=True)
-class RestingPush:
-    """A planned sheet motion for a finger that pushes and then rests.
-
-    measured_m: measured minus true fingertip (3,).
-    """
-
-    planner: SheetTrajectoryPlanner
-    controller: ComplianceController
-    measured_m: Floats
-
-    def rest_at(self, tip: Floats, surface: Floats) -> Any:
+    def rest_at(self, tip: Floats, surface: Floats) -> SheetMotion:
         """Return the planned sheet motion after the finger has rested at a point.
 
-        tip: fingertip (3,), m. surface: point (3,) of the object at which the finger first makes
-        contact.
+        tip: fingertip (3,), m. surface: point (3,) of the object at the first contact, m.
         """
-        finger = tip + self.measured_m
-        if not self.planner.in_contact:
-            for _ in range(round(FORCE_REST_S / FORCE_STEP_S)):
-                self._step(surface + self.measured_m)
-        for _ in range(round(FORCE_REST_S / FORCE_STEP_S)):
-            motion = self._step(finger)
-        return motion
+        if not self._planner.in_contact:
+            self._rest(surface)
+        self._rest(tip)
+        return self._planner.motion
 
-    def _step(self, finger: Floats) -> Any:
-        return self.planner.follow_finger(
-            finger, np.zeros(3), self.controller, FORCE_STEP_S, finger
-        ).motion
+    def _rest(self, tip: Floats) -> None:
+        finger = tip + self._measured_m
+        for _ in range(round(FORCE_REST_S / FORCE_STEP_S)):
+            self._planner.follow_finger(finger, np.zeros(3), self._controller, FORCE_STEP_S, finger)
 
 
 @cache
@@ -297,11 +290,9 @@ def split_sheet_error(recording: StrokeRecording, offsets_m: Floats, times_ns: A
 
     The total error is the difference of two points in the object's frame. The first is the object's
     point nearest to the true finger, moved inward by the commanded offset (n, 1). The second is the
-    contact point of the true sheet.
-
-    A displacement of a flat sheet along a flat object does not change the contact. For flat
-    objects, the total error is therefore only the distance between the planes. It is zero if the
-    arms move within the plane.
+    contact point of the true sheet. A displacement of a flat sheet along a flat object does not
+    change the contact. For flat objects, the total error is therefore only the distance between the
+    planes.
     """
     world_from_object = object_pose(recording.scene)
     object_from_world = inverse(world_from_object)

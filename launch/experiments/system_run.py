@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -24,36 +23,19 @@ from flexsheet.launch.experiments.system_errors import (
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import FingerPath, Frame, SheetTarget, TwinFinger
+from flexsheet.messages.types import Frame, SheetTarget, TwinFinger
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.truth import find_display_delay_s
 
 DELAY_TOPICS = ("twin/apparatus", "arm_left", "arm_right", "frame")
 
 
-@dataclass(slots=True)
-class CpuUse:
-    """The average number of processor cores that each process of a graph uses, by node name."""
-
-    cores: dict[str, float] = field(default_factory=dict)
-
-    async def measure(self, driver: Driver, path: FingerPath) -> None:
-        """Move the finger along a path, and measure the processor use during this motion."""
-        before, begin_s = read_cpu_s(driver.pids()), time.monotonic()
-        await driver.follow(path)
-        after, passed_s = read_cpu_s(driver.pids()), time.monotonic() - begin_s
-        self.cores = {
-            name: (used_s - before[name]) / passed_s
-            for name, used_s in after.items()
-            if name in before
-        }
-
-
 def read_cpu_s(pids: Mapping[str, int]) -> dict[str, float]:
     """Return the processor time (s) of each process, including its ended child processes.
 
-    pids: process id of each node. Nodes that share a process have one entry, whose key is their
-    names joined by "+".
+    Nodes that share a process have one entry. Its key contains their names, joined by "+".
+
+    pids: process id of each node.
     """
     names: dict[int, list[str]] = {}
     for name, pid in pids.items():
@@ -76,18 +58,22 @@ def run_system(
 
     A latency is None if the graph does not have the corresponding output.
     """
-    used = CpuUse()
+    cores: dict[str, float] = {}
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         progress(f"stroke for {seconds:g} s")
-        await used.measure(driver, make_stroke(scene, seconds))
+        before, start_s = read_cpu_s(driver.pids()), time.monotonic()
+        await driver.follow(make_stroke(scene, seconds))
+        after, passed_s = read_cpu_s(driver.pids()), time.monotonic() - start_s
+        for name in before.keys() & after.keys():
+            cores[name] = (after[name] - before[name]) / passed_s
 
     run_experiment(launch_file, settings, bag, procedure, progress)
     begin_ns, end_ns = read_window_ns(bag)
     to_arm_s, to_light_s = read_delays_s(bag, begin_ns + round(1e9 * APPROACH_S), end_ns)
     return {
-        "cpu_cores": sum(used.cores.values()),
-        "cpu_cores_by_node": used.cores,
+        "cpu_cores": sum(cores.values()),
+        "cpu_cores_by_node": dict(sorted(cores.items())),
         "exposure_to_arm_ms": summarize_latency(to_arm_s),
         "exposure_to_light_ms": summarize_latency(to_light_s),
     }
@@ -137,8 +123,7 @@ def read_delays_s(bag: Path, begin_ns: int, end_ns: int) -> tuple[Floats, Floats
     """Return the delays (s) from exposures to arm commands, and from exposures to displayed images.
 
     Only exposures between `begin_ns` and `end_ns`, and only the first effect of an exposure, are
-    used. If the projector is slower than the renderer assumes, the difference is added to the
-    display time.
+    used. The display time is corrected by the true latency of the projector.
     """
     to_arm: dict[tuple[str, int], float] = {}
     to_light: dict[int, float] = {}

@@ -93,7 +93,7 @@ def run_stroke_trial(trial: Mapping[str, Any]) -> Row:
 def run_robustness_trial(trial: Mapping[str, Any]) -> Row:
     """Return the errors of the system with a random apparatus.
 
-    The errors of the sheet are measured in motion, the errors of image and force at rest.
+    The errors of the sheet are measured in motion, and the errors of image and force at rest.
     """
     if trial.get("commission_folder"):
         return _run_commissioned_trial(trial)
@@ -176,10 +176,10 @@ def _run_commissioned_trial(trial: Mapping[str, Any]) -> Row:
 
 
 def run_sensitivity_trial(trial: Mapping[str, Any]) -> Row:
-    """Return the error changes due to deviations of one apparatus parameter, without a graph.
+    """Return the error changes by deviations of one apparatus parameter, without a graph.
 
-    If the trial has `stroke_seeds`, the errors are those of strokes in simulated time. Otherwise
-    they are those of the sheet at rest.
+    The errors are measured in strokes in simulated time if the trial has `stroke_seeds`, and at
+    rest otherwise.
     """
     plan = load_graph(Path(trial["launch_file"]), settings=trial["settings"])
     scene, calibrations = require_scene(plan), NodeCalibrations.of(plan)

@@ -1,22 +1,18 @@
 """Compute the true poses of the sheet's edges for the poses that the nodes command.
 
-The module uses the kinematics of the simulated arms, which share no code with the nodes'
-kinematics.
+The module uses the kinematics of the simulated arms. They share no code with the nodes' kinematics.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Self
-
 import numpy as np
 
 from flexsheet.messages.apparatus import Apparatus
-from flexsheet.messages.scene import ArmSpec, Scene
+from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
+from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.models.sheet.tension import edge_force_n
-from flexsheet.nodes.twin.arms import ArmMechanics
+from flexsheet.nodes.twin.arms import PlacedArm
 from flexsheet.nodes.twin.sheet_pull import SheetPull
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -31,40 +27,14 @@ def place_edges(world_from_sheet: Floats, distance_m: float) -> tuple[Floats, Fl
     return transform(rotation, centre - half), transform(rotation, centre + half)
 
 
-@dataclass(frozen=True, slots=True)
-class ArmModel:
-    """The geometry of one arm: its kinematics, and the poses (4, 4) of its base and its clamped
-    edge."""
-
-    mechanics: ArmMechanics
-    world_from_base: Floats
-    flange_from_edge: Floats
-
-    @classmethod
-    def of(cls, arm: ArmSpec) -> Self:
-        return cls(
-            ArmMechanics(arm.model),
-            pose_matrix(arm.world_from_base),
-            pose_matrix(arm.flange_from_edge),
-        )
-
-    def solve_joints(self, world_from_edge: Floats, guess_rad: Floats) -> Floats:
-        """Return the joint angles (6,), in rad, for a pose (4, 4) of the edge.
-
-        guess_rad: initial joint angles. Raises ValueError if the pose is out of reach.
-        """
-        flange = inverse(self.world_from_base) @ world_from_edge @ inverse(self.flange_from_edge)
-        return self.mechanics.solve_inverse_kinematics(flange, guess_rad)
-
-
 class ArmPair:
     """A pair of arms, with the geometry that the scene assumes and the true geometry."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus) -> None:
         true_scene = apply_apparatus(scene, apparatus)
         specs, true_specs = scene.arms, true_scene.arms
-        self._believed = ArmModel.of(specs.left), ArmModel.of(specs.right)
-        self._true = ArmModel.of(true_specs.left), ArmModel.of(true_specs.right)
+        self._believed = PlacedArm.of(specs.left), PlacedArm.of(specs.right)
+        self._true = PlacedArm.of(true_specs.left), PlacedArm.of(true_specs.right)
         self._specs, self._sheet = (specs.left, specs.right), scene.sheet
         self._offsets_rad = (
             np.array(apparatus.arms.left.joint_offsets_rad),
@@ -98,9 +68,10 @@ class ArmPair:
     ) -> tuple[Floats, Floats]:
         """Return the true poses (4, 4) of the edges at rest.
 
-        edges: commanded poses (4, 4). The tension of the true sheet displaces the true flanges.
-        Servo lag is not included. play_rad: position of each joint (6,) of both arms within its
-        backlash.
+        The tension of the true sheet displaces the true flanges. Servo lag is not included.
+
+        edges: commanded poses (4, 4).
+        play_rad: position of each joint (6,) of both arms within its backlash.
         """
         commanded = self.solve_joints(edges)
         flanges = []
@@ -108,8 +79,7 @@ class ArmPair:
             true_rad = joints_rad + self._offsets_rad[side]
             if play_rad is not None:
                 true_rad = true_rad + play_rad[side]
-            true = self._true[side]
-            flanges.append(true.world_from_base @ true.mechanics.forward(true_rad))
+            flanges.append(self._true[side].world_from_flange(true_rad))
         left, right = flanges
         clamps = [arm.flange_from_edge for arm in self._true]
         if self._pull is not None:

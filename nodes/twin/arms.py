@@ -1,8 +1,7 @@
-"""Simulate the arms, manipulators with six joints and servo lag, which receive commands over Modbus
-TCP.
+"""Simulate arms with six joints and servo lag that receive commands over Modbus TCP.
 
 This module was written from `docs/modbus.md` and the dimensions of the arms only. It shares no code
-with the bridge (the node that sends commands to an arm), because it serves to test the bridge. The
+with the bridge (the node that sends commands to an arm), because it is used to test the bridge. The
 forward kinematics is a product of exponentials (Brockett 1984; Lynch and Park, Modern Robotics, ch.
 4). The inverse kinematics applies a Gauss-Newton method to this product.
 """
@@ -19,7 +18,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import accumulate
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from pymodbus.constants import ExcCodes
@@ -27,9 +26,9 @@ from pymodbus.exceptions import NoSuchIdException
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from flexsheet.messages.scene import RV_1A, ClosedFormArm, JointChain
+from flexsheet.messages.scene import RV_1A, ArmSpec, ClosedFormArm, JointChain
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import pose_matrix
+from flexsheet.nodes.models.rigid import inverse, pose_matrix
 
 Fault = Literal[
     "none",
@@ -61,6 +60,8 @@ LATE_S = 0.05
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 CONTROLLER_CYCLE_S = 0.0071
+MAX_STEP_RAD = 0.15
+"""The maximum change of a joint angle between two set-points that the controller accepts, rad."""
 
 JITTER_STREAM = 1
 """The second element of the random seed for the jitter of controller cycles. It makes the jitter
@@ -95,7 +96,7 @@ def _skew(axis: Floats) -> Floats:
 
 
 class ArmMechanics:
-    """The geometry and limits of a simulated arm, taken from the arm's model in the scene.
+    """The kinematics and limits of a simulated arm.
 
     range_rad: lower and upper ends of the joints' ranges (6, 2).
     speed_rad_per_s, acceleration_rad_per_s2: maximum speeds and accelerations of the joints (6,).
@@ -127,9 +128,9 @@ class ArmMechanics:
         return bool(((joints_rad >= low) & (joints_rad <= high)).all())
 
     def forward(self, joints_rad: Floats) -> Floats:
-        """Compute the forward kinematics: base_from_flange (4, 4) for joint angles (6,), rad.
+        """Return the flange pose base_from_flange (4, 4) for joint angles (6,), rad.
 
-        The pose is exp(S1 q1) ... exp(S6 q6) M, with the screw axes S, joint angles q, and the
+        The pose is exp(S1 q1) ... exp(S6 q6) M, with the screw axes S, the joint angles q, and the
         flange pose M at joint angles of zero.
         """
         turns = self._rotations(joints_rad)
@@ -137,17 +138,14 @@ class ArmMechanics:
         return np.asarray(one @ two @ three @ self._home)
 
     def _rotations(self, joints_rad: Floats) -> Floats:
-        """Return the matrices exp(S q) (6, 4, 4) for the screw axes S and the joint angles q (6,),
-        rad.
-        """
+        """Return the matrices exp(S q) (6, 4, 4) for screw axes S and joint angles q (6,), rad."""
         angles = joints_rad[:, None, None]
         return np.asarray(
             np.eye(4) + np.sin(angles) * self._cross + (1.0 - np.cos(angles)) * self._square
         )
 
     def solve_inverse_kinematics(self, base_from_flange: Floats, guess_rad: Floats) -> Floats:
-        """Return joint angles (6,), rad, within their ranges, at which the flange has a pose (4,
-        4).
+        """Return joint angles (6,), rad, within their ranges for a flange pose (4, 4).
 
         A damped Gauss-Newton method starts at `guess_rad` (6,). Raises ValueError unless the pose
         error decreases to a micrometre and a microradian.
@@ -175,9 +173,7 @@ class ArmMechanics:
 
 
 def _pose_error(wanted: Floats, present: Floats) -> Floats:
-    """Return the translation (m) and the small rotation (rad) from pose `present` to pose `wanted`,
-    as (6,).
-    """
+    """Return the small motion (6,) from one pose to another: translation, m, and rotation, rad."""
     turn = wanted[:3, :3] @ present[:3, :3].T
     spin = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -187,6 +183,35 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 RV_1A_MECHANICS = ArmMechanics(RV_1A)
 """The mechanics of the Mitsubishi RV-1A, the default arm of a scene."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedArm:
+    """An arm with the poses (4, 4) of its base and of its clamped edge of the sheet."""
+
+    mechanics: ArmMechanics
+    world_from_base: Floats
+    flange_from_edge: Floats
+
+    @classmethod
+    def of(cls, arm: ArmSpec) -> Self:
+        return cls(
+            ArmMechanics(arm.model),
+            pose_matrix(arm.world_from_base),
+            pose_matrix(arm.flange_from_edge),
+        )
+
+    def world_from_flange(self, joints_rad: Floats) -> Floats:
+        """Return the pose (4, 4) of the flange for joint angles (6,), rad."""
+        return self.world_from_base @ self.mechanics.forward(joints_rad)
+
+    def solve_joints(self, world_from_edge: Floats, guess_rad: Floats) -> Floats:
+        """Return the joint angles (6,), rad, for a pose (4, 4) of the edge.
+
+        guess_rad: initial joint angles (6,). Raises ValueError if the pose is out of reach.
+        """
+        flange = inverse(self.world_from_base) @ world_from_edge @ inverse(self.flange_from_edge)
+        return self.mechanics.solve_inverse_kinematics(flange, guess_rad)
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
@@ -254,19 +279,19 @@ class Servo:
 
 
 class Controller:
-    """A simulated controller of one arm, which checks command blocks and answers with its status.
+    """A simulated controller of one arm that checks command blocks and answers with its status.
 
-    The controller answers a command with an invalid magic number, version, CRC, mode or sequence
-    number by a Modbus exception. Four faults make it brake and stop: joint angles out of range,
-    joint angles not finite, a jump of the set-point, and no command for `watchdog_s` while moving.
-    A command with the mode `idle` clears a fault and may restart the sequence numbers.
+    The controller refuses a command with an invalid magic number, version, CRC, mode or sequence
+        number by a Modbus exception. Four faults make the arm brake: joint angles out of range,
+        joint angles that are not finite, a jump of the set-point, and no command for `watchdog_s`
+        while moving. A command with the mode `idle` clears a fault and may restart the sequence
+        numbers.
 
-    noise_rad: standard deviation of the measured joints.
-    cycle_s: duration of a controller cycle. A set-point takes effect when the next cycle begins.
-        With 0, set-points take effect immediately.
-    cycle_jitter_s: standard deviation of the time at which a cycle begins.
-    latency_s: time from the arrival of a set-point until the controller has processed it. Then it
-        takes effect in the next cycle.
+    noise_rad: standard deviation of the measured joint angles.
+    cycle_s: period of the controller. A set-point takes effect when the next cycle begins. With 0,
+        set-points take effect immediately.
+    cycle_jitter_s: standard deviation of the start of a cycle.
+    latency_s: time from the arrival of a set-point until it is ready for the next cycle.
     """
 
     def __init__(
@@ -280,7 +305,6 @@ class Controller:
         cycle_s: float = 0.0,
         cycle_jitter_s: float = 0.0,
         latency_s: float = 0.0,
-        max_step_rad: float = 0.15,
         mechanics: ArmMechanics = RV_1A_MECHANICS,
         seed: int = 0,
     ) -> None:
@@ -302,14 +326,11 @@ class Controller:
         self._cycle_s = cycle_s
         self._cycle_jitter_s, self._latency_s = cycle_jitter_s, latency_s
         self._jitter = np.random.default_rng((seed, JITTER_STREAM))
-        self._max_step_rad = max_step_rad
         self._noise_rad = noise_rad
         self._random = np.random.default_rng(seed)
 
     def advance(self, duration_s: float) -> None:
-        """Simulate the motion for `duration_s`; enter the fault state if no command has arrived in
-        time.
-        """
+        """Simulate the motion for `duration_s`; brake if no command has arrived in time."""
         end_s = self._time_s + duration_s
         while self._pending and self._pending[0][0] <= end_s:
             due_s, wanted_rad = self._pending.popleft()
@@ -325,9 +346,7 @@ class Controller:
             self.servo.advance(self._acting_rad, duration_s, braking=self.state != STATE_MOVING)
 
     def receive_command(self, registers: list[int]) -> bool:
-        """Check and execute a command, which is given as 16-bit registers; return False if it is
-        invalid.
-        """
+        """Check and execute a command in 16-bit registers; return False if it is invalid."""
         block = struct.pack(f">{len(registers)}H", *registers)
         if len(block) != _COMMAND.size:
             return self._refuse()
@@ -358,7 +377,7 @@ class Controller:
             self._fail(FAULT_FINITE)
         elif not self.servo.mechanics.is_in_range(joints):
             self._fail(FAULT_RANGE)
-        elif np.abs(joints - before).max() > self._max_step_rad:
+        elif np.abs(joints - before).max() > MAX_STEP_RAD:
             self._fail(FAULT_STEP)
         else:
             if self.state != STATE_MOVING:
@@ -408,7 +427,7 @@ class Controller:
 
 
 class ArmServer:
-    """A Modbus TCP server through which clients send commands to a simulated controller."""
+    """A Modbus TCP server that passes commands from clients to a simulated controller."""
 
     def __init__(
         self, controller: Controller, *, host: str, port: int, before: Callable[[], None]
@@ -438,10 +457,7 @@ class ArmServer:
 
     @property
     def port(self) -> int:
-        """Return the number of the port on which the server listens.
-
-        If port 0 was requested, this is the port that the operating system chose.
-        """
+        """Return the network port of the server; for port 0, the system chooses a free port."""
         listener: Any = None if self._server is None else self._server.transport
         if listener is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")

@@ -15,11 +15,11 @@ from pydantic import AfterValidator, Field
 
 from flexsheet.messages.apparatus import ArmTruth, nominal_apparatus
 from flexsheet.messages.base import Header
-from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
+from flexsheet.messages.scene import NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import inverse, pose_matrix, transform
+from flexsheet.nodes.models.rigid import transform
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
 from flexsheet.nodes.twin.arms import (
@@ -28,6 +28,7 @@ from flexsheet.nodes.twin.arms import (
     ArmServer,
     Controller,
     Fault,
+    PlacedArm,
     check_loopback,
 )
 from flexsheet.nodes.twin.mxt_controller import FILTER_S, MxtController, MxtServer
@@ -78,11 +79,10 @@ class TwinArmsParameters(SimulatorParameters):
 
 
 def open_joints_file(path: str | None) -> dict[str, Floats]:
-    """Open the file that preserves the joint angles (rad) of both arms after the end of the
-    process.
+    """Map a file that stores the joint angles (rad) of both arms to arrays.
 
-    The returned arrays (6,), by side, are mapped to the file. They contain NaN if the file is new
-    or `path` is None. Raises OSError if the file cannot be opened.
+    Return one array (6,) per side. The arrays contain NaN if the file is new or `path` is None.
+    Raises OSError if the file cannot be opened.
     """
     if path is None:
         rows = np.full((2, 6), np.nan)
@@ -113,9 +113,7 @@ def joint_torques_nm(
 
 
 class TwinArmsNode(Node):
-    """A node that simulates both arms and the sheet between them. The arms start when the first
-    scene arrives.
-    """
+    """A node that simulates both arms and the sheet between them, from the first scene onwards."""
 
     role: ClassVar[NodeRole | None] = NodeRole.ARM_SIMULATOR
     opens_devices: ClassVar[bool] = True
@@ -130,9 +128,7 @@ class TwinArmsNode(Node):
 
     async def setup(self) -> None:
         self.servers: dict[str, ArmServer | MxtServer] = {}
-        self._mechanics: dict[str, ArmMechanics] = {}
-        self._world_from_base: dict[str, Floats] = {}
-        self._flange_from_edge: dict[str, Floats] = {}
+        self._placed: dict[str, PlacedArm] = {}
         self._pull: SheetPull | None = None
         self._moved_ns: dict[str, int] = {}
         self._started_ns = 0
@@ -147,23 +143,19 @@ class TwinArmsNode(Node):
         self._arms = truth.arms
         scene = apply_apparatus(scene, truth)
         arms = {"left": scene.arms.left, "right": scene.arms.right}
-        for side, spec in arms.items():
-            base, clamp = spec.world_from_base, spec.flange_from_edge
-            self._mechanics[side] = ArmMechanics(spec.model)
-            self._world_from_base[side] = pose_matrix(base)
-            self._flange_from_edge[side] = pose_matrix(clamp)
+        self._placed = {side: PlacedArm.of(spec) for side, spec in arms.items()}
         self._pull = SheetPull.of(scene.sheet, truth)
         if len(self.servers) == len(arms):
             return
         self._started_ns = self.clock.now_ns()
-        for number, (side, spec) in enumerate(arms.items()):
+        for number, side in enumerate(arms):
             if side in self.servers:
                 continue
             port = self.parameters.left_port if side == "left" else self.parameters.right_port
             self._moved_ns[side] = self._started_ns
             joints_rad = self._stored_joints[side]
-            if not self._mechanics[side].is_in_range(joints_rad):
-                joints_rad = self._start_joints(side, spec, scene)
+            if not self._placed[side].mechanics.is_in_range(joints_rad):
+                joints_rad = self._start_joints(side, scene)
             server = self._server(side, joints_rad, port, number)
             await server.start()
             self.servers[side] = server
@@ -186,7 +178,7 @@ class TwinArmsNode(Node):
                 cycle_s=CONTROLLER_CYCLE_S if period_s is None else period_s,
                 cycle_jitter_s=truth.controller_jitter_s,
                 latency_s=truth.command_latency_s,
-                mechanics=self._mechanics[side],
+                mechanics=self._placed[side].mechanics,
                 seed=seed,
             )
             return MxtServer(mxt, host=given.host, port=port, before=before)
@@ -199,7 +191,7 @@ class TwinArmsNode(Node):
             cycle_s=given.cycle_s if period_s is None else period_s,
             cycle_jitter_s=truth.controller_jitter_s,
             latency_s=truth.command_latency_s,
-            mechanics=self._mechanics[side],
+            mechanics=self._placed[side].mechanics,
             seed=seed,
         )
         return ArmServer(controller, host=given.host, port=port, before=before)
@@ -215,19 +207,15 @@ class TwinArmsNode(Node):
         offsets_rad = self._truth(side).joint_offsets_rad
         return motor_rad + np.array(offsets_rad) if any(offsets_rad) else motor_rad
 
-    def _start_joints(self, side: str, spec: ArmSpec, scene: Scene) -> Floats:
+    def _start_joints(self, side: str, scene: Scene) -> Floats:
         """Return the encoder angles (6,), rad, at which an arm starts.
 
-        At these angles the arm holds the sheet in the screen plane (z = 0), with the scene's
-        minimum stretch.
+        There, the sheet lies in the screen plane (z = 0) with the scene's minimum stretch.
         """
         half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
         edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
-        flange = edge @ inverse(pose_matrix(spec.flange_from_edge))
-        mechanics = self._mechanics[side]
-        joints_rad = mechanics.solve_inverse_kinematics(
-            inverse(self._world_from_base[side]) @ flange, mechanics.start_rad
-        )
+        arm = self._placed[side]
+        joints_rad = arm.solve_joints(edge, arm.mechanics.start_rad)
         return np.asarray(joints_rad - np.array(self._truth(side).joint_offsets_rad))
 
     def _advance(self, side: str) -> None:
@@ -240,8 +228,7 @@ class TwinArmsNode(Node):
             self._stored_joints[side][:] = controller.servo.joints_rad
 
     def _load_motors(self, joints: dict[str, Floats], left: Floats, right: Floats) -> None:
-        """Compute the joint torques that the sheet's tension causes, and store them in the
-        controllers.
+        """Set the joint torques that the sheet's tension causes in the controllers.
 
         Only controllers with the protocol MXT report torques.
         """
@@ -253,9 +240,10 @@ class TwinArmsNode(Node):
         for side, sign in (("left", 1.0), ("right", -1.0)):
             controller = self.servers[side].controller
             if isinstance(controller, MxtController):
-                force_n = sign * self._world_from_base[side][:3, :3].T @ pull_n
+                arm = self._placed[side]
+                force_n = sign * arm.world_from_base[:3, :3].T @ pull_n
                 controller.load_nm = joint_torques_nm(
-                    self._mechanics[side], joints[side], self._flange_from_edge[side], force_n
+                    arm.mechanics, joints[side], arm.flange_from_edge, force_n
                 )
 
     @periodic("rate_hz")
@@ -272,20 +260,13 @@ class TwinArmsNode(Node):
             side: self._true_joints(side, server.controller.servo.driven_rad)
             for side, server in self.servers.items()
         }
-        left, right = (
-            self._world_from_base[side] @ self._mechanics[side].forward(joints[side])
-            for side in joints
-        )
+        left, right = (self._placed[side].world_from_flange(joints[side]) for side in joints)
         if self._pull is not None:
-            clamps = self._flange_from_edge
+            clamps = [self._placed[side].flange_from_edge for side in ("left", "right")]
             left, right = self._pull.displace(
-                left,
-                right,
-                clamps["left"],
-                clamps["right"],
-                time_s=self.clock.now_ns() * 1e-9,
+                left, right, *clamps, time_s=self.clock.now_ns() * 1e-9
             )
-            self._load_motors(joints, left @ clamps["left"], right @ clamps["right"])
+            self._load_motors(joints, left @ clamps[0], right @ clamps[1])
         self.twin__arms.publish(
             TwinArms(
                 joints_left_rad=joints["left"],

@@ -1,7 +1,7 @@
 """Render images of a calibration board for the simulated stereo camera, and choose its poses.
 
 The rays of each pixel are intersected with the plane of the board. Edges of squares are antialiased
-over the width of one ray, so that corners are accurate to a few thousandths of a pixel.
+over the width of one ray. Therefore corners are accurate to a few thousandths of a pixel.
 """
 
 from __future__ import annotations
@@ -126,9 +126,7 @@ class TwinBoard:
         return seen
 
     def pair(self, left_from_board: Floats) -> tuple[Image, Image]:
-        """Render the left and the right image of the board at the pose `left_from_board` (4, 4),
-        with noise.
-        """
+        """Render the left and right image, with noise, of the board at a pose (4, 4)."""
         left, right = self.levels(left_from_board)
         return self._exposed(left), self._exposed(right)
 
@@ -137,9 +135,7 @@ class TwinBoard:
         return quantize(levels + self.sensor.noise(levels) * noise)
 
     def levels(self, left_from_board: Floats) -> tuple[Singles, Singles]:
-        """Render both images (height, width) of the board at a pose (4, 4), without noise and
-        rounding.
-        """
+        """Render both images (height, width) of the board at a pose (4, 4), without noise."""
         self._views(left_from_board, self._outline())
         light = self._light()
         left, right = (
@@ -232,11 +228,11 @@ class TwinBoard:
         return self.board.marker_m / self.board.square_m
 
     def poses(self, count: int) -> list[Floats]:
-        """Return poses `left_from_board` (4, 4) of the board that are suitable for a calibration.
+        """Return `count` poses left_from_board (4, 4) that are suitable for a calibration.
 
-        The poses cover the centre, corners and edges of the image at several distances, with tilts
-        in all directions. Each pose has the maximum distance from the image centre at which both
-        images show the whole board (most of a ChArUco board).
+        The board appears at the centre, corners and edges of the image, at several distances, with
+        tilts in all directions. It is as far from the image centre as possible while both images
+        show the whole board (most of a ChArUco board).
         """
         board = self.board
         board_centre = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
@@ -262,8 +258,8 @@ class TwinBoard:
     ) -> Floats:
         """Return the pose left_from_board (4, 4) of a rotated board near the edge of the image.
 
-        The board is moved in `direction` from the image centre as far as it remains visible. A
-        board that is too large at the distance `depth_m` is moved farther away.
+        The board is moved in `direction` from the image centre as far as possible while it remains
+        visible. A board that is too large at the distance `depth_m` is moved farther away.
         """
         between_m = -0.5 * float(self.camera.right_from_left[0, 3])
         half = 0.5 * np.array([self.camera.width_px, self.camera.height_px])

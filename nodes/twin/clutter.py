@@ -1,8 +1,7 @@
-"""Describe clutter, which consists of objects in the camera images that interfere with fingertip
-tracking.
+"""Describe clutter: objects in the camera images that interfere with fingertip tracking.
 
 Positions are in m. The module `pixels` renders the objects. The path of an object is in the world
-frame, or relative to the fingertip if its attribute `carried` is true. The attribute `views` names
+frame, or relative to the fingertip if the attribute `carried` is true. The attribute `views` names
 the cameras that see the object. Levels are grey levels (0 to 255) at normal exposure. The marker on
 the fingertip has a level of about 215.
 """
@@ -30,9 +29,7 @@ class Trajectory(Protocol):
     """The interface of a position as a function of simulation time."""
 
     def at(self, time_s: float) -> Floats:
-        """Return the position (3,), m, at a time, in the world frame or relative to the
-        fingertip.
-        """
+        """Return the position (3,), m, in the world frame or relative to the fingertip."""
         ...
 
 
@@ -44,17 +41,6 @@ class FixedPoint:
 
     def at(self, time_s: float) -> Floats:
         return np.array(self.point)
-
-
-@dataclass(frozen=True, slots=True)
-class Moving:
-    """A trajectory of constant velocity that starts at the point `start` at time 0."""
-
-    start: Point
-    velocity_m_per_s: Point
-
-    def at(self, time_s: float) -> Floats:
-        return np.array(self.start) + time_s * np.array(self.velocity_m_per_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +59,7 @@ class Oscillation:
 
 @dataclass(frozen=True, slots=True)
 class Capsule:
-    """A part of the hand. It is a tapered capsule (rounded cone) between two points, and is drawn
-    behind the finger.
-    """
+    """A part of the hand, drawn behind the finger as a tapered capsule (rounded cone)."""
 
     start: Trajectory
     end: Trajectory
@@ -98,7 +82,7 @@ class SecondMarker:
 
 @dataclass(frozen=True, slots=True)
 class Highlight:
-    """A reflection of a lamp, which is a small spot whose light is added to the background.
+    """A small reflection of a lamp. Its light is added to the background.
 
     The image saturates above the grey level 255. A reflection on a curved surface often appears in
     only one of the two images.
@@ -113,9 +97,7 @@ class Highlight:
 
 @dataclass(frozen=True, slots=True)
 class Occluder:
-    """A capsule of constant grey level that hides everything behind it. It represents, for example,
-    a cable.
-    """
+    """A capsule of constant grey level, such as a cable, in front of all other objects."""
 
     start: Trajectory
     end: Trajectory
@@ -142,7 +124,7 @@ class Sheet:
 
 @dataclass(frozen=True, slots=True)
 class Clutter:
-    """A set of cluttering objects, in the order in which they are drawn.
+    """A set of cluttering objects. They are drawn in the order of the fields.
 
     The finger with its marker is drawn after `limbs`.
     """
@@ -155,28 +137,26 @@ class Clutter:
 
 
 def second_marker(offset_m: Point) -> Clutter:
-    """Make clutter that consists of a second marker at a fixed offset (3,), m, from the
-    fingertip.
-    """
+    """Return clutter that consists of a second marker at an offset (3,), m, from the fingertip."""
     return Clutter(markers=(SecondMarker(FixedPoint(offset_m), carried=True),))
 
 
-def touching_highlight(overlap: float, *, radius_m: float = 0.0015) -> Clutter:
-    """Make clutter that consists of a reflection beside the marker (+x).
+def touching_highlight(overlap: float) -> Clutter:
+    """Return clutter that consists of a reflection beside the marker (+x).
 
     overlap: fraction of the marker's diameter that the reflection covers.
     """
+    radius_m = 0.0015
     aside_m = MARKER_RADIUS_M + radius_m - overlap * 2.0 * MARKER_RADIUS_M
     spot = Highlight(FixedPoint((aside_m, 0.0, 0.0)), radius_m, 300.0, carried=True)
     return Clutter(highlights=(spot,))
 
 
 def covered(share: float, *, views: Views = "both") -> Clutter:
-    """Make clutter with an occluder whose straight edge hides the fraction `share` (0 to 1) of the
-    marker.
+    """Return clutter that consists of an occluder with a straight edge across the marker.
 
-    The occluder covers the marker from the side +x. With `share` = 1, it also hides the blurred
-    edge of the marker. views: cameras from which the marker is hidden.
+    share: hidden fraction (0 to 1) of the marker, from the side +x. With 1, the blurred edge of the
+    marker is also hidden. views: cameras in which the marker is hidden.
     """
     radius_m = 0.05
     if share >= 1.0:

@@ -1,10 +1,9 @@
-"""Measure the image error at each point of the object, with position codes that are drawn on the
-object.
+"""Measure the image error at each point of the object by drawn position codes.
 
-In the patterns `coordinate_ramp_x` and `coordinate_ramp_y`, the colour of each point encodes a
-coordinate. It is the x or y at which the eye should see this point on the imaginary screen (z = 0).
-Red and green are the cosine and the sine of a phase. Blue encodes the coarse position. The image
-error is the position at which the eye sees a point minus the position that its colour encodes.
+In the patterns `coordinate_ramp_x` and `coordinate_ramp_y`, the colour of each point encodes the x
+or y at which the eye should see the point on the imaginary screen (z = 0). Red and green are the
+cosine and the sine of a phase. Blue encodes the coarse position. The image error is the position at
+which the eye sees a point minus the encoded position.
 """
 
 from __future__ import annotations
@@ -54,10 +53,10 @@ class ErrorMap:
 
 
 def error_map(coordinate_ramp_x: Image, coordinate_ramp_y: Image, metres_per_px: float) -> ErrorMap:
-    """Measure the image errors from the eye's images of both patterns.
+    """Measure the image errors from the eye's images of both position codes.
 
-    coordinate_ramp_x, coordinate_ramp_y: images (rows, columns, 3). metres_per_px: pixel size on
-    the imaginary screen.
+    coordinate_ramp_x, coordinate_ramp_y: images (rows, columns, 3).
+    metres_per_px: pixel size on the imaginary screen.
     """
     seen = _lit(coordinate_ramp_x) & _lit(coordinate_ramp_y)
     kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)

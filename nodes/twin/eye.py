@@ -1,20 +1,18 @@
 """Render by ray tracing what the user's eye sees on the simulated sheet, to verify the display.
 
-A virtual measuring camera is placed at the eye. It views a square window about the origin of the
-screen plane (z = 0). Each ray is intersected with the triangles of the sheet, and gets the colour
-that the projector casts on that point. The expected image, which shows the virtual object itself,
-is rendered in the same way. Sizes are then measured in both images as in Furukawa et al. 2007 ("the
-paper" below).
+A virtual camera is placed at the eye. It views a square window about the origin of the screen plane
+(z = 0). Each ray is intersected with the triangles of the sheet, and gets the colour that the
+projector casts on this point. The expected image shows the virtual object itself and is rendered in
+the same way. Sizes are measured in both images as in Furukawa et al. 2007 ("the paper" below).
 
-"True" refers to the simulated devices, which may differ from those that the nodes assume. The
-module shares no code with the renderer, so that it can reveal errors of the renderer.
+"True" refers to the simulated devices. They may differ from the devices that the nodes assume. The
+module shares no code with the renderer, because it is used to test the renderer.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
 
 import cv2
 import numpy as np
@@ -23,13 +21,13 @@ from numpy.typing import NDArray
 from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Projector, Scene, require_projector
-from flexsheet.messages.types import Display, Skin, SoftBody, TwinArms, TwinFinger
+from flexsheet.messages.types import Skin, TwinArms
 from flexsheet.nodes.arrays import Bools, Floats, Image
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix
 from flexsheet.nodes.twin import rig
-from flexsheet.nodes.twin.membrane import DeformedSheet, TrueRubber, solve
+from flexsheet.nodes.twin.membrane import DeformedSheet
 from flexsheet.nodes.twin.rig import slopes_of
-from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
+from flexsheet.nodes.twin.sheet_pull import find_clamps, solve_sheet
 from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
 
 Indices = NDArray[np.intp]
@@ -47,8 +45,10 @@ FLAT_SAMPLES, SOFT_SAMPLES = 8, 4
 Flat-shaded images need more samples, because sizes are measured at their outlines."""
 
 SHADOW_TOLERANCE = 0.002
-"""The minimum relative distance of a point behind the first surface on a projector ray at which the
-point is in shadow."""
+"""The minimum distance of a shadowed point behind the first surface on its projector ray.
+
+The distance is relative to the distance of the point from the projector.
+"""
 
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 AMBIENT, WRAP, SHEEN, SHEEN_EXPONENT = 0.25, 0.35, 0.10, 20.0
@@ -78,7 +78,7 @@ class Rays:
     height: int
 
     def directions(self) -> Floats:
-        """Return the directions (height, width, 3) of all rays, which are not unit vectors."""
+        """Return the directions (height, width, 3) of all rays; they are not unit vectors."""
         columns, rows = np.arange(self.width), np.arange(self.height)
         return self.first + columns[None, :, None] * self.right + rows[:, None, None] * self.down
 
@@ -89,8 +89,8 @@ class Hits:
 
     triangle (height, width): index of the triangle that the ray hits; -1 if it hits none.
     inverse_range (height, width): reciprocal of the ray parameter at the hit; 0 if there is no hit.
-    weights (triangles, 3, 3): matrices that map (1, column, row) to barycentric weights, which are
-        not normalized.
+    weights (triangles, 3, 3): matrices that map (1, column, row) to unnormalized barycentric
+        weights.
     """
 
     triangle: NDArray[np.int32]
@@ -101,7 +101,8 @@ class Hits:
 def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
     """Find the first triangle that each ray hits.
 
-    vertices (vertices, 3): positions, m. triangles (triangles, 3): indices of vertices.
+    vertices (v, 3): positions, m.
+    triangles (t, 3): indices of vertices.
 
     A direction is written as d = sum of w_i (vertex_i - origin) over the corners of a triangle. The
     ray hits the triangle if all w_i >= 0, at the ray parameter 1 / sum(w). The weights w_i are
@@ -142,17 +143,15 @@ def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
 
 
 class TrueProjector:
-    """A simulated projector, which maps its pixels to the points of the sheet and back."""
+    """A simulated projector that maps its pixels to the points of the sheet and back."""
 
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
         """Compute the rays of a projector that illuminates a sheet.
 
-        vertices (vertices, 3): vertices of the sheet, world frame, m. triangles (triangles, 3):
-        indices.
+        vertices (v, 3): vertices of the sheet, world frame, m. triangles (t, 3): vertex indices.
         """
-        pose, lens = projector.world_from_projector, projector.lens
-        self._world_from_projector = pose_matrix(pose)
-        self._lens = lens
+        self._world_from_projector = pose_matrix(projector.world_from_projector)
+        self._lens = lens = projector.lens
         self._size = np.array([projector.width_px, projector.height_px])
         # The rays are those of a lens without distortion. A margin contains the pixels that
         # distortion moves out of the undistorted image.
@@ -187,11 +186,9 @@ class TrueProjector:
         return np.asarray(slopes_of(lens, pixels) * focal + centre)
 
     def pixels_of(self, points: Floats) -> tuple[Floats, Bools]:
-        """Return the projector pixels (..., 2) of world points (..., 3), and whether each point is
-        lit.
+        """Return the projector pixels (..., 2) of world points (..., 3), and a mask of lit points.
 
-        A point is not lit if it lies outside the projected image or if another part of the sheet
-        casts a shadow on it.
+        A point is lit if it lies within the projected image and not in the shadow of the sheet.
         """
         local = apply(inverse(self._world_from_projector), points)
         depth = local[..., 2]
@@ -209,10 +206,9 @@ class TrueProjector:
         return pixels, lit
 
     def intersect_surface(self, pixels: Floats) -> tuple[Floats, Bools]:
-        """Return the points (n, 3) of the sheet that pixels (n, 2) illuminate, and their validity
-        (n,).
+        """Return the points (n, 3) of the sheet that pixels (n, 2) illuminate, and a mask (n,).
 
-        A point is not valid if the pixel is outside the image or if its ray misses the sheet.
+        The mask is False if a pixel is outside the image or if its ray misses the sheet.
         """
         inside: Bools = np.all((pixels >= -0.5) & (pixels <= self._size - 0.5), axis=1)
         places = self._straight(np.where(inside[:, None], pixels, 0.0)) + self._margin
@@ -233,10 +229,10 @@ Box = tuple[int, int, int, int]
 
 
 def eye_rays(eye: Floats, *, metres_per_px: float, size: int, box: Box, samples: int) -> Rays:
-    """Make the rays from the eye (3,) through part of the measuring camera's square image.
+    """Return the rays from the eye (3,) through the part `box` of its square image.
 
-    The whole image has `size` x `size` pixels. Each pixel of `box` has `samples` x `samples` rays;
-    the first ray is at the top left.
+    The whole image has `size` x `size` pixels. Each pixel has `samples` x `samples` rays. The first
+    ray is at the top left.
     """
     left, top, right, bottom = box
     pitch = metres_per_px / samples
@@ -260,12 +256,11 @@ def seen(
     eye: Floats,
     metres_per_px: float = METRES_PER_PX,
 ) -> Image:
-    """Render the image (rows, columns, 3) of the sheet that a measuring camera at the eye takes.
+    """Render the image (rows, columns, 3) that a camera at the eye takes of the sheet.
 
-    projected: projected image (height, width, 3), which starts with the top row. eye (3,):
-    position, m.
+    projected: projected image (height, width, 3). eye (3,): position, m.
 
-    The result is black where there is no sheet or where a fold of the sheet blocks the light.
+    The image is black where there is no sheet and where a fold of the sheet blocks the light.
     """
     vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
     projector = TrueProjector(require_projector(scene), vertices, triangles)
@@ -293,9 +288,9 @@ def seen(
 
 
 def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | None:
-    """Return the part of the measuring camera's image that shows world points (n, 3).
+    """Return the part of the eye's image that shows world points (n, 3), with a margin.
 
-    The part includes a margin of MARGIN_PX. Return None if the image shows none of the points.
+    Return None if the image shows none of the points.
     """
     if len(points) == 0:
         return None
@@ -367,8 +362,10 @@ def render_expected(
 def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) -> Floats:
     """Return the colours (n, 3), from 0 to 1, of points on a soft object without a texture.
 
-    colour (3,): colour of the object. normals (n, 3): unit normals. to_eye (n, 3): vectors from the
-    points to the eye. sunk_m (n,): depths by which the points are pushed in, m.
+    colour (3,): colour of the object.
+    normals (n, 3): unit normals.
+    to_eye (n, 3): vectors from the points to the eye.
+    sunk_m (n,): depths to which the points are pushed in, m.
     """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     half = to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True) + LIGHT
@@ -381,9 +378,7 @@ def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) ->
 
 
 class _Silhouette:
-    """The outline of the largest bright region of an image, which is measured along rows and
-    columns.
-    """
+    """The outline of the largest bright region of an image."""
 
     def __init__(self, picture: Image) -> None:
         gray = picture.astype(np.float64).mean(axis=2)
@@ -411,15 +406,11 @@ class _Silhouette:
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Return the first and the last row (px, subpixel) of the object at a column, which need
-        not be an integer.
-        """
+        """Return the first and the last row (px) of the object at a column; all are fractional."""
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:
-        """Return the first and the last column (px, subpixel) of the object at a row, which need
-        not be an integer.
-        """
+        """Return the first and the last column (px) of the object at a row; all are fractional."""
         return self._ends_between(self._gray, row)
 
     def _ends_between(self, lines: Floats, at: float) -> tuple[float, float]:
@@ -433,10 +424,10 @@ class _Silhouette:
 
 
 def _ends(profile: Floats) -> tuple[float, float]:
-    """Return the subpixel positions at which a bright run of a grey-level profile begins and ends.
+    """Return the subpixel positions of both ends of the bright part of a grey-level profile.
 
-    The position of an edge is that of a sharp step with the same total light. This position is
-    exact for any symmetric blur. Raises NotMeasurableError if the run is too short.
+    An edge is located where a sharp step would give the same total light. This position is exact
+    for any symmetric blur. Raises NotMeasurableError if the bright part is too short.
     """
     bright = np.nonzero(profile > 0.5)[0]
     if len(bright) < 12:
@@ -474,7 +465,7 @@ def _height(shape: _Silhouette) -> tuple[float, float]:
 def tilt_sizes(picture: Image, metres_per_px: float) -> tuple[float, float, float]:
     """Measure height, upper width and lower width (m) of a cylinder in a flat-shaded image.
 
-    The method is that of section VI-B of Furukawa et al. 2007. Raises NotMeasurableError if the
+    The method is described in Furukawa et al. 2007, section VI-B. Raises NotMeasurableError if the
     cylinder is cut off, interrupted or missing.
     """
     shape = _Silhouette(picture)
@@ -492,7 +483,7 @@ def tilt_sizes(picture: Image, metres_per_px: float) -> tuple[float, float, floa
 def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
     """Measure height and width (m) of a cylinder at its centre in a flat-shaded image.
 
-    The method is that of section VI-C of Furukawa et al. 2007. Raises NotMeasurableError if the
+    The method is described in Furukawa et al. 2007, section VI-C. Raises NotMeasurableError if the
     cylinder is cut off, interrupted or missing.
     """
     shape = _Silhouette(picture)
@@ -505,94 +496,22 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
 class EyeSituation:
     """The true state of the simulated hardware and of the object while a frame is shown.
 
-    world_from_flange_left, world_from_flange_right: poses (4, 4) of the arms' last links.
+    scene: scene with the true parameters of the devices.
     finger_tip: position (3,) in the world frame, m, or None if there is no finger.
-    skin_vertices, skin_triangles: surface mesh (the skin) of the soft body at rest, (v, 3) and (t,
-        3).
+    skin: surface mesh of the soft body at rest, with v vertices.
     displacement: displacement (v, 3) of the skin, m. Skin and displacement are None if the object
         is not deformed.
     flat: whether the object is shown in one colour, without shading.
     """
 
     scene: Scene
-    rubber: TrueRubber
-    world_from_flange_left: Floats
-    world_from_flange_right: Floats
+    apparatus: Apparatus | None
+    arms: TwinArms
     finger_tip: Floats | None
-    skin_vertices: NDArray[np.float32] | None
-    skin_triangles: NDArray[np.int32] | None
+    skin: Skin | None
     displacement: NDArray[np.float32] | None
     flat: bool
     metres_per_px: float
-    friction_coefficient: float | None = None
-
-    @classmethod
-    def from_messages(
-        cls,
-        scene: Scene,
-        arms: TwinArms,
-        *,
-        finger: TwinFinger | None,
-        body: SoftBody | None,
-        skin: Skin | None,
-        display: Display | None,
-        metres_per_px: float,
-        apparatus: Apparatus | None = None,
-    ) -> Self:
-        """Collect the true state from the latest messages.
-
-        scene: scene with the parameters of the simulated devices. The deformation is ignored unless
-            `body` and `skin` belong to the same mesh.
-        """
-        moved = body if skin is not None and body and body.mesh_id == skin.mesh_id else None
-        shown = skin if moved is not None else None
-        return cls(
-            scene=scene,
-            rubber=true_rubber(scene.sheet, apparatus),
-            world_from_flange_left=arms.world_from_flange_left,
-            world_from_flange_right=arms.world_from_flange_right,
-            finger_tip=None if finger is None else finger.position_world_m,
-            skin_vertices=None if shown is None else shown.vertices_world_m,
-            skin_triangles=None if shown is None else shown.triangles,
-            displacement=None if moved is None else moved.displacement_world_m,
-            flat=display is not None and display.shading == "flat",
-            metres_per_px=metres_per_px,
-            friction_coefficient=true_friction(apparatus),
-        )
-
-
-def true_sheet(
-    scene: Scene,
-    world_from_flange_left: Floats,
-    world_from_flange_right: Floats,
-    finger_tip: Floats | None,
-    *,
-    rubber: TrueRubber,
-    friction_coefficient: float | None = None,
-) -> DeformedSheet:
-    """Compute the shape of the sheet between the true flange poses (4, 4).
-
-    scene: scene with the parameters of the simulated devices.
-    finger_tip: true position (3,) of the fingertip that pushes the sheet, or None.
-
-    Raises NotConvergedError if the membrane has no solution.
-    """
-    arms = scene.arms
-    edges = [
-        world_from_flange @ pose_matrix(spec.flange_from_edge)
-        for world_from_flange, spec in (
-            (world_from_flange_left, arms.left),
-            (world_from_flange_right, arms.right),
-        )
-    ]
-    return solve(
-        rubber,
-        edges[0],
-        edges[1],
-        finger_tip=finger_tip,
-        finger_radius_m=scene.finger.radius_m,
-        friction_coefficient=friction_coefficient,
-    )
 
 
 class EyeCamera:
@@ -612,17 +531,12 @@ class EyeCamera:
         of the sheet's shape fails. Raises ValueError if the object reaches the eye or its
         deformation is invalid.
         """
-        sheet = true_sheet(
-            situation.scene,
-            situation.world_from_flange_left,
-            situation.world_from_flange_right,
-            situation.finger_tip,
-            rubber=situation.rubber,
-            friction_coefficient=situation.friction_coefficient,
-        )
-        scale = situation.metres_per_px
+        scene, arms, scale = situation.scene, situation.arms, situation.metres_per_px
+        left, right = find_clamps(scene)
+        edges = arms.world_from_flange_left @ left, arms.world_from_flange_right @ right
+        sheet = solve_sheet(scene, situation.apparatus, edges, situation.finger_tip)
         return (
-            seen(projected, sheet, situation.scene, eye=eye, metres_per_px=scale),
+            seen(projected, sheet, scene, eye=eye, metres_per_px=scale),
             self._expected_image(situation, eye),
         )
 
@@ -630,14 +544,14 @@ class EyeCamera:
         if self._body is None or self._scene is not situation.scene:
             self._scene, self._body = situation.scene, TrueBody(situation.scene)
             self._expected = None
-        skin, triangles = situation.skin_vertices, situation.skin_triangles
-        moved = situation.displacement
+        skin, moved = situation.skin, situation.displacement
         settings = np.array([*eye, situation.flat, situation.metres_per_px])
         key: tuple[bytes, ...] = (settings.tobytes(),)
         deformation = None
-        if skin is not None and triangles is not None and moved is not None and moved.any():
-            key += (skin.tobytes(), moved.tobytes())
-            deformation = skin.astype(np.float64), triangles, moved.astype(np.float64)
+        if skin is not None and moved is not None and moved.any():
+            vertices = skin.vertices_world_m
+            key += (vertices.tobytes(), moved.tobytes())
+            deformation = vertices.astype(np.float64), skin.triangles, moved.astype(np.float64)
         if self._expected is None or self._expected[0] != key:
             body = self._body
             true_object = body.displaced(*deformation) if deformation else body.at_rest()

@@ -1,4 +1,4 @@
-"""Simulate the user's eye, whose images of projected frames are evaluated in experiments.
+"""Simulate the images at the user's eye, from which experiments compute image errors.
 
 Experiments label the frames that they evaluate. The parameter `apparatus` contains the true
 parameters of the simulated hardware. The scene contains the parameters that the other nodes assume.
@@ -68,17 +68,16 @@ class TwinEyeParameters(SimulatorParameters):
 
 
 class TwinEyeNode(Node):
-    """A node that renders the eye's image of labelled frames, once per label, correction method and
-    eye.
+    """A node that renders the eye's image of labelled frames.
 
-    Only frames that contain the pixels of a single view are rendered. A mono frame is rendered from
-    the viewpoint in the parameters, and a frame for one eye from that eye.
+    An image takes about a second. Therefore the node renders one frame per label, correction method
+    and eye, and ignores further ones. Only frames that contain the pixels of a single view are
+    rendered. A mono frame is rendered from the viewpoint in the parameters, and a frame for one eye
+    from this eye.
 
-    The computation of an image takes about a second. Therefore the node ignores further frames with
-    the same label, and does not count them as lost. The shape of the sheet is that at the time at
-    which the projector shows the frame. This time is a few milliseconds after the frame arrives.
-    The finger position is that of the latest exposure. The deformation is the latest result of the
-    soft-body solver.
+    The sheet has its shape at the time at which the projector shows the frame. This time is a few
+    milliseconds after the frame arrives. The finger position is that of the latest exposure. The
+    deformation is the latest result of the soft-body solver.
     """
 
     on_demand: ClassVar[bool] = True
@@ -150,7 +149,7 @@ class TwinEyeNode(Node):
             return
         self._before_light = None
         true_scene = self._true_scene(scene)
-        situation = self._situation(true_scene, arms)
+        situation = self._collect_situation(true_scene, arms)
         eye = self._true_eye(true_scene, light_ns * 1e-9, self._viewpoint(frame))
         key = (frame.label, frame.correction, frame.eye)
         self._queue.add(key, (situation, eye, frame, frame_header))
@@ -158,10 +157,7 @@ class TwinEyeNode(Node):
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
 
     def _true_scene(self, scene: Scene) -> Scene:
-        """Return the scene with the parameters of the simulated devices.
-
-        The same scene object gives the same result object.
-        """
+        """Return the scene with the true parameters of the devices; the result is cached."""
         if self._scenes is None or self._scenes[0] is not scene:
             true = apply_apparatus(scene, self.parameters.apparatus)
             if self.parameters.projector is not None:
@@ -169,26 +165,31 @@ class TwinEyeNode(Node):
             self._scenes = scene, true
         return self._scenes[1]
 
-    def _situation(self, scene: Scene, arms: TwinArms) -> EyeSituation:
-        return EyeSituation.from_messages(
-            scene,
-            arms,
-            finger=self.twin__finger.message,
-            body=self.soft_body.message,
-            skin=self.skin.message,
-            display=self.display.message,
-            metres_per_px=self.parameters.metres_per_px,
+    def _collect_situation(self, true_scene: Scene, arms: TwinArms) -> EyeSituation:
+        """Collect the true state from the latest messages."""
+        finger, display = self.twin__finger.message, self.display.message
+        skin, body = self.skin.message, self.soft_body.message
+        # A deformation of another mesh is ignored.
+        moved = body if skin is not None and body and body.mesh_id == skin.mesh_id else None
+        return EyeSituation(
+            scene=true_scene,
             apparatus=self.parameters.apparatus,
+            arms=arms,
+            finger_tip=None if finger is None else finger.position_world_m,
+            skin=None if moved is None else skin,
+            displacement=None if moved is None else moved.displacement_world_m,
+            flat=display is not None and display.shading == "flat",
+            metres_per_px=self.parameters.metres_per_px,
         )
 
     def _viewpoint(self, frame: Frame) -> Viewpoint:
         return self.parameters.viewpoint if frame.eye == "both" else frame.eye
 
     def _true_eye(self, true_scene: Scene, at_s: float, viewpoint: Viewpoint) -> Floats:
-        """Return the true world position (3,), m, of the measuring camera at the time `at_s`.
+        """Return the true world position (3,), m, of the virtual camera at the time `at_s`.
 
-        The position is that of the tracked eyes, or of the scene's eyes if none are tracked. The
-        offset in the parameter `apparatus` is added.
+        The tracked eyes are used, or the scene's eyes if none are tracked. The offset in the
+        parameter `apparatus` is added.
         """
         given = self.parameters
         tracked = self.eye.message if self.eye.age_s() <= given.eye_stale_s else None

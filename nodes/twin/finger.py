@@ -41,8 +41,7 @@ class FingerPathError(FlexsheetError, ValueError):
 
 @dataclass(frozen=True, slots=True)
 class SineSum:
-    """Band-limited noise with three components. Each component is a sum of n sines with the
-    standard deviation 1.
+    """Band-limited noise with three components of standard deviation 1, each a sum of n sines.
 
     frequencies_hz, phases_rad (3, n): frequencies and phases of the sines.
     """
@@ -82,10 +81,7 @@ class Path(Protocol):
 
     @property
     def begins_s(self) -> float:
-        """Return the time (s, at most 0) at which the finger leaves the first point.
-
-        The finger must reach the first point at this time or earlier.
-        """
+        """Return the time (s, at most 0) at which the finger leaves the first point."""
         ...
 
     def speeds(self) -> Floats:
@@ -99,8 +95,7 @@ class Path(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class RoundedLines:
-    """A motion along straight lines, whose corners are rounded by a moving average over
-    +-ROUNDING_S.
+    """A motion along straight lines with corners that a moving average over +-ROUNDING_S rounds.
 
     The average is computed exactly from the integral of the position. The rounded motion never
     leaves the convex hull of the points, never exceeds the speed on the lines, and has a continuous
@@ -136,9 +131,7 @@ class RoundedLines:
         return np.asarray(ways / np.diff(self.times_s))
 
     def _corner(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return the position (3,), m, on the polyline, and the integral (3,), m s, of the position
-        since time 0.
-        """
+        """Return the position (3,), m, on the polyline and its integral (3,), m s, since time 0."""
         if time_s <= 0.0:
             return self.points[0], self.points[0] * time_s
         if time_s >= self.times_s[-1]:
@@ -162,7 +155,7 @@ class RoundedLines:
 
 @dataclass(frozen=True, slots=True)
 class SmoothPath:
-    """A motion along a cubic spline through samples, which is at rest at both ends.
+    """A motion along a cubic spline through samples, at rest at both ends.
 
     For samples at intervals h, the error is about h^4 / 100 times the fourth derivative of the
     motion. The error of a motion of 10 mm in 50 ms with samples every 4 ms is below a micrometre.
@@ -195,9 +188,9 @@ class SmoothPath:
     def speeds(self) -> Floats:
         """Return upper bounds (n - 1,), in m/s, on the speed between successive samples.
 
-        Between two samples, the velocity is a quadratic Bezier curve, which is inside the triangle
-        of its control points. Two control points are the end velocities. The third is 3 times the
-        mean velocity minus both end velocities.
+        Between two samples, the velocity is a quadratic Bezier curve within the triangle of its
+        control points. Two control points are the end velocities. The third is 3 times the mean
+        velocity minus both end velocities.
         """
         ends = self.rates
         mean = np.diff(self.points, axis=0) / np.diff(self.times_s)[:, None]
@@ -282,16 +275,15 @@ class FingerState:
 
 @dataclass(frozen=True, slots=True)
 class FingerMotion:
-    """The motion of the fingertip: a motion to the first point of a path, the path itself, and
-    random deviations (wander and tremor).
+    """The motion of the fingertip to a path and along it, with wander and tremor.
 
-    start, start_velocity: position and velocity when the path message arrived, without random
-        deviations.
+    start, start_velocity: position and velocity when the path message arrived, without wander and
+        tremor.
     ease_s: duration of the motion to the first point.
     amplitudes_before_m, amplitudes_m: amplitudes of wander and tremor before the path message and
         on the path. During the motion to the first point, they are interpolated.
-    age_s: time argument of the random deviations when the path message arrived. Later motions
-        continue this time, so the deviations have no jumps.
+    age_s: time argument of wander and tremor when the path message arrived. Later motions continue
+        this time, so wander and tremor have no jumps.
     """
 
     path: Path
@@ -356,12 +348,11 @@ class FingerMotion:
         max_speed_m_per_s: float,
         joined_by: PathJoin = "rounded_lines",
     ) -> FingerMotion:
-        """Return the motion that follows a new path, starting at the time `at_s` of this motion.
+        """Return the motion along a new path that starts at the time `at_s` of this motion.
 
         times_s, points: path of n times and points (n, 3), m.
-
         wander_m: standard deviation of the wander per axis.
-        tremor_m: amplitude of the tremor, which is sqrt(2) times its standard deviation per axis.
+        tremor_m: amplitude of the tremor: sqrt(2) times its standard deviation per axis.
 
         Raises FingerPathError if the path has no points, times that do not increase, or a speed
         above `max_speed_m_per_s`.
@@ -393,8 +384,8 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Return position (3,), m, and velocity (3,), m/s, without random deviations, and the
-        amplitudes of wander and tremor (m).
+        """Return position (m) and velocity (m/s) without wander and tremor, and both amplitudes
+        (m).
         """
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))
@@ -410,9 +401,7 @@ class FingerMotion:
         return position, velocity, amplitudes
 
     def at(self, time_s: float) -> FingerState:
-        """Return the true state of the fingertip at the time `time_s` after the path message
-        arrived.
-        """
+        """Return the true state of the fingertip at a time (s) after the path message arrived."""
         position, velocity, amplitudes = self._steady(time_s)
         _, share_rate = minimum_jerk_profile(min(max(time_s / self.ease_s, 0.0), 1.0))
         noises = ((self.wander, 1.0), (self.tremor, np.sqrt(0.5)))
@@ -435,8 +424,7 @@ class FingerMotion:
 def find_tremor_m(finger: FingerTruth | None, path_tremor_m: float) -> float:
     """Return the tremor amplitude (m) on a path.
 
-    If the true parameters `finger` contain a tremor, it replaces the amplitude of a path with
-    tremor.
+    A tremor in the true parameters `finger` replaces the tremor of a path, if the path has one.
     """
     if finger is None or finger.tremor_rms_m is None or not path_tremor_m:
         return path_tremor_m

@@ -1,4 +1,4 @@
-"""Simulate the user's finger and the stereo camera that observes it.
+"""Simulate the user's finger and the stereo camera.
 
 The parameter `apparatus` contains the true parameters of the simulated hardware. The scene contains
 the parameters that the other nodes assume.
@@ -23,7 +23,6 @@ from flexsheet.messages.scene import NonNegative, Scene, shows_check_marks
 from flexsheet.messages.types import FingerPath, Frame, StereoPair, TwinArms, TwinFinger
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input, Node, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.finger import FingerMotion, FingerState, find_tremor_m
@@ -32,6 +31,7 @@ from flexsheet.nodes.twin.lit_marks import LitMarks
 from flexsheet.nodes.twin.nail import Nail
 from flexsheet.nodes.twin.pixels import NO_POINTS, TwinCamera
 from flexsheet.nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.sheet_pull import find_clamps
 from flexsheet.nodes.twin.sheet_reaction import load_or_compute_reaction
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
@@ -73,9 +73,7 @@ class TwinFingerParameters(SimulatorParameters):
 
 
 class TwinFingerNode(Node):
-    """A node that moves a simulated finger along its path, and renders stereo images at the
-    camera's rate.
-    """
+    """A node that moves a simulated finger along its path and renders stereo images."""
 
     role: ClassVar[NodeRole | None] = NodeRole.FINGER_SIMULATOR
     optional_inputs: ClassVar[frozenset[str]] = frozenset({"frame", "twin__arms"})
@@ -102,7 +100,7 @@ class TwinFingerNode(Node):
 
     @cached_property
     def has_scene(self) -> asyncio.Event:
-        """Return an event, which is set when the first scene arrives."""
+        """Return the event that is set when the first scene arrives."""
         return asyncio.Event()
 
     @classmethod
@@ -155,10 +153,7 @@ class TwinFingerNode(Node):
         self.has_scene.set()
         if self.parameters.hand == "coupled":
             self.coupled, self.edges = None, EdgeTrack()
-            self.clamps = [
-                pose_matrix(arm.flange_from_edge)
-                for arm in (true_scene.arms.left, true_scene.arms.right)
-            ]
+            self.clamps = find_clamps(true_scene)
             if self.preparing is not None:
                 self.preparing.cancel()
             self.preparing = asyncio.create_task(self.call("couple", self._couple, scene))
@@ -185,9 +180,7 @@ class TwinFingerNode(Node):
         return (at_ns - self.started_ns) * 1e-9
 
     def _voluntary(self, at_s: float) -> tuple[Floats, Floats]:
-        """Return the position (3,), m, and velocity (3,), m/s, that the finger has if no force acts
-        on it.
-        """
+        """Return position (m) and velocity (m/s) of the finger without forces, both (3,)."""
         state = self.motion.at(at_s - self._seconds(self.motion_from_ns))
         return state.position, state.velocity
 
@@ -218,7 +211,7 @@ class TwinFingerNode(Node):
     def _follow(self, path: FingerPath) -> None:
         """Start to follow a path immediately.
 
-        Raises FingerPathError if the finger cannot follow the path. Then the current motion
+        Raises FingerPathError if the finger cannot follow the path; the current motion then
         continues.
         """
         now_ns = self.clock.now_ns()
@@ -254,7 +247,7 @@ class TwinFingerNode(Node):
         position.
 
         The actual exposure time differs from `middle_ns` by the timestamp error in the parameter
-        `apparatus`. This method must be called after a scene was received.
+        `apparatus`. A scene must have arrived before the call.
         """
         assert self.camera is not None
         exposed_ns = middle_ns + self._stamp_error_ns()
@@ -286,16 +279,14 @@ class TwinFingerNode(Node):
         )
 
     def _track(self, exposed_ns: int) -> Callable[[float], Floats]:
-        """Return a function that maps the time (s) since mid-exposure to the fingertip position
-        (3,), m.
-        """
+        """Return the fingertip position (3,), m, as a function of time (s) since mid-exposure."""
         if self.coupled is None:
             return lambda offset_s: self.truth(exposed_ns + round(offset_s * 1e9)).position
         seen = self.truth(exposed_ns)
         return lambda offset_s: seen.position + offset_s * seen.velocity
 
     def _lit_points(self, at_ns: int, finger: Floats) -> Floats:
-        """Return the points (n, 3) of the sheet on which projected check marks are visible."""
+        """Return the points (n, 3) of the sheet at which projected check marks are visible."""
         arms = self.twin__arms.message
         if self.lit_marks is None or arms is None:
             return NO_POINTS
@@ -318,7 +309,7 @@ class TwinFingerNode(Node):
 
     @property
     def _max_late_ns(self) -> int:
-        """Return the maximum delay (ns) of an exposure's start up to which the frame is not missed.
+        """Return the maximum delay (ns) of an exposure without a missed frame.
 
         An exposure may overlap the read-out of the previous frame.
         """

@@ -47,8 +47,8 @@ maximum force to the evaluated force. The finger reverses at the maximum force."
 class ForceHistory:
     """The state of the hysteresis and creep of one force of the sheet.
 
-    hysteresis_ratio: fraction of the loading energy that a cycle from zero force loses, including
-        the loss by creep.
+    hysteresis_ratio: lost fraction of the loading energy in a cycle from zero force, including the
+        loss by creep.
     creep_ratio_per_decade: relative decrease of the force per decade of time.
     """
 
@@ -118,8 +118,7 @@ def apply_history(history: ForceHistory, times_s: Floats, elastic_n: Floats) -> 
 
 
 def compute_history_ratios(apparatus: Apparatus) -> Floats:
-    """Return the ratios (2,) of the force of rubber to that of an elastic sheet, for loading and
-    unloading.
+    """Return the ratios (2,) of the force of rubber to an elastic force, in loading and unloading.
 
     The elastic force increases linearly to `TURNING_RATIO` times the evaluated force, and decreases
     again.

@@ -7,7 +7,6 @@ the parameters that the other nodes assume.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,12 +17,10 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Positive, Scene
 from flexsheet.messages.types import Force, TwinArms, TwinFinger
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import pose_matrix
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.twin.force_history import ForceHistory
-from flexsheet.nodes.twin.membrane import solve
-from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
-from flexsheet.nodes.twin.sheet_surface import make_edge_plane
+from flexsheet.nodes.twin.membrane import make_edge_plane
+from flexsheet.nodes.twin.sheet_pull import find_clamps, solve_sheet
 from flexsheet.nodes.twin.truth import SimulatorParameters, apply_apparatus
 
 CELLS = 12
@@ -51,53 +48,27 @@ class TwinGaugeParameters(SimulatorParameters):
 
 
 class TrueSheetForce:
-    """A computation of the true force that the simulated sheet exerts on the finger, along the
-    sheet's normal.
-    """
+    """A model of the true normal force that the simulated sheet exerts on the finger."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
-        true_scene = apply_apparatus(scene, apparatus)
-        self._rubber = true_rubber(true_scene.sheet, apparatus)
-        self._friction = true_friction(apparatus)
-        self._radius_m = true_scene.finger.radius_m
+        self._scene, self._apparatus = apply_apparatus(scene, apparatus), apparatus
         self._history = ForceHistory.of(apparatus)
-        self._clamps = [
-            pose_matrix(arm.flange_from_edge)
-            for arm in (true_scene.arms.left, true_scene.arms.right)
-        ]
+        self._clamps = find_clamps(self._scene)
 
     def compute_n(self, time_s: float, tip: Floats, left: Floats, right: Floats) -> float:
         """Return the normal force (N) of the sheet on a fingertip.
 
-        time_s: time, which must not decrease between calls. tip (3,): position of the fingertip, m.
+        time_s: time; it must not decrease between calls.
+        tip (3,): position of the fingertip, m.
         left, right (4, 4): poses of the arms' flanges.
         """
         edges = left @ self._clamps[0], right @ self._clamps[1]
         plane = make_edge_plane(*edges)
         normal, elastic_n = plane[:3, 2], 0.0
         if (tip - plane[:3, 3]) @ normal < 0.0:
-            pressed = solve(
-                self._rubber,
-                *edges,
-                finger_tip=tip,
-                finger_radius_m=self._radius_m,
-                friction_coefficient=self._friction,
-                cells=CELLS,
-            )
+            pressed = solve_sheet(self._scene, self._apparatus, edges, tip, cells=CELLS)
             elastic_n = max(float(pressed.finger_force_n @ normal), 0.0)
         return elastic_n if self._history is None else self._history.update(time_s, elastic_n)
-
-
-@dataclass(slots=True)
-class GaugeErrors:
-    """The measurement errors of the simulated gauge: gain, offset and noise."""
-
-    truth: GaugeTruth
-    random: np.random.Generator
-
-    def read_n(self, force_n: float) -> float:
-        noise_n = self.truth.noise_n * float(self.random.standard_normal())
-        return self.truth.gain_ratio * force_n + self.truth.offset_n + noise_n
 
 
 class TwinGauge(Node):
@@ -118,8 +89,7 @@ class TwinGauge(Node):
     async def setup(self) -> None:
         truth = self.parameters.apparatus
         self._truth = GaugeTruth() if truth is None else truth.gauge
-        random = np.random.default_rng((self.parameters.seed, GAUGE_STREAM))
-        self._errors = GaugeErrors(self._truth, random)
+        self._random = np.random.default_rng((self.parameters.seed, GAUGE_STREAM))
         self._sheet: TrueSheetForce | None = None
 
     def on_scene(self, scene: Scene, header: Header) -> None:
@@ -141,6 +111,7 @@ class TwinGauge(Node):
             arms.message.world_from_flange_right,
         )
         self.note = ""
+        noise_n = self._truth.noise_n * float(self._random.standard_normal())
         # The reading lags behind the force, but its timestamp is the present time.
         self.force.publish(
             Force(
@@ -148,7 +119,7 @@ class TwinGauge(Node):
                 axis="sheet_normal",
                 valid=True,
                 reason="ok",
-                force_n=self._errors.read_n(true_n),
+                force_n=self._truth.gain_ratio * true_n + self._truth.offset_n + noise_n,
                 standard_deviation_n=STATED_STANDARD_DEVIATION_N,
             ),
             source_ns=taken_ns + round(1e9 * self._truth.lag_s),

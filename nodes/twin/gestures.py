@@ -71,11 +71,11 @@ class Gesture(Protocol):
 
 
 def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> Sampled:
-    """Sample a sequence of motions with minimum jerk, each from one position to the next.
+    """Sample a sequence of minimum-jerk motions.
 
     start: first position (3,), m.
-    moves: pairs of a duration (s) and the next position (3,), m. During a move to the current
-        position, the finger rests.
+    moves: duration (s) and end position (3,), m, of each motion. A motion to the current position
+        is a rest.
     """
     corners = np.array([start, *(place for _, place in moves)])
     ends = np.cumsum([0.0, *(duration for duration, _ in moves)])
@@ -89,8 +89,10 @@ def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> 
 def integrate_speed_profile(phases: Sequence[tuple[float, float]]) -> Sampled:
     """Sample the distance (n,), m, that a finger covers while its speed changes in phases.
 
-    phases: pairs of a duration (s) and the speed (m/s) at the end of the phase. The finger starts
-    at rest. The speed follows the minimum-jerk profile, which makes the acceleration continuous.
+    The finger starts at rest. In each phase, the speed follows the minimum-jerk profile, so the
+    acceleration is continuous.
+
+    phases: duration (s) of each phase, and speed (m/s) at its end.
     """
     durations = np.array([duration for duration, _ in phases])
     speeds = np.array([0.0, *(speed for _, speed in phases)])
@@ -129,9 +131,7 @@ def _on_surface(scene: Scene, label: str, motion: Sampled) -> FingerPath:
 
 
 def hold(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Touch the object lightly, and hold the finger still for 5 s. The argument `seed` has no
-    effect.
-    """
+    """Touch the object lightly, and hold the finger still for 5 s."""
     touch = (0.0, 0.0, -TOUCH_M)
     return _on_surface(scene, "hold", minimum_jerk(touch, [(5.0, touch)]))
 
@@ -184,9 +184,10 @@ def _taps(
 ) -> FingerPath:
     """Tap `count` times near one position. The intervals vary by 5 %, and the positions by 2 mm.
 
-    A tap is a motion from `lift_m` above the surface to PRESS_M below the surface, a rest, and a
-    motion back. The finger does not brake before contact, and is below the surface for `contact_s`
-    of each interval `every_s`.
+    In a tap, the finger moves from `lift_m` above the surface to PRESS_M below the surface, rests,
+    and moves back. It does not brake before contact.
+
+    every_s: mean time between taps. contact_s: time below the surface in each tap.
     """
     generator = np.random.default_rng(seed)
     grid = np.linspace(0.0, 1.0, 1001)
@@ -217,9 +218,7 @@ def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _arc_run(scene: Scene) -> tuple[float, float]:
-    """Return half the arc length (m) of a stroke around the surface, and the speed (m/s) of the
-    stroke.
-    """
+    """Return half the arc length (m) and the speed (m/s) of a stroke around the surface."""
     half = 0.5 * touchable(scene)[1]
     return half, min(scene.working_range.speed_m_per_s, half / 0.3)
 
@@ -237,7 +236,7 @@ def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
         signed = speed if leg % 4 < 2 else -speed
         phases += [(start_s, signed), (even_s, signed), (BRAKE_S, 0.0), (float(rest_s), 0.0)]
     times, travel_m = integrate_speed_profile(phases)
-    return _on_surface(scene, "stop", (times, _pressing(travel_m - half, TOUCH_M)))
+    return _on_surface(scene, "stop", (times, _touch_along(travel_m - half)))
 
 
 def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
@@ -255,7 +254,7 @@ def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
         signed = -signed
     phases += [(turn_s, 0.0)]
     times, travel_m = integrate_speed_profile(phases)
-    return _on_surface(scene, "reverse", (times, _pressing(travel_m - 0.5 * half, TOUCH_M)))
+    return _on_surface(scene, "reverse", (times, _touch_along(travel_m - 0.5 * half)))
 
 
 def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
@@ -275,7 +274,7 @@ def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def _rounds(turns: int, turn_s: float) -> Sampled:
-    """Sample the angle (n,), rad, of a motion around a closed figure that starts and ends at rest.
+    """Sample the angle (n,), rad, of a rotation that starts and ends at rest.
 
     turns: number of revolutions. turn_s: duration of one revolution.
     """
@@ -290,7 +289,7 @@ def _drawing_m(scene: Scene) -> float:
 
 
 def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Move along four circles on the surface, at the speed at which people explore a surface."""
+    """Move along four circles on the surface, at the typical speed of exploration."""
     radius = _drawing_m(scene)
     times, angle = _rounds(4, 2.0 * np.pi * radius / EXPLORE_M_PER_S)
     places = np.stack(
@@ -300,7 +299,7 @@ def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
 
 
 def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
-    """Move along three figures of eight on the surface, more slowly where they are curved."""
+    """Move along three figures of eight on the surface, slowly where the curvature is high."""
     radius = _drawing_m(scene)
     # The length of the figure, integrated numerically, is 6.1 radii.
     times, angle = _rounds(3, 6.1 * radius / EXPLORE_M_PER_S)
@@ -311,11 +310,9 @@ def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
     return _on_surface(scene, "eight", (times, places))
 
 
-def _pressing(arcs: Floats, depth_m: float) -> Floats:
-    """Return surface positions (n, 3), m, at arc lengths (n,), m, and a constant depth below the
-    surface.
-    """
-    return np.stack([np.zeros(len(arcs)), arcs, np.full(len(arcs), -depth_m)], axis=1)
+def _touch_along(arcs: Floats) -> Floats:
+    """Return surface positions (n, 3) of a light touch at arc lengths (n,), m."""
+    return np.stack([np.zeros(len(arcs)), arcs, np.full(len(arcs), -TOUCH_M)], axis=1)
 
 
 GESTURES: dict[str, Gesture] = {

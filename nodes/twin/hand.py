@@ -1,5 +1,4 @@
-"""Simulate the hand behind the finger as a mass with a spring and a damper, on which the sheet
-acts.
+"""Simulate the hand behind the finger as a mass with a spring and a damper.
 
 Without contact, the finger follows its voluntary path exactly. The force F of the sheet causes a
 deviation e from this path. The hand at the fingertip has the mass m, damping b and stiffness k:
@@ -25,8 +24,9 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.twin.force_history import ForceHistory
+from flexsheet.nodes.twin.membrane import make_edge_plane
 from flexsheet.nodes.twin.sheet_reaction import SheetReaction
-from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface, make_edge_plane
+from flexsheet.nodes.twin.sheet_surface import SheetPlanes, SheetSurface
 
 VoluntaryPath = Callable[[float], tuple[Floats, Floats]]
 """A function that returns the voluntary position (3,), m, and velocity (3,), m/s, at a time (s)."""
@@ -55,10 +55,10 @@ UP = np.array([0.0, 1.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class HandImpedance:
-    """The mechanical impedance of a hand at the fingertip, which is equal in all directions.
+    """The mechanical impedance of a hand at the fingertip, equal in all directions.
 
-    The default values are those of a finger that moves together with the wrist. Their natural
-    frequency without contact is 5 Hz (Lakie et al. 2015: 6 to 12 Hz with less mass).
+    The default values describe a finger that moves together with the wrist. Their natural frequency
+    without contact is 5 Hz (Lakie et al. 2015: 6 to 12 Hz with less mass).
     """
 
     mass_kg: float = 0.15
@@ -67,10 +67,9 @@ class HandImpedance:
 
     @classmethod
     def of(cls, apparatus: Apparatus | None) -> Self:
-        """Return the hand impedance from an apparatus (the true parameters of the simulated
-        hardware).
+        """Return the hand impedance from an apparatus (true parameters of the simulated hardware).
 
-        Return the default if the apparatus contains no impedance.
+        Return the default values if the apparatus contains no impedance.
         """
         finger = None if apparatus is None else apparatus.finger
         if finger is None or finger.hand_mass_kg is None:
@@ -111,9 +110,7 @@ class Touch:
 
 
 class TrueSheet:
-    """A model of the force that the simulated sheet exerts on the finger, for given poses of the
-    sheet's edges.
-    """
+    """A model of the force of the simulated sheet on the finger, for given poses of its edges."""
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None, reaction: SheetReaction) -> None:
         self.step_m = float(reaction.depths_m[1])
@@ -130,7 +127,7 @@ class TrueSheet:
         x_axis, y_axis, normal, middle = make_edge_plane(left, right)[:3].T
         if float((tip - middle) @ normal) > NEAR_M:
             return Touch(middle, normal, np.zeros(2))
-        plane = SheetPlanes(middle[None], normal[None], x_axis[None], np.array([distance_m]))
+        plane = SheetPlanes.through(left, right)
         surface = self._surface.find_tangent_planes(plane, tip[None], UP)
         x_m = float((tip - middle) @ x_axis)
         y_m = float((tip - middle) @ y_axis)
@@ -142,9 +139,7 @@ class TrueSheet:
 
 
 class EdgeTrack:
-    """A predictor of the poses of the sheet's edges. It extrapolates the last two samples
-    linearly.
-    """
+    """A linear extrapolation of the last two samples of the poses of the sheet's edges."""
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, Floats]] = []
@@ -161,8 +156,9 @@ class EdgeTrack:
         return len(self._samples) == 2
 
     def __call__(self, time_s: float) -> tuple[Floats, Floats]:
-        """Return the poses (4, 4) of both edges at a time (s), extrapolated by at most
-        MAX_EXTRAPOLATION_S.
+        """Return the poses (4, 4) of both edges at a time (s).
+
+        The extrapolation is limited to MAX_EXTRAPOLATION_S.
         """
         (before_s, before), (after_s, after) = self._samples
         at_s = min(max(time_s, before_s), after_s + MAX_EXTRAPOLATION_S)
@@ -171,9 +167,9 @@ class EdgeTrack:
 
 
 class CoupledFinger:
-    """A simulation of the finger's deviation from its voluntary path due to the force of the sheet.
+    """A simulation of the finger's deviation from its voluntary path by the force of the sheet.
 
-    path: voluntary motion, which may be replaced at any time.
+    path: voluntary motion; it may be replaced at any time.
     deviation_m, rate_m_per_s (3,): deviation and its rate of change.
     force_n (3,): force of the sheet on the finger, averaged over the last interval.
     log: rows (time in s, indentation in m, force in N) of all steps; None if they are not recorded.
@@ -188,10 +184,10 @@ class CoupledFinger:
         self._ratio, self._remembers = 1.0, sheet.history is not None
 
     def predict(self, time_s: float, edges: Edges) -> CoupledFinger:
-        """Return a copy of this simulation that is advanced to `time_s`.
+        """Return a copy of this simulation, advanced to `time_s`.
 
-        This simulation itself is advanced only to MAX_PREDICTION_S before `time_s`. This has an
-        effect only if no poses of the edges arrive.
+        If this simulation is more than MAX_PREDICTION_S behind `time_s`, it is advanced to this
+        limit.
         """
         self.advance(time_s - MAX_PREDICTION_S, edges)
         ahead = copy(self)
@@ -200,16 +196,14 @@ class CoupledFinger:
         return ahead
 
     def position(self) -> tuple[Floats, Floats]:
-        """Return the position (3,), m, and velocity (3,), m/s, of the fingertip at the current
-        simulation time.
+        """Return position (m) and velocity (m/s), each (3,), of the fingertip at the simulation
+        time.
         """
         position, velocity = self.path(self.time_s)
         return position + self.deviation_m, velocity + self.rate_m_per_s
 
     def advance(self, until_s: float, edges: Edges) -> None:
-        """Integrate the motion until the time `until_s`. A time before the current simulation time
-        has no effect.
-        """
+        """Integrate the motion until `until_s`; an earlier time has no effect."""
         span_s = until_s - self.time_s
         if span_s <= 0.0:
             return

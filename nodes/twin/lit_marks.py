@@ -17,11 +17,10 @@ from flexsheet.messages.types import Frame, TwinArms
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import apply, inverse, pose_matrix, transform
 from flexsheet.nodes.twin.eye import TrueProjector
-from flexsheet.nodes.twin.membrane import DeformedSheet, NotConvergedError, solve
+from flexsheet.nodes.twin.membrane import NotConvergedError, make_edge_plane
 from flexsheet.nodes.twin.projector import on_plane
 from flexsheet.nodes.twin.rig import slopes_of
-from flexsheet.nodes.twin.sheet_pull import true_friction, true_rubber
-from flexsheet.nodes.twin.sheet_surface import make_edge_plane
+from flexsheet.nodes.twin.sheet_pull import find_clamps, solve_sheet
 from flexsheet.nodes.twin.truth import find_display_delay_s
 
 CELLS = 8
@@ -37,10 +36,11 @@ larger motion, the shape is unknown, and no marks are drawn."""
 
 @dataclass(frozen=True, slots=True)
 class _Heights:
-    """The heights (n,) of the sheet at the projected marks, above the plane of its edges.
+    """The heights of the sheet at the projected marks, above the plane of its edges.
 
-    finger_sheet_m: position (3,) of the fingertip in the frame of this plane. pushed: whether the
-    finger deforms the sheet.
+    heights_m (n,): heights at the marks.
+    finger_sheet_m (3,): position of the fingertip in the frame of this plane.
+    pushed: whether the finger deforms the sheet.
     """
 
     heights_m: Floats
@@ -49,10 +49,10 @@ class _Heights:
 
 
 class LitMarks:
-    """A computation of the points of the simulated sheet that the projected marks illuminate.
+    """A model of the sheet that computes the points that the projected marks illuminate.
 
-    The sheet moves with the simulated arms. The deflection of the sheet by the finger and by its
-    weight is computed in a background thread.
+    The sheet moves with the simulated arms. A background thread computes the deflection of the
+    sheet by the finger and by gravity.
     """
 
     def __init__(self, scene: Scene, apparatus: Apparatus | None) -> None:
@@ -62,9 +62,7 @@ class LitMarks:
         the nodes assume.
         """
         self._scene, self._apparatus = scene, apparatus
-        projector = require_projector(scene)
-        pose = projector.world_from_projector
-        self._world_from_projector = pose_matrix(pose)
+        self._world_from_projector = pose_matrix(require_projector(scene).world_from_projector)
         self._frames: deque[tuple[int, Floats]] = deque(maxlen=16)
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="sheet")
         self._solving: Future[_Heights | None] | None = None
@@ -80,7 +78,7 @@ class LitMarks:
             self._solving.exception()
 
     def on_frame(self, frame: Frame) -> None:
-        """Store the check marks of a frame, which the projector shows until the next frame."""
+        """Store the check marks of a frame. The projector shows them until the next frame."""
         if frame.light_ns and len(frame.marks_px):
             late_ns = round(1e9 * find_display_delay_s(frame, self._apparatus))
             self._frames.append((frame.light_ns + late_ns, frame.marks_px))
@@ -88,7 +86,9 @@ class LitMarks:
     def light(self, arms: TwinArms, finger: Floats, at_ns: int) -> Floats:
         """Return the illuminated points (n, 3), world frame, m, at the time `at_ns`.
 
-        The result is empty if the points are unknown. finger (3,): position of the fingertip, m.
+        The result is empty if the points are unknown.
+
+        finger (3,): position of the fingertip, m.
         """
         shown = [pixels for light_ns, pixels in self._frames if light_ns <= at_ns]
         if not shown:
@@ -111,13 +111,8 @@ class LitMarks:
         return np.stack(points)
 
     def _edges(self, arms: TwinArms) -> tuple[Floats, Floats]:
-        left, right = (
-            spec.flange_from_edge for spec in (self._scene.arms.left, self._scene.arms.right)
-        )
-        return (
-            arms.world_from_flange_left @ pose_matrix(left),
-            arms.world_from_flange_right @ pose_matrix(right),
-        )
+        left, right = find_clamps(self._scene)
+        return arms.world_from_flange_left @ left, arms.world_from_flange_right @ right
 
     def _rays(self, pixels: Floats) -> tuple[Floats, Floats]:
         slopes = slopes_of(require_projector(self._scene).lens, pixels)
@@ -143,14 +138,7 @@ class LitMarks:
     ) -> _Heights | None:
         scene = self._scene
         try:
-            sheet: DeformedSheet = solve(
-                true_rubber(scene.sheet, self._apparatus),
-                *edges,
-                finger_tip=finger,
-                finger_radius_m=scene.finger.radius_m,
-                friction_coefficient=true_friction(self._apparatus),
-                cells=CELLS,
-            )
+            sheet = solve_sheet(scene, self._apparatus, edges, finger, cells=CELLS)
         except NotConvergedError:
             return None
         vertices = sheet.positions.reshape(-1, 3)

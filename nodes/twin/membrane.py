@@ -2,16 +2,16 @@
 
 The material is incompressible neo-Hookean rubber in plane stress. Its energy per volume is W = mu/2
 (I1 - 3), where I1 is the first strain invariant and mu = E/3 is the shear modulus. A membrane has
-no bending stiffness, so it would buckle into infinitely fine wrinkles. Where W would give
-compression, the energy of a tension field is used instead (Pipkin, IMA J. Appl. Math. 36, 1986).
-The stress is uniaxial along the wrinkles, zero across them, and zero where the sheet is slack. This
-relaxed energy is convex in the strain, so Newton's method with a line search finds its minimum.
+no bending stiffness. Under compression, it would buckle into infinitely fine wrinkles. There, the
+energy of a tension field is used instead of W (Pipkin, IMA J. Appl. Math. 36, 1986). The stress is
+uniaxial along the wrinkles, zero across them, and zero where the sheet is slack. The relaxed energy
+is convex in the strain, so Newton's method with a line search finds its minimum.
 
-The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points). They differ from the
-elements of the renderer, because this module is used to test the renderer. The mesh is finer around
-the finger. Gravity acts on the sheet. The fingertip is a rigid sphere that is moved into the sheet
-along the sheet's normal, in steps. A stiff penalty force keeps the sheet outside the sphere.
-Touched nodes stick to the sphere unless the limit of Coulomb friction is exceeded.
+The elements are biquadratic quadrilaterals (nine nodes, 3x3 Gauss points). The renderer uses other
+elements, because this module is used to test the renderer. The mesh is finer around the finger.
+Gravity acts on the sheet. The fingertip is a rigid sphere that is moved into the sheet along the
+sheet's normal, in steps. A stiff penalty force keeps the sheet outside the sphere. Touched nodes
+stick to the sphere unless the limit of Coulomb friction is exceeded.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.arrays import Bools, Floats
+from flexsheet.nodes.models.rigid import transform
 
 Indices = NDArray[np.intp]
 
@@ -119,6 +120,20 @@ class DeformedSheet:
         )
 
 
+def make_edge_plane(left: Floats, right: Floats) -> Floats:
+    """Return the pose (4, 4) of the plane through both clamped edges of the sheet.
+
+    left, right: poses (4, 4) of the edges. The origin of the plane is midway between the edges. Its
+    x axis points to the right edge, and its z axis points towards the user.
+    """
+    across = right[:3, 3] - left[:3, 3]
+    across = across / np.linalg.norm(across)
+    normal = np.cross(across, left[:3, 1] + right[:3, 1])
+    normal /= np.linalg.norm(normal)
+    rotation = np.column_stack([across, np.cross(normal, across), normal])
+    return transform(rotation, 0.5 * (left[:3, 3] + right[:3, 3]))
+
+
 def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
     """Return coordinates (cells + 1,), in m, from 0 to `length_m`, densest at `focus_m`.
 
@@ -153,7 +168,7 @@ def _quadratic(t: Floats) -> tuple[Floats, Floats]:
 
 
 class _Mesh:
-    """A rectangular finite-element mesh, which assembles the elastic forces and stiffness.
+    """A rectangular finite-element mesh that assembles the elastic forces and stiffness.
 
     x, y: coordinates of the nodes. Element boundaries have even indices. Nodes with odd indices are
         midway between their neighbours.
@@ -259,7 +274,7 @@ class _Mesh:
     def matrix(self, stiffness: Floats, contact: Floats) -> scipy.sparse.csc_array:
         """Return the sparse stiffness matrix of the nodes that are not clamped.
 
-        contact (nodes, 3, 3): contact stiffness, N/m, which is added to the diagonal blocks.
+        contact (nodes, 3, 3): contact stiffness, N/m, added to the diagonal blocks.
         """
         free = stiffness.ravel()[self._is_free]
         values = np.bincount(self._slot, free, minlength=len(self._unique))
@@ -276,7 +291,9 @@ class _Mesh:
 def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the larger and the smaller eigenvalue (...,) of C, and a unit eigenvector (..., 2).
 
-    The eigenvector is that of the larger eigenvalue. c: components [C11, C22, C12] (..., 3).
+    The eigenvector belongs to the larger eigenvalue.
+
+    c: components [C11, C22, C12] (..., 3).
     """
     mean, half = 0.5 * (c[..., 0] + c[..., 1]), 0.5 * (c[..., 0] - c[..., 1])
     radius = np.hypot(half, c[..., 2])
@@ -342,7 +359,7 @@ def relaxed_stress(
 
 
 class _Finger:
-    """A model of the fingertip as a rigid sphere, to which touched nodes stick.
+    """A model of the fingertip as a rigid sphere to which touched nodes stick.
 
     A penalty force acts on nodes inside the sphere.
 
@@ -396,13 +413,14 @@ class _Finger:
         derivative = pressed[:, None, None] * outward[:, :, None] * outward[:, None, :]
         return gradient, derivative + fixed[:, None, None] * np.eye(3)
 
-    def release(self, positions: Floats, share: float) -> bool:
-        """Release the nodes whose friction force exceeds the Coulomb limit, so that they slip.
+    def release(self, positions: Floats, fraction: float) -> bool:
+        """Let the nodes slip whose friction force exceeds the Coulomb limit.
 
-        Return whether forces changed. If they did, a new equilibrium must be computed. The friction
-        force of a slipping node is the friction coefficient times the normal force, and its
-        direction does not change. share: fraction (0 to 1) of the change of the friction forces
-        that is applied.
+        Return whether forces changed; then a new equilibrium must be computed. The friction force
+        of a slipping node is the friction coefficient times the normal force. Its direction does
+        not change.
+
+        fraction: applied fraction (0 to 1) of the change of the friction forces.
         """
         if self._coefficient is None:
             return False
@@ -418,7 +436,7 @@ class _Finger:
         moving = (slipping & (depth > 0.0)) | begins
         direction = tangential / np.maximum(size_n, 1e-15)[:, None]
         wanted = np.where(moving[:, None], limit_n[:, None] * direction, 0.0)
-        self._friction_n = before + share * (wanted - before)
+        self._friction_n = before + fraction * (wanted - before)
         self._stuck = self._stuck & ~begins
         change = np.linalg.norm(self._friction_n - before)
         return bool(begins.any() or change > FRICTION_TOLERANCE * np.linalg.norm(before))
@@ -436,9 +454,10 @@ def solve(
 ) -> DeformedSheet:
     """Compute the equilibrium of the sheet between its edges, with or without a pushing fingertip.
 
-    finger_tip: point (3,), m, of the fingertip sphere that is farthest from the user. There is no
-    contact if the point is None, in front of the sheet, or beside the sheet. The other arguments
-    and the errors are those of `solve_path`.
+    finger_tip: deepest point (3,), m, of the fingertip sphere. There is no contact if the point is
+        None, in front of the sheet, or beside the sheet.
+
+    The other arguments and the errors are those of `solve_path`.
     """
     return solve_path(
         rubber,
@@ -470,42 +489,35 @@ def solve_path(
         the centre of the edge, and y points along the edge.
     finger_tips: positions (3,) on one normal of the sheet, sorted by depth.
     friction_coefficient: Coulomb coefficient between finger and sheet; None if touched nodes stick.
-    cells: number of intervals between nodes along each side, which must be even.
+    cells: number of intervals between nodes along each side, an even number.
     slack_tension: see SLACK_TENSION. A smaller value is more accurate for small pushes of a sheet
-        with little tension. With it, the iteration for a slack sheet does not converge.
+        with little tension, but the iteration for a slack sheet does not converge.
 
     Raises NotConvergedError if an iteration does not converge, and ValueError if the edges
     coincide.
     """
     left, right = world_from_left_edge, world_from_right_edge
-    x_axis = right[:3, 3] - left[:3, 3]
-    distance = float(np.linalg.norm(x_axis))
+    distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
     if distance < 1e-3:
         raise ValueError(
             f"the sheet's edges are {distance * 1e3:.2f} mm apart, but the simulated membrane "
             "needs at least 1 mm; move the arms apart"
         )
-    x_axis = x_axis / distance
-    normal = np.cross(x_axis, left[:3, 1] + right[:3, 1])
-    normal /= np.linalg.norm(normal)
-    y_axis = np.cross(normal, x_axis)
-    middle = 0.5 * (left[:3, 3] + right[:3, 3])
+    x_axis, y_axis, normal, middle = make_edge_plane(left, right)[:3].T
 
-    focus: tuple[float | None, float | None] = (None, None)
+    focus: tuple[float, float] | None = None
     tips = list(finger_tips)
     if tips:
         offset = tips[-1] - middle
         across, along_edge = float(offset @ x_axis / distance), float(offset @ y_axis)
         over = abs(across) < 0.5 and abs(along_edge) < 0.5 * rubber.height_m
         if over and offset @ normal < 0.0:
-            focus = (
-                (across + 0.5) * rubber.width_m,
-                along_edge + 0.5 * rubber.height_m,
-            )
+            focus = (across + 0.5) * rubber.width_m, along_edge + 0.5 * rubber.height_m
+    focus_x_m, focus_y_m = focus or (None, None)
     mesh = _Mesh(
         rubber,
-        _insert_midpoints(graded_axis(rubber.width_m, cells // 2, focus[0])),
-        _insert_midpoints(graded_axis(rubber.height_m, cells // 2, focus[1])),
+        _insert_midpoints(graded_axis(rubber.width_m, cells // 2, focus_x_m)),
+        _insert_midpoints(graded_axis(rubber.height_m, cells // 2, focus_y_m)),
         slack_tension,
     )
     fraction = mesh.rest[..., 0, None] / rubber.width_m
@@ -515,7 +527,7 @@ def solve_path(
     )
     positions, iterations = _relax(mesh, flat.reshape(-1, 3), None)
 
-    if focus[0] is None:
+    if focus is None:
         return [_describe(mesh, positions, None, iterations)] * max(len(tips), 1)
     carried = _cone(mesh, focus, rubber)
     stuck = np.zeros(len(positions), bool)
@@ -572,25 +584,21 @@ def _describe(
 
 
 def _insert_midpoints(boundaries: Floats) -> Floats:
-    """Return the element boundaries (n,) and the midpoints between them, in ascending order (2 n -
-    1,).
-    """
+    """Return boundaries (n,) and the midpoints between them in ascending order (2 n - 1,)."""
     nodes = np.empty(2 * len(boundaries) - 1)
     nodes[::2] = boundaries
     nodes[1::2] = 0.5 * (boundaries[1:] + boundaries[:-1])
     return nodes
 
 
-def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: TrueRubber) -> Floats:
+def _cone(mesh: _Mesh, focus_m: tuple[float, float], rubber: TrueRubber) -> Floats:
     """Return the fraction (nodes,) of a finger step by which each node moves initially.
 
-    The fraction is 1 at the focus (the pushed point) and decreases linearly to 0 near the clamps.
-    The moved nodes are the initial guess of the next equilibrium.
+    The fraction is 1 at the pushed point `focus_m` and decreases linearly to 0 near the clamps. The
+    moved nodes are the initial guess of the next equilibrium.
     """
     x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
-    focus_x, focus_y = focus
-    assert focus_x is not None
-    assert focus_y is not None
+    focus_x, focus_y = focus_m
     reach = np.where(x < focus_x, focus_x, rubber.width_m - focus_x)
     radius = np.hypot((x - focus_x) / np.maximum(reach, 1e-6), (y - focus_y) / np.max(reach))
     cone: Floats = np.clip(1.0 - radius, 0.0, 1.0)

@@ -2,8 +2,8 @@
 
 This module was written from `docs/mxt.md` only. It shares no code with the bridge (the node that
 sends commands to an arm), because it is used to test the bridge. The simulated controller executes
-the robot program `Mxt 1,1,<filter>`. It is only partly known which packets a real controller
-rejects. The simulated controller rejects more packets, and sends no answer after its program has
+the robot program `Mxt 1,1,<filter>`. The rules by which a real controller rejects packets are only
+partly known, so the simulated controller is stricter. It sends no answer after its program has
 ended.
 """
 
@@ -73,10 +73,11 @@ class MxtError(FlexsheetError):
 
 
 class MxtController:
-    """A simulated controller of one arm, which receives and answers one packet per cycle.
+    """A simulated controller of one arm that answers one packet per cycle.
 
     An error ends the robot program. Then the arm brakes, and the controller answers no packet until
-        `restart` is called. The errors are:
+    `restart` is called. The errors are:
+
     - a motion command before a packet that only requests the state
     - an unknown command or data type
     - joint angles outside the allowed range
@@ -148,7 +149,7 @@ class MxtController:
         self._count = self._timeouts = self._missing = 0
 
     def receive_command(self, packet: bytes, sender: Address) -> None:
-        """Store a packet, which the next cycle processes unless a newer packet replaces it.
+        """Store a packet for the next cycle; a newer packet replaces it.
 
         Packets of wrong length are ignored. While a sender has control, packets from other senders
         are also ignored.
@@ -168,9 +169,7 @@ class MxtController:
         return self._next_cycle_s - self._into_cycle_s
 
     def advance(self, duration_s: float) -> None:
-        """Simulate the motion for `duration_s`, and append the answers of the controller to
-        `answers`.
-        """
+        """Simulate the motion for `duration_s`, and append the new answers to `answers`."""
         while duration_s >= self.until_cycle_s():
             duration_s -= self.until_cycle_s()
             self._move_on(self.until_cycle_s())
@@ -204,9 +203,7 @@ class MxtController:
         self._filtered_rad = self._filtered_rad + self._filter_share * (wanted - self._filtered_rad)
 
     def _acting(self) -> Floats:
-        """Return the set-point (6,), rad, that takes effect in the current cycle, after the
-        latency.
-        """
+        """Return the set-point (6,), rad, that takes effect in the current cycle."""
         late_s = self._latency_s + (LATE_S if self.fault == "lagging" else 0.0)
         if not late_s:
             self._late.clear()
@@ -239,10 +236,9 @@ class MxtController:
             self.answers.append((self._answer(command, receive_type, packet), sender))
 
     def _stay(self, sender: Address) -> None:
-        """Process a packet that only requests the state.
+        """Stop the arm after a packet that only requests the state.
 
-        The arm stops. The next set-point must agree with the measured joint angles, like the first
-        set-point.
+        The next set-point must agree with the measured joint angles, like the first set-point.
         """
         self._master = sender
         if self._moved:
@@ -266,9 +262,7 @@ class MxtController:
         self._moved, self.wanted_rad = True, joints
 
     def _set_point(self, send_type: int, data: Floats) -> Floats:
-        """Decode the set-point (6,), rad, of a packet; raise MxtError if the set-point is
-        invalid.
-        """
+        """Decode the set-point (6,), rad, of a packet; raise MxtError if it is invalid."""
         if send_type != _JOINTS[0]:
             raise MxtError(f"the set-point has the unknown data type {send_type}")
         if not np.isfinite(data).all():
@@ -308,8 +302,7 @@ class MxtController:
     def _currents_percent(self) -> list[int]:
         """Return the motor currents (6,) in percent of the rated current, rounded to integers.
 
-        The motors carry the weight of the arm and the load, minus the part that static friction
-        carries.
+        Static friction carries a part of the weight and of the load.
         """
         balance = UNLOADED_PERCENT - self.load_nm / TORQUE_PER_PERCENT_NM
         return [round(float(one)) for one in balance + self._stuck_percent]
@@ -324,7 +317,7 @@ class MxtController:
 
 
 class MxtServer:
-    """A UDP server through which clients send commands to a simulated controller."""
+    """A UDP server that passes packets from clients to a simulated controller."""
 
     def __init__(
         self, controller: MxtController, *, host: str, port: int, before: Callable[[], None]
@@ -349,10 +342,7 @@ class MxtServer:
 
     @property
     def port(self) -> int:
-        """Return the number of the port on which the server listens.
-
-        If port 0 was requested, this is the port that the operating system chose.
-        """
+        """Return the network port of the server; for port 0, the system chooses a free port."""
         if self._transport is None:
             raise RuntimeError("the server of the simulated arm is not started; call start() first")
         return int(self._transport.get_extra_info("sockname")[1])

@@ -1,4 +1,4 @@
-"""Compute the position of the marker on the nail of a finger, which may be tilted."""
+"""Compute the position of a marker on the nail of a tilted or straight finger."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ THICKNESS_RATIO = 0.6
 class Nail:
     """The placement of the marker and the direction of the finger, as vectors in the world frame.
 
-    marker_offset_m (3,): vector from the fingertip (the contact point of the finger pad) to the
-        centre of the marker.
-    marker_normal (3,): normal of a flat marker; None if the marker is a ball.
-    direction (3,): direction from the fingertip to the knuckle.
-
     A finger with a flat marker on its nail has an elliptic cross-section, and the marker is on the
     flat side. A finger with a ball, or with a marker at the pad, is round. The axis of a round
     finger begins at the fingertip.
+
+    marker_offset_m (3,): vector from the fingertip (contact point of the finger pad) to the centre
+        of the marker.
+    marker_normal (3,): normal of a flat marker; None if the marker is a ball.
+    direction (3,): direction from the fingertip to the knuckle.
     """
 
     marker_offset_m: Floats = field(default_factory=lambda: np.zeros(3))
@@ -95,9 +95,7 @@ class Nail:
 
     @property
     def knuckle_shift_m(self) -> Floats:
-        """Return the vector (3,), m, by which the finger's tilt displaces the knuckle and the
-        hand.
-        """
+        """Return the displacement (3,), m, of the knuckle and the hand by the finger's tilt."""
         return np.asarray(FINGER_LENGTH_M * (self.direction - np.array(FINGER_DIRECTION)))
 
 

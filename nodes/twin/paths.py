@@ -62,14 +62,15 @@ def touchable(scene: Scene) -> tuple[float, float]:
 class SurfaceMap:
     """A map from surface positions on a scene's object to world points.
 
-    The distances `along` and `arc` are measured on geodesics, which are computed on a grid. Points
-    between the grid points are interpolated by bicubic splines and projected onto the surface.
-    Therefore a mapped path is as smooth as the surface.
+    The distances `along` and `arc` are measured on geodesics over a grid. Points between the grid
+    points are interpolated by bicubic splines and projected onto the surface. Therefore a mapped
+    path is as smooth as the surface.
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Compute the grid of surface points. Raises FingerPathError if no side of the object faces
-        the user.
+        """Compute the grid of surface points.
+
+        Raises FingerPathError if no side of the object faces the user.
         """
         self._world_from_object = pose_matrix(scene.object.world_from_object)
         self._shape = make_shape(dict(scene.object.geometry))
@@ -112,12 +113,14 @@ class SurfaceMap:
     def _reach_m(
         self, front: Nearest, heading: Floats, towards_user: Floats, most: float
     ) -> tuple[float, bool]:
-        """Return the maximum length (m) of a stroke in one direction, and whether an end of the
-        object limits it.
+        """Return the maximum length (m) of a stroke in one direction, and whether it reaches an
+        edge.
 
-        The length is measured from the front along the geodesic that begins in the direction
-        `heading` (3,). The other limit is the angle between the surface normal and the direction to
-        the user. most: cosine of the maximum angle.
+        The stroke starts at the front of the object and follows the geodesic in the direction
+        `heading` (3,). It ends at an edge of the object, or at the maximum angle between the
+        surface normal and the direction to the user.
+
+        most: cosine of the maximum angle.
         """
         here, way_m = front, 0.0
         while way_m < MAX_DISTANCE_M:
@@ -135,9 +138,7 @@ class SurfaceMap:
         return way_m, False
 
     def _fit_splines(self, front: Nearest, heading: Floats) -> None:
-        """Fit splines to the surface over (along, arc). They cover 1.25 times the range of
-        strokes.
-        """
+        """Fit splines to the surface over (along, arc), for 1.25 times the range of strokes."""
         ticks = [
             np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
             for half in (0.625 * size for size in self.touchable_m)
@@ -153,10 +154,10 @@ class SurfaceMap:
 
 
 def _front(shape: Shape, towards_user: Floats) -> Nearest:
-    """Return the surface point that faces the user, which is the point nearest to a distant user.
+    """Return the surface point nearest to a distant user.
 
-    If the nearest point is on an end of the object, return the point that the user sees in the
-    direction of the object's origin.
+    If this point is on an end of the object, return the point that the user sees in the direction
+    of the object's origin.
     """
     far = shape.closest(FAR_M * towards_user)
     if not far.on_edge:
@@ -215,19 +216,18 @@ def _surface_map_of(scene: Scene) -> SurfaceMap:
 
 
 def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
-    """Return whether all world points (n, 3) are at least `margin_m` inside the scene's finger
-    volume.
-    """
+    """Return whether all world points (n, 3) lie in the scene's finger volume with a margin (m)."""
     low = scene.finger.volume_min_m + margin_m
     high = scene.finger.volume_max_m - margin_m
     return bool((points >= low).all() and (points <= high).all())
 
 
 def limit_path_speed(scene: Scene, times_s: Floats, points: Floats) -> Floats:
-    """Return the times (n,), s, of a path, slowed down so that it does not exceed the finger's
-    maximum speed.
+    """Return the times (n,), s, of a path after slowing it down to the finger's maximum speed.
 
-    All times are multiplied by the same factor. points (n, 3): positions, m.
+    All times are multiplied by the same factor of at least 1.
+
+    points (n, 3): positions, m.
     """
     fastest = float(SmoothPath.through(times_s, points).speeds().max())
     slower = max(1.0, fastest / (SPEED_FRACTION * scene.finger.max_speed_m_per_s))
@@ -245,11 +245,10 @@ def place_path(
 ) -> FingerPath:
     """Make a path in the scene from a smooth motion in surface positions.
 
-    times_s, places: sample times (n,) and surface positions (n, 3), m.
+    If the path with wander and tremor would leave the scene's finger volume, the motion is scaled
+    down. If it would exceed the scene's maximum finger speed, the motion is slowed down.
 
-    The motion is reduced by one factor if the path with wander and tremor would leave the scene's
-    finger volume. It is slowed down by one factor if it would exceed the scene's maximum finger
-    speed.
+    times_s, places: sample times (n,) and surface positions (n, 3), m.
 
     Raises FingerPathError if the volume does not contain the front of the object.
     """

@@ -2,11 +2,10 @@
 
 The camera model (module `rig`) is a pinhole with Brown's distortion. It shares no code with the
 camera model of the nodes, because the images are used to test the nodes. The finger is a tapered
-capsule. By default, the marker is a small luminous bead, whose centre is the fingertip position.
-The module `nail` defines other markers. The module `clutter` describes the surroundings. All
-objects are drawn pixel by pixel. They are blurred by the lens, defocus, pixel area and motion
-during the exposure. Then photon and read noise are added, and the result is clipped and rounded to
-grey levels.
+capsule. By default, the marker is a small luminous bead at the fingertip. The module `nail` defines
+other markers. The module `clutter` describes the surroundings. All objects are drawn pixel by
+pixel. They are blurred by the lens, defocus, pixel area and motion during the exposure. Then photon
+and read noise are added, and the result is clipped and rounded to grey levels.
 """
 
 from __future__ import annotations
@@ -87,8 +86,9 @@ GRAIN = 1 << 21
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """The properties of the image sensor and the lens. Grey levels (0 to 255) are proportional to
-    the light.
+    """The properties of the image sensor and the lens.
+
+    Grey levels (0 to 255) are proportional to the light.
 
     photons_per_level: full-well capacity in photons, divided by 255. The variance of the photon
         noise at level L is L / photons_per_level.
@@ -113,27 +113,22 @@ class Sensor:
     noisy_backgrounds: int = 8
 
     def noise(self, levels: Singles) -> Singles:
-        """Return the standard deviation of photon noise and read noise for an array of grey
-        levels.
-        """
+        """Return the standard deviation of photon and read noise for an array of grey levels."""
         variance = levels * np.float32(1.0 / self.photons_per_level) + np.float32(
             self.read_noise**2
         )
         return np.asarray(np.sqrt(variance), dtype=np.float32)
 
     def spread_px(self, depth_m: float, focal_px: float) -> float:
-        """Return the blur of a point (standard deviation, px) due to lens, defocus and pixel
-        area.
-        """
+        """Return the blur of a point (standard deviation, px) by lens, defocus and pixel area."""
         defocus_px = 0.25 * focal_px * self.aperture_m * abs(1.0 / depth_m - 1.0 / self.focus_m)
         return float(np.sqrt(self.blur_px**2 + defocus_px**2 + 1.0 / 12.0))
 
     def out_of_focus(self, defocus_px: float, depth_m: float, focal_px: float) -> Sensor:
-        """Return a copy of the sensor whose focus is behind `depth_m`, so that points at `depth_m`
-        are blurred.
+        """Return a copy of the sensor that blurs points at the depth `depth_m` by defocus.
 
         defocus_px: standard deviation of the blur by the defocus alone. Raises ValueError if even a
-        focus at infinity gives less blur.
+            focus at infinity gives less blur.
         """
         nearer = 4.0 * defocus_px / (focal_px * self.aperture_m)
         focus = 1.0 / depth_m - nearer
@@ -147,8 +142,7 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """One simulated camera of the stereo camera, with the rays through its pixels and its
-    background images.
+    """One camera of the simulated stereo camera, with pixel rays and background images.
 
     slopes_x, slopes_y (rows, columns): x/z and y/z of the ray through each pixel, in the camera
         frame.
@@ -184,8 +178,7 @@ class CameraView:
         return np.array(project_ray(self.lens, x / z, y / z)), z
 
     def window(self, pixels: Sequence[tuple[float, float]], reach_px: float) -> Window | None:
-        """Return the bounding box of pixels, enlarged by `reach_px` on each side and limited to the
-        image.
+        """Return the bounding box of pixels, enlarged by `reach_px` on each side, within the image.
 
         Return None if the bounding box is outside the image.
         """
@@ -202,9 +195,7 @@ class CameraView:
 
 
 class TwinCamera:
-    """A simulated stereo camera, which renders image pairs. The random seed determines the
-    noise.
-    """
+    """A simulated stereo camera that renders image pairs. The random seed determines the noise."""
 
     def __init__(
         self,
@@ -270,9 +261,8 @@ class TwinCamera:
         """Render the left and the right image of a finger whose tip moves during the exposure.
 
         position: function that returns the fingertip position.
-
         marker: whether the finger wears a marker.
-        time_s: simulation time at mid-exposure, which determines the positions of moving clutter.
+        time_s: simulation time at mid-exposure. It determines the positions of moving clutter.
         lit_points (n, 3): points of the sheet that the projector illuminates, world frame, m.
         """
         left, right = (
@@ -300,8 +290,7 @@ class TwinCamera:
     def _views(
         self, position: Position, exposure_s: float
     ) -> Iterator[tuple[CameraView, Floats, Floats]]:
-        """Yield each camera with sampling times (n,), s, and fingertip positions (n, 3), m, at
-        these times.
+        """Yield each camera with sampling times (n,), s, and fingertip positions (n, 3), m.
 
         The times are relative to mid-exposure.
         """
@@ -314,11 +303,11 @@ class TwinCamera:
         yield right, instants_s, tips
 
     def _instants(self, position: Position, exposure_s: float) -> tuple[Floats, Floats]:
-        """Return the times (n,), s, and fingertip positions (n, 3), m, that are drawn to simulate
-        motion blur.
+        """Return the times (n,), s, and fingertip positions (n, 3), m, at which the finger is
+        drawn.
 
-        The times are relative to mid-exposure. Between successive times, the fingertip moves by at
-        most MOTION_STEP_PX in the image.
+        The drawn positions add up to the motion blur. The times are relative to mid-exposure.
+        Between successive times, the fingertip moves by at most MOTION_STEP_PX in the image.
         """
         ends = [position(share * exposure_s) for share in (-0.5, 0.5)]
         travel_px = 0.0
@@ -331,10 +320,7 @@ class TwinCamera:
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
     def _exposed(self, eye: CameraView, windows: list[Window]) -> Image:
-        """Return an image that consists of a noisy background and the drawn windows of the canvas.
-
-        Reset the canvas to the background.
-        """
+        """Return a noisy background with the drawn windows of the canvas; reset the canvas."""
         image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
         for window in disjoint(windows):
             image[window] = self._read_out(eye.canvas[window])
@@ -423,9 +409,8 @@ class TwinCamera:
         motion (3,): displacement of the limb during the exposure, m. It increases the blur of the
             edges.
 
-        The profile of the edges is a cubic polynomial, which is within 2 % of the normal
-        distribution function. The polynomial is not valid for a limb that is thinner than its
-        blurred edges.
+        The profile of the edges is a cubic polynomial within 2 % of the normal distribution
+        function. It is not valid for a limb that is thinner than its blurred edges.
         """
         (x0, y0, z0), (x1, y1, z1) = apply(eye.camera_from_world, ends).tolist()
         if min(z0, z1) <= MIN_DEPTH_M:
@@ -472,8 +457,8 @@ class TwinCamera:
 
         Return the drawn window, or None if the ball is not visible.
 
-        adds: whether the ball's light is added to the background; otherwise the ball hides the
-        background.
+        adds: whether the light of the ball is added to the background; otherwise the ball hides the
+            background.
         """
         in_camera = apply(eye.camera_from_world, places)
         if in_camera[:, 2].min() <= MIN_DEPTH_M:
@@ -497,8 +482,8 @@ class TwinCamera:
 
         Return the drawn window, or None if the disc is not visible or is seen from behind.
 
-        The disc is a sum of Gaussian spots. For a disc that is larger than the blur, the sum is
-        within 1 % of the light of a uniform disc.
+        The disc is a sum of Gaussian spots. For a disc larger than the blur, the sum is within 1 %
+        of the light of a uniform disc.
         """
         in_camera = apply(eye.camera_from_world, places)
         centre = in_camera.mean(axis=0)
@@ -555,9 +540,7 @@ class TwinCamera:
         return eye
 
     def _make_background(self, height: int, width: int) -> Singles:
-        """Return the image (height, width) of a dark room, which consists of smooth noise darker
-        than the marker.
-        """
+        """Return the image (height, width) of a dark room: smooth noise darker than the marker."""
         texture = np.zeros((height, width), dtype=np.float32)
         for cells, share in ((24, 0.7), (96, 0.3)):
             coarse = self._random.standard_normal((cells, cells), dtype=np.float32)
@@ -585,10 +568,11 @@ class TwinCamera:
     def _draw_sheet(
         self, sheet: Sheet, grain: Singles, canvas: Singles, slopes: Floats, pose: Floats
     ) -> None:
-        """Draw the sheet, which lies in the world plane z = 0, on the canvas.
+        """Draw the sheet in the world plane z = 0 on the canvas.
 
-        grain: grey levels of the sheet's texture. slopes (height, width, 2): x/z and y/z of the
-        pixels' rays. pose (4, 4): camera_from_world.
+        grain: grey levels of the sheet's texture.
+        slopes (height, width, 2): x/z and y/z of the pixels' rays.
+        pose (4, 4): camera_from_world.
         """
         plane_from_ray = np.linalg.inv(pose[:3, [0, 1, 3]])
         on_plane = slopes @ plane_from_ray[:, :2].T + plane_from_ray[:, 2]

@@ -1,7 +1,7 @@
 """Simulate a projector that illuminates a flat sheet, and compute the errors of its calibration.
 
-The projector model shares no code with that of the nodes, because the simulator is used to test the
-nodes. A plane represents the sheet, because an untouched sheet between two parallel edges is flat.
+The projector model shares no code with the nodes, because the simulator is used to test the nodes.
+A plane represents the sheet, because an untouched sheet between two parallel edges is flat.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
 def make_true_projector(projector: Projector, *, seed: int) -> Projector:
     """Return a copy of the scene's projector with random deviations, like those of real devices.
 
-    The pose deviates as if it had been measured with a tape measure. Deviations are normally
-    distributed and limited to two standard deviations.
+    The deviations of the pose are typical of a tape measure. Deviations are normally distributed
+    and limited to two standard deviations.
     """
     random = np.random.default_rng(seed)
 
@@ -101,9 +101,7 @@ def sheet_poses(count: int) -> list[Floats]:
 
 
 class LitSheet:
-    """A simulation of a stereo camera in front of a flat sheet that the projector illuminates from
-    behind.
-    """
+    """A simulated stereo camera in front of a flat sheet that the projector illuminates."""
 
     def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
         """Store the parameters of the simulated devices.
@@ -122,9 +120,9 @@ class LitSheet:
     def pair(
         self, patterns: Sequence[Image], world_from_sheet: Floats, points: Floats | None = None
     ) -> tuple[list[Image], list[Image]]:
-        """Render the left and right images of patterns that are projected onto the sheet at a pose
-        (4, 4).
+        """Render the left and right images of patterns that are projected onto the sheet.
 
+        world_from_sheet: pose (4, 4) of the sheet.
         points (n, 3): points of a sheet that sags by its weight, m; None for a flat sheet.
         """
         bend = None if points is None else _fit_bend(apply(inverse(world_from_sheet), points))
@@ -192,11 +190,11 @@ class LitSheet:
     def _lit_by(
         self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats, bend: Floats | None
     ) -> tuple[Singles, Singles, NDArray[np.bool_]]:
-        """Return the projector columns and rows that illuminate the sheet at the points that camera
-        rays hit.
+        """Return the projector columns and rows that illuminate the sheet where camera rays hit it.
 
-        rays: x/z and y/z (rows, columns, 2) in the camera frame. The third result states for each
-            ray whether it hits the sheet.
+        The third result is a mask of the rays that hit the sheet.
+
+        rays: x/z and y/z (rows, columns, 2) in the camera frame.
         """
         directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
         directions = directions @ world_from_eye[:3, :3].T
@@ -219,9 +217,7 @@ class LitSheet:
 
 
 def _fit_bend(points: Floats) -> Floats:
-    """Return the coefficients (5, 5) of a polynomial z(x, y) that is fitted to points (n, 3) in the
-    sheet's frame.
-    """
+    """Fit a polynomial z(x, y), coefficients (5, 5), to points (n, 3) in the frame of the sheet."""
     powers = polynomial.polyvander2d(points[:, 0], points[:, 1], [4, 4])
     return np.asarray(np.linalg.lstsq(powers, points[:, 2], rcond=None)[0].reshape(5, 5))
 
@@ -229,7 +225,7 @@ def _fit_bend(points: Floats) -> Floats:
 def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Intersect rays (..., 3) from a point with the x-y plane of a pose (4, 4).
 
-    Return the points (..., 3), and whether they are in front of the origin of the rays.
+    Return the points (..., 3), and a mask of the points in front of the origin.
     """
     normal = plane[:3, 2]
     slant = directions @ normal
@@ -251,12 +247,12 @@ def pixels_lighting(projector: Projector, points: Floats) -> Floats:
 def errors_at_eye(
     believed: Projector, true: Projector, eye: Floats, planes: Sequence[Floats], half_m: float
 ) -> Floats:
-    """Return the distances (n,), m, between the intended and the actual positions of projected
-    points, as an eye sees them.
+    """Return the distances (n,), m, between intended and actual projected points, as an eye sees
+    them.
 
-    The distances are measured on the imaginary screen, which is the world plane z = 0. The points
-    form a grid of +-half_m on each plane (4, 4). The pixels are computed with the calibrated
-    projector `believed`. The projector `true` projects these pixels.
+    The distances are measured on the imaginary screen (world plane z = 0). The points form a grid
+    of +-half_m on each plane (4, 4). The calibrated projector `believed` computes their pixels, and
+    the projector `true` projects these pixels.
     """
     axis = np.linspace(-half_m, half_m, 9)
     flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)

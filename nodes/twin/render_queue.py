@@ -1,6 +1,4 @@
-"""Queue the frames that the simulated eye renders, one for each label, correction method and
-viewpoint.
-"""
+"""Queue the frames that the simulated eye renders."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ J = TypeVar("J")
 
 
 class RenderQueue(Generic[J]):
-    """A queue of rendering jobs in order of arrival, which prevents repeated rendering.
+    """A queue of rendering jobs in order of arrival, without repeated jobs.
 
     max_length: maximum number of waiting jobs.
     min_interval_s: minimum time before a job with the same key is rendered again.
@@ -43,10 +41,7 @@ class RenderQueue(Generic[J]):
         return now_ns - at_ns < self._min_interval_s * 1e9
 
     def reject(self, key: Key) -> bool:
-        """Record that a job was rejected because the queue is full.
-
-        Return whether this is the first rejection for the key, which the caller should report.
-        """
+        """Record that the full queue rejected a job; return True at the first time for this key."""
         is_new = key not in self._rejected
         self._rejected.add(key)
         return is_new
@@ -56,13 +51,11 @@ class RenderQueue(Generic[J]):
         self._jobs[key] = job
 
     def next(self) -> tuple[Key, J]:
-        """Return the key and the content of the oldest job, without removing the job from the
-        queue.
-        """
+        """Return the key and the content of the oldest job; the job remains in the queue."""
         return next(iter(self._jobs.items()))
 
     def finish(self, key: Key, now_ns: int) -> None:
-        """Remove a rendered job, and store the time `now_ns` of its rendering."""
+        """Remove a rendered job, and store the time of its rendering."""
         self._jobs.pop(key, None)
         self._rejected.discard(key)
         self._recent_ns[key] = now_ns

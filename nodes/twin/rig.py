@@ -2,7 +2,7 @@
 
 The section `camera` of a scene corresponds to a data sheet. The simulated device deviates from the
 data sheet, and only a calibration determines the deviations. The camera model shares no code with
-that of the nodes, because the simulator is used to test the nodes.
+the nodes, because the simulator is used to test the nodes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
 
 T = TypeVar("T", float, Floats)
 
@@ -47,11 +47,11 @@ NEWTON_STEPS = 12
 
 
 def make_true_camera(camera: StereoCamera) -> StereoCamera:
-    """Return true camera parameters, which deviate at random from those in the scene.
+    """Return true camera parameters that deviate at random from those in the scene.
 
     The random seed is derived from the device name. The deviations are normally distributed and
     limited to two standard deviations. The pose of the left camera, image size, rate and exposure
-    are unchanged.
+    do not change.
     """
     name = hashlib.sha256(camera.device.encode()).digest()
     random = np.random.default_rng(np.frombuffer(name, dtype=np.uint32))
@@ -110,10 +110,9 @@ def project_ray(lens: Lens, u: T, v: T) -> tuple[T, T]:
 
 
 def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
-    """Return the derivatives dx/du, dx/dv and dy/dv of Brown's distortion, where dy/du equals
-    dx/dv.
+    """Return the derivatives dx/du, dx/dv and dy/dv of Brown's distortion; dy/du equals dx/dv.
 
-    u, v: x/z and y/z of the ray. x and y are these slopes after the distortion.
+    u, v: x/z and y/z of the ray. x, y: these slopes after the distortion.
     """
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v
@@ -122,6 +121,21 @@ def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
     xx = radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u
     yy = radial + slope * v * v + 6.0 * p1 * v + 2.0 * p2 * u
     return xx, slope * u * v + 2.0 * p1 * u + 2.0 * p2 * v, yy
+
+
+def stereo_pixels(
+    camera: StereoCamera, left_from_world: Floats, points: Floats
+) -> tuple[Floats, Floats]:
+    """Return the pixels (2,) of a moving point in the left and in the right image.
+
+    points (2, 3): world positions of the point at the exposures of both images, m.
+    """
+    in_left = apply(left_from_world, points)
+    left, right = in_left[0], apply(camera.right_from_left, in_left)[1]
+    return (
+        pixels_of(camera.left, left[:2] / left[2]),
+        pixels_of(camera.right, right[:2] / right[2]),
+    )
 
 
 def pixels_per_slope(lens: Lens, slope_x: float, slope_y: float) -> float:

@@ -1,6 +1,7 @@
-"""Displace the flanges (last links of the arms) by the tension and the weight of the sheet.
+"""Compute the true sheet, and the displacement of the arms by its tension and weight.
 
-An apparatus contains the true parameters of the simulated hardware.
+An apparatus contains the true parameters of the simulated hardware. A flange is the last link of an
+arm.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from typing import Self
 import numpy as np
 
 from flexsheet.messages.apparatus import Apparatus
-from flexsheet.messages.scene import SheetSpec
+from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.nodes.arrays import Floats
-from flexsheet.nodes.models.rigid import transform
+from flexsheet.nodes.models.rigid import pose_matrix, transform
+from flexsheet.nodes.twin import membrane
 from flexsheet.nodes.twin.force_history import ForceHistory
-from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, TrueRubber, solve
+from flexsheet.nodes.twin.membrane import GRAVITY_M_PER_S2, DeformedSheet, TrueRubber, solve
 
 CELLS = 8
 """The number of intervals between nodes along each side of the sheet's mesh. Without a finger, the
@@ -37,15 +39,42 @@ def true_rubber(sheet: SheetSpec, apparatus: Apparatus | None) -> TrueRubber:
     )
 
 
-def true_friction(apparatus: Apparatus | None) -> float | None:
-    """Return the friction coefficient of the finger on the sheet, or None if nothing slips."""
-    return None if apparatus is None else apparatus.sheet.friction_coefficient
+def find_clamps(scene: Scene) -> tuple[Floats, Floats]:
+    """Return the poses flange_from_edge (4, 4) of the left and the right clamped edge."""
+    arms = scene.arms
+    return pose_matrix(arms.left.flange_from_edge), pose_matrix(arms.right.flange_from_edge)
+
+
+def solve_sheet(
+    true_scene: Scene,
+    apparatus: Apparatus | None,
+    edges: tuple[Floats, Floats],
+    finger_tip: Floats | None = None,
+    *,
+    cells: int = membrane.CELLS,
+) -> DeformedSheet:
+    """Compute the equilibrium of the true sheet between its clamped edges.
+
+    true_scene: scene with the true parameters of the devices.
+    edges: poses (4, 4) of the left and the right edge.
+    finger_tip: position (3,) of the fingertip, m; None if nothing pushes the sheet.
+    cells: number of intervals between nodes along each side of the sheet.
+
+    Raises NotConvergedError if the iteration does not converge.
+    """
+    return solve(
+        true_rubber(true_scene.sheet, apparatus),
+        *edges,
+        finger_tip=finger_tip,
+        finger_radius_m=true_scene.finger.radius_m,
+        friction_coefficient=None if apparatus is None else apparatus.sheet.friction_coefficient,
+        cells=cells,
+    )
 
 
 @dataclass(slots=True)
 class SheetPull:
-    """A model of the sheet's tension on both arms, and of the resulting displacement of compliant
-    arms.
+    """A model of the sheet's tension and weight, which displace the flanges of compliant arms.
 
     The force of a finger on the sheet is neglected, because it is small compared with the tension.
 
@@ -88,20 +117,16 @@ class SheetPull:
         )
 
     def force_n(self, distance_m: float) -> float:
-        """Return the tension (N) of a sheet whose edges would have the distance `distance_m` on
-        rigid arms.
+        """Return the tension (N) of the sheet in equilibrium with the compliant arms.
 
-        The compliant flanges move until the sheet and the arms are in equilibrium.
+        distance_m: distance of the sheet's edges if the arms were rigid.
         """
         forces_n = self._rubber_ratio * self.forces_n
         rigid_m = self.distances_m + sum(self.compliances_m_per_n) * forces_n
         return float(np.interp(distance_m, rigid_m, forces_n))
 
     def _remember(self, distance_m: float, time_s: float) -> None:
-        """Add the tension at a distance of the edges to the history of hysteresis and creep.
-
-        This method has no effect if hysteresis and creep are not modelled.
-        """
+        """Add the tension at a distance of the edges to the history of hysteresis and creep."""
         if self.history is None:
             return
         elastic_n = self.force_n(distance_m) / self._rubber_ratio
@@ -119,7 +144,9 @@ class SheetPull:
     ) -> tuple[Floats, Floats]:
         """Return both flange poses (4, 4) after displacement by the sheet's tension and weight.
 
-        The flanges are not rotated. time_s: time of the poses, which must not decrease.
+        The flanges are not rotated.
+
+        time_s: time of the poses; it must not decrease.
         """
         left_m = (world_from_left_flange @ left_flange_from_edge)[:3, 3]
         right_m = (world_from_right_flange @ right_flange_from_edge)[:3, 3]

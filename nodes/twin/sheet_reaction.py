@@ -1,10 +1,10 @@
 """Tabulate the force of the simulated sheet on a finger.
 
 The force is needed every millisecond, but the membrane model takes a tenth of a second per push.
-The table contains the normal force of pushes
-along the sheet's normal. The force is the product of two factors. The first factor is the force at
-the sheet's centre for several stretch ratios. The second factor is the ratio of the force at other
-positions to the force at the centre, for the mean stretch ratio.
+The table contains the normal force of pushes along the sheet's normal. The force is the product of
+two factors. The first factor is the force at the sheet's centre for several stretch ratios. The
+second factor is the ratio of the force at other positions to the force at the centre, for the mean
+stretch ratio.
 """
 
 from __future__ import annotations
@@ -45,13 +45,16 @@ DEPTH_STEPS = 256
 
 @dataclass(frozen=True, slots=True)
 class SheetReaction:
-    """A table of the normal force (N) of the sheet on a finger over stretch ratio, position and
-    indentation.
+    """A table of the normal force (N) of the sheet on a finger.
 
-    width_m, height_m: dimensions of the sheet at rest, (1,). stretches (s,): stretch ratios.
-    depths_m (d,): depths in equal steps from 0. centre_n (s, d): force at the centre. ratios (p, p,
-    d): ratio of the force at POSITION_FRACTIONS of width and height to the force at the centre. The
-    sheet is assumed to be symmetric.
+    The sheet is assumed to be symmetric.
+
+    width_m, height_m: dimensions of the sheet at rest, (1,).
+    stretches (s,): stretch ratios.
+    depths_m (d,): depths in equal steps from 0.
+    centre_n (s, d): force at the centre.
+    ratios (p, p, d): ratio of the force at POSITION_FRACTIONS of width and height to the force at
+        the centre.
     """
 
     width_m: Floats
@@ -82,9 +85,7 @@ class SheetReaction:
 def load_or_compute_reaction(
     scene: Scene, apparatus: Apparatus | None, cache_dir: Path | None = None
 ) -> SheetReaction:
-    """Return the force table of a scene's true sheet from the cache, or compute it. The computation
-    takes 10 s.
-    """
+    """Return the force table of a scene's true sheet from the cache, or compute it in 10 s."""
     true_scene = apply_apparatus(scene, apparatus)
     sheet = true_scene.sheet
     rubber = replace(

@@ -1,7 +1,6 @@
 """Compute the surface of the unloaded sheet: the plane between its edges, and its sag by weight.
 
-The sag is computed with the membrane model of the simulator, which shares no code with the sag
-model of the nodes.
+The simulator's membrane model computes the sag. It shares no code with the sag model of the nodes.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from flexsheet.messages.apparatus import Apparatus
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arrays import Floats
 from flexsheet.nodes.models.rigid import transform
-from flexsheet.nodes.twin.membrane import TrueRubber, solve
+from flexsheet.nodes.twin.membrane import TrueRubber, make_edge_plane, solve
 from flexsheet.nodes.twin.sheet_pull import true_rubber
 from flexsheet.nodes.twin.truth import apply_apparatus
 
@@ -37,9 +36,10 @@ STRETCH_MARGIN = 0.005
 class SheetPlanes:
     """The planes of the sheet at n times.
 
-    The attributes are points (n, 3), m, unit normals (n, 3), x axes (n, 3), and distances (n,)
-    between the clamped edges, m. For planes through the edges, the points are midway between the
-    edges.
+    points (n, 3): points on the planes, m. They are midway between the clamped edges if the planes
+        contain the edges.
+    normals, x_axes (n, 3): unit vectors.
+    distances_m (n,): distances between the clamped edges.
     """
 
     points: Floats
@@ -47,19 +47,12 @@ class SheetPlanes:
     x_axes: Floats
     distances_m: Floats
 
-
-def make_edge_plane(left: Floats, right: Floats) -> Floats:
-    """Return the pose (4, 4) of the plane through both edges (4, 4) of the sheet.
-
-    The origin is midway between the edges. x points to the right edge, and z points towards the
-    user.
-    """
-    across = right[:3, 3] - left[:3, 3]
-    across = across / np.linalg.norm(across)
-    normal = np.cross(across, left[:3, 1] + right[:3, 1])
-    normal /= np.linalg.norm(normal)
-    rotation = np.column_stack([across, np.cross(normal, across), normal])
-    return transform(rotation, 0.5 * (left[:3, 3] + right[:3, 3]))
+    @classmethod
+    def through(cls, left: Floats, right: Floats) -> Self:
+        """Return the plane through the edges with the poses `left` and `right` (4, 4)."""
+        x_axis, _, normal, middle = make_edge_plane(left, right)[:3].T
+        distance_m = np.linalg.norm(right[:3, 3] - left[:3, 3])
+        return cls(middle[None], normal[None], x_axis[None], np.array([distance_m]))
 
 
 class SagTable:
@@ -80,8 +73,7 @@ class SagTable:
     def evaluate(
         self, distances_m: Floats, leans: Floats, x_m: Floats, y_m: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the sag (n,), m, along the normal, and its derivatives (n,) with respect to x and
-        y.
+        """Return the sag (n,), m, along the normal, and its slopes (n,) along x and along y.
 
         distances_m: distances (n,) between the edges. leans: vertical components (n,) of the sheet
         normals. x_m, y_m: positions (n,) relative to the sheet's centre.
@@ -110,9 +102,7 @@ def _compute_tension(stretch: Floats) -> Floats:
 
 
 def lagrange(nodes: Floats, at: Floats | float) -> Floats:
-    """Return the values (n, ...) of the n Lagrange polynomials of `nodes` (n,) at positions
-    (...).
-    """
+    """Return the Lagrange polynomials (n, ...) of `nodes` (n,) at positions `at` (...)."""
     factors = [
         np.prod([(at - other) / (node - other) for other in nodes if other != node], axis=0)
         for node in nodes
@@ -161,11 +151,11 @@ class SheetSurface:
         return cls(_cached_table(rubber, max(low - STRETCH_MARGIN, 1.01), high + STRETCH_MARGIN))
 
     def find_tangent_planes(self, planes: SheetPlanes, points: Floats, up: Floats) -> SheetPlanes:
-        """Return the tangent planes of the sheet at the projections of points (n, 3) onto the
-        sheet.
+        """Return the tangent planes of the sheet at n points.
 
-        planes: planes through the edges. up (3,): unit vector against gravity, in the frame of the
-        planes.
+        points (n, 3): points that are projected onto the sheet.
+        planes: planes through the edges.
+        up (3,): unit vector against gravity, in the frame of the planes.
         """
         if self.table is None:
             return planes

@@ -30,9 +30,9 @@ and correct a larger deviation."""
 class Profile(StrEnum):
     """The age of the laboratory's equipment.
 
-    modern: a 60 Hz camera with a short read-out, and robot controllers with a short period.
-    paper: equipment as in Furukawa et al. 2007: a camera of 15 to 48 Hz, whose read-out takes most
-        of a frame period, and a controller period of 7.1 ms.
+    MODERN: a 60 Hz camera with a short read-out, and robot controllers with a short period.
+    PAPER: equipment as in Furukawa et al. 2007. The camera has 15 to 48 Hz, and its read-out takes
+        most of a frame period. The controller period is 7.1 ms.
     """
 
     MODERN = "modern"
@@ -47,17 +47,16 @@ class Distribution(Protocol):
         ...
 
     def at(self, sigmas: float) -> Any:
-        """Return the quantile that corresponds to `sigmas` standard deviations of a normal
-        distribution.
+        """Return the quantile at `sigmas` standard deviations of a normal distribution.
+
+        Example: 0 gives the median, and 1 gives the quantile of 84 %.
         """
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Normal:
-    """A normal distribution whose samples are limited to MAX_DEVIATION_SIGMAS and to the range
-    `low` to `high`.
-    """
+    """A normal distribution, truncated at MAX_DEVIATION_SIGMAS and at `low` and `high`."""
 
     mean: float
     sigma: float
@@ -68,13 +67,12 @@ class Normal:
         return self.at(float(random.standard_normal()))
 
     def at(self, sigmas: float) -> float:
-        limited = min(max(sigmas, -MAX_DEVIATION_SIGMAS), MAX_DEVIATION_SIGMAS)
-        return min(max(self.mean + self.sigma * limited, self.low), self.high)
+        return min(max(self.mean + self.sigma * _limit(sigmas), self.low), self.high)
 
 
 @dataclass(frozen=True, slots=True)
 class LogNormal:
-    """A log-normal distribution whose samples are limited to MAX_DEVIATION_SIGMAS."""
+    """A log-normal distribution, truncated at MAX_DEVIATION_SIGMAS."""
 
     median: float
     sigma_ln: float
@@ -83,15 +81,12 @@ class LogNormal:
         return self.at(float(random.standard_normal()))
 
     def at(self, sigmas: float) -> float:
-        limited = min(max(sigmas, -MAX_DEVIATION_SIGMAS), MAX_DEVIATION_SIGMAS)
-        return self.median * math.exp(self.sigma_ln * limited)
+        return self.median * math.exp(self.sigma_ln * _limit(sigmas))
 
 
 @dataclass(frozen=True, slots=True)
 class HalfNormal:
-    """A half-normal distribution (of absolute normal values) whose samples are limited to
-    MAX_DEVIATION_SIGMAS.
-    """
+    """A distribution of absolute values of a normal variable, truncated at MAX_DEVIATION_SIGMAS."""
 
     sigma: float
 
@@ -99,7 +94,7 @@ class HalfNormal:
         return self.at(abs(float(random.standard_normal())))
 
     def at(self, sigmas: float) -> float:
-        return self.sigma * min(max(sigmas, 0.0), MAX_DEVIATION_SIGMAS)
+        return self.sigma * max(_limit(sigmas), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +108,7 @@ class Uniform:
         return self.low + (self.high - self.low) * float(random.random())
 
     def at(self, sigmas: float) -> float:
-        share = 0.5 * (1.0 + math.erf(sigmas / math.sqrt(2.0)))
-        return self.low + (self.high - self.low) * share
+        return self.low + (self.high - self.low) * _normal_cdf(sigmas)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,35 +122,28 @@ class LogUniform:
         return float(self.low * (self.high / self.low) ** float(random.random()))
 
     def at(self, sigmas: float) -> float:
-        share = 0.5 * (1.0 + math.erf(sigmas / math.sqrt(2.0)))
-        return float(self.low * (self.high / self.low) ** share)
+        return float(self.low * (self.high / self.low) ** _normal_cdf(sigmas))
 
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """A discrete distribution over a few values in ascending order, with equal probabilities."""
+    """A discrete distribution over values in ascending order, with equal probabilities."""
 
-    values: tuple[float, ...]
-
-    def draw(self, random: np.random.Generator) -> float:
-        return self.values[int(random.integers(len(self.values)))]
-
-    def at(self, sigmas: float) -> float:
-        share = 0.5 * (1.0 + math.erf(sigmas / math.sqrt(2.0)))
-        return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
-
-
-@dataclass(frozen=True, slots=True)
-class Always:
-    """A distribution that always gives the same value, for parameters without tolerance."""
-
-    value: float | str
+    values: tuple[float | str, ...]
 
     def draw(self, random: np.random.Generator) -> float | str:
-        return self.value
+        return self.values[int(random.integers(len(self.values)))]
 
     def at(self, sigmas: float) -> float | str:
-        return self.value
+        return self.values[min(int(_normal_cdf(sigmas) * len(self.values)), len(self.values) - 1)]
+
+
+def _limit(sigmas: float) -> float:
+    return min(max(sigmas, -MAX_DEVIATION_SIGMAS), MAX_DEVIATION_SIGMAS)
+
+
+def _normal_cdf(sigmas: float) -> float:
+    return 0.5 * (1.0 + math.erf(sigmas / math.sqrt(2.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,11 +206,11 @@ _ROWS = (
     Tolerance("camera.right_rotation_offset_rad", "mrad", MRAD, Normal(0.0, 0.2e-3),
               "drift 0.2 mrad, from memory", calibrated=Normal(0.0, 0.045e-3),
               calibrated_source="docs/camera.md: residual 0.024 px of 540"),
-    Tolerance("camera.rate_hz", "Hz", 1.0, Always(60.0), "USB3 cameras: 60 to 120 Hz",
+    Tolerance("camera.rate_hz", "Hz", 1.0, OneOf((60.0,)), "USB3 cameras: 60 to 120 Hz",
               paper=OneOf((15.0, 30.0, 48.0))),
     Tolerance("camera.read_out_s", "ms (paper: frames)", MS, Uniform(1.5e-3, 4e-3),
               "computed: 614,400 bytes over USB3, or over 1394a at 0.9 frame",
-              paper=Always(0.9), frame_periods=(Profile.PAPER,)),
+              paper=OneOf((0.9,)), frame_periods=(Profile.PAPER,)),
     Tolerance("camera.skew_s", "ms", MS, Normal(0.0, 0.02e-3),
               "one stream for both sensors (ptgrey.com KB 312); trigger cable"),
     Tolerance("camera.exposure_jitter_s", "ms", MS, Uniform(0.05e-3, 0.2e-3), J),
@@ -254,7 +241,7 @@ _ROWS = (
               calibrated_source="launch/experiments/lag.py: standard error 0.6 to 1.9 ms"),
     Tolerance("arms.*.controller_period_s", "ms", MS, OneOf((1e-3, 2e-3, 4e-3)),
               "RV-1A: 7.1 ms (docs/mxt.md); newer controllers: 1 to 4 ms",
-              paper=Always(7.1e-3)),
+              paper=OneOf((7.1e-3,))),
     Tolerance("arms.*.controller_jitter_s", "ms", MS, Uniform(0.02e-3, 0.1e-3), J,
               paper=Uniform(0.1e-3, 0.3e-3)),
     Tolerance("arms.*.backlash_rad", "mrad", MRAD, Uniform(0.1e-3, 0.6e-3), "from memory"),
@@ -282,7 +269,7 @@ _ROWS = (
               "nail to pad 12 mm less 1 to 2 mm of pad yield, from memory",
               calibrated=Normal(0.0, 0.3e-3),
               calibrated_source="[set-up-marker.md](set-up-marker.md): target 0.5 mm"),
-    Tolerance("finger.marker_shape", "", 1.0, Always("disc"), "a sticker on the nail"),
+    Tolerance("finger.marker_shape", "", 1.0, OneOf(("disc",)), "a sticker on the nail"),
     Tolerance("finger.marker_tilt_rad", "°", math.degrees(1.0), Normal(0.0, math.radians(10.0)),
               J),
     Tolerance("finger.finger_tilt_rad", "°", math.degrees(1.0),
@@ -357,9 +344,7 @@ for each key."""
 
 
 def expand_key(key: str) -> tuple[str, ...]:
-    """Return the dotted paths that a key represents. A key with "*" represents one path for each
-    side.
-    """
+    """Return the dotted paths of a key; a key with "*" has one path for each side."""
     return tuple(key.replace("*", side) for side in ("left", "right")) if "*" in key else (key,)
 
 
@@ -368,8 +353,8 @@ def sample_apparatus(
 ) -> Apparatus:
     """Generate a random apparatus (true hardware parameters) for a scene.
 
-    Equal arguments give equal results. With and without calibration, all profiles use the same
-    random numbers for the same seed. Therefore results can be compared in pairs.
+    Equal arguments give equal results. For one seed, all profiles use the same random numbers, with
+    and without calibration. Therefore results can be compared in pairs.
     """
     values = nominal_apparatus(scene).model_dump(mode="json")
     for row in TOLERANCES.values():
@@ -387,12 +372,11 @@ def deviate_apparatus(
     profile: Profile = Profile.MODERN,
     calibrated: bool = False,
 ) -> Apparatus:
-    """Make an apparatus (true hardware parameters) in which only the parameter `key` deviates from
-    the scene.
+    """Make an apparatus (true hardware parameters) in which only one parameter deviates.
 
-    sigmas: size of the deviation, in standard deviations of a normal distribution. All components
-    of a vector deviate equally, and so do both arms or lenses. Raises KeyError for a key that is
-    not in the tolerance table.
+    key: row of the tolerance table; other keys raise KeyError. sigmas: size of the deviation, in
+    standard deviations of a normal distribution. All components of a vector deviate equally, and so
+    do both arms or lenses.
     """
     row = TOLERANCES[key]
     given = row.of(profile, calibrated=calibrated)
@@ -430,9 +414,7 @@ def _draw_row(
 
 
 def _stream(seed: int, name: str) -> np.random.Generator:
-    """Return the random generator of the parameter `name`, which is independent of those of other
-    parameters.
-    """
+    """Return the random generator of a parameter; parameters have independent generators."""
     digest = hashlib.sha256(f"{seed}/{name}".encode()).digest()
     return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
 

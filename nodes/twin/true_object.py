@@ -1,6 +1,6 @@
 """Compute the surface of the virtual object, at rest or deformed, to verify the displayed images.
 
-The skin is the surface mesh of the soft-body solver. This module uses a separate, finer mesh, which
+The skin is the surface mesh of the soft-body solver. This module uses a separate, finer mesh that
 follows the displacement of the skin.
 """
 
@@ -49,9 +49,7 @@ class TrueObject:
 
 
 class TrueBody:
-    """The virtual object of a scene, which may have any shape. A plane is a rectangle of the
-    touchable size.
-    """
+    """The surface mesh of a scene's virtual object; a plane becomes a rectangle."""
 
     def __init__(self, scene: Scene) -> None:
         geometry, pose = scene.object.geometry, scene.object.world_from_object
@@ -82,8 +80,7 @@ class TrueBody:
     def displaced(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer], displacement: Floats
     ) -> TrueObject:
-        """Return the deformed object, each point of which moves with the nearest point of the skin
-        at rest.
+        """Return the deformed object; each point moves with the nearest point of the skin at rest.
 
         skin_vertices (s, 3): vertices of the skin (solver's surface mesh) at rest, m.
         skin_triangles (t, 3): triangles in which the displacement is interpolated linearly.
@@ -103,8 +100,7 @@ class TrueBody:
     def _on_skin(
         self, skin_vertices: Floats, skin_triangles: NDArray[np.integer]
     ) -> tuple[Indices, Floats]:
-        """Return, for each object vertex, the indices (v, 3) and weights (v, 3) of three skin
-        vertices.
+        """Return the indices (v, 3) and weights (v, 3) of three skin vertices per object vertex.
 
         Both arrays are cached until the skin changes.
         """
@@ -186,9 +182,7 @@ def _turned() -> Floats:
 
 
 def _tube(radius_m: float, length_m: float) -> tuple[Floats, Indices]:
-    """Return the vertices and triangles of a closed cylinder along x. The vertices on the rims are
-    duplicated.
-    """
+    """Return vertices and triangles of a closed cylinder along x with duplicated rim vertices."""
     side = np.repeat(radius_m * _turned()[None], ALONG + 1, axis=0)
     side[..., 0] = length_m * np.linspace(-0.5, 0.5, ALONG + 1)[:, None]
     count = AROUND * (ALONG + 1)
@@ -215,8 +209,7 @@ def _rectangle(width_m: float, height_m: float) -> tuple[Floats, Indices]:
 def _directions() -> Floats:
     """Return unit vectors (n, 3) that cover the sphere.
 
-    The vectors are ordered in rows around the x axis, from -x to +x. The last two vectors are -x
-    and +x.
+    The vectors are in rows around the x axis, from -x to +x. The last two vectors are -x and +x.
     """
     polar = np.pi * np.arange(1, 2 * ALONG) / (2 * ALONG)
     rows = np.sin(polar)[:, None, None] * _turned()
@@ -225,9 +218,7 @@ def _directions() -> Floats:
 
 
 def _star(vertices: Floats) -> tuple[Floats, Indices]:
-    """Return the vertices and triangles of a closed surface with one vertex per unit vector of
-    `_directions`.
-    """
+    """Return the vertices and triangles of a closed surface over the directions `_directions`."""
     rows, count = 2 * ALONG - 1, len(vertices)
     first, last = np.arange(AROUND), (rows - 1) * AROUND + np.arange(AROUND)
     caps = [_fan(first, count - 2), _fan(last[::-1], count - 1)]
@@ -237,7 +228,7 @@ def _star(vertices: Floats) -> tuple[Floats, Indices]:
 def _cast_rays(geometry: Geometry, shape: Shape) -> Floats:
     """Return the points (n, 3), m, at which rays from the centre leave a solid.
 
-    The solid must be star-shaped, so that all of its points are visible from the centre.
+    The solid must be star-shaped: all its points are visible from the centre.
     """
     away = _directions()
     match geometry:

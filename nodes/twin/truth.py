@@ -1,7 +1,7 @@
 """Replace the assumed parameters of a scene by the true parameters of the simulated hardware.
 
-The scene describes the object and the devices according to the assumptions of the nodes. The
-apparatus contains the deviations of the simulated devices from the scene.
+The scene describes the object, and the devices as the nodes assume them. The apparatus contains the
+deviations of the simulated devices from the scene.
 """
 
 from __future__ import annotations
@@ -45,11 +45,10 @@ class SimulatorParameters(NodeParameters):
 
 
 def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> float:
-    """Return the true time at which the projector shows a frame, minus the assumed time, in
-    seconds.
+    """Return the delay (s) of the true display of a frame after the time that the renderer assumes.
 
-    The latency that the renderer assumes is stored in the frame. Without a displayed frame, the
-    nominal latency is used. The result is 0 without an apparatus.
+    The frame contains the latency that the renderer assumes. Without a displayed frame, the nominal
+    latency is used. The result is 0 without an apparatus.
     """
     if apparatus is None:
         return 0.0
@@ -60,12 +59,11 @@ def find_display_delay_s(frame: Frame | None, apparatus: Apparatus | None) -> fl
 
 
 def apply_apparatus(scene: Scene, apparatus: Apparatus | None) -> Scene:
-    """Return the scene with the true parameters of the devices, or the scene itself without an
-    apparatus.
+    """Return the scene with the true parameters of the devices.
 
-    Virtual objects and requirements in the scene are unchanged. The returned camera has the lenses
-    of its data sheet plus the offsets in the apparatus. The function `make_true_camera` adds the
-    deviations of the individual camera.
+    Without an apparatus, the scene is returned. Virtual objects and requirements are unchanged. The
+    returned camera has the lenses of its data sheet plus the offsets in the apparatus. The function
+    `make_true_camera` adds the deviations of the individual camera.
     """
     if apparatus is None:
         return scene
@@ -168,9 +166,9 @@ def _true_arm(arm: ArmSpec, truth: ArmTruth) -> ArmSpec:
 
 
 def _shifted_pose(pose: Pose, shift_m: tuple[float, ...], rotation_rad: tuple[float, ...]) -> Pose:
-    """Return a pose that is translated in its parent frame and rotated about its own origin.
+    """Return a pose after a translation in the parent frame and a rotation about its own origin.
 
-    shift_m: translation (3,). rotation_rad: rotation vector (3,). With a zero vector, the angles
+    shift_m: translation (3,). rotation_rad: rotation vector (3,). With a zero rotation, the angles
     are exactly unchanged.
     """
     rpy_rad = pose.rpy_rad
@@ -184,9 +182,9 @@ def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
     """Express the true hardware parameters in the world frame that the stereo camera defines.
 
     Calibrations define the world frame by the left camera. In this frame, the camera's pose in the
-    scene is exact by definition. The original pose error of the camera appears as the inverse pose
-    error of arms, projector and eyes. The finger's path, the direction of gravity and the finger's
-    tilt have the same coordinates in the new world frame.
+    scene is exact. The original pose error of the camera becomes the inverse pose error of arms,
+    projector and eyes. The coordinates of the finger's path, the finger's tilt and gravity are
+    unchanged.
     """
     nominal = apparatus.nominal or devices_of(scene)
     true_scene = apply_apparatus(scene, apparatus)
@@ -236,43 +234,34 @@ def align_world_to_camera(scene: Scene, apparatus: Apparatus) -> Apparatus:
 
 
 def check_truth(scene: Scene, apparatus: Apparatus) -> list[tuple[tuple[str, ...], Any, str, str]]:
-    """List the values of an apparatus that are impossible in its scene, as (key, value, problem,
-    remedy).
+    """List the values of an apparatus that are impossible in its scene.
+
+    An entry is (key, value, problem, remedy).
     """
     base = apparatus.nominal or scene
-    found: list[tuple[tuple[str, ...], Any, str, str]] = []
-    radius_m = base.finger.radius_m + apparatus.finger.radius_offset_m
-    if radius_m <= 0.0:
-        found.append(
-            (("finger", "radius_offset_m"), apparatus.finger.radius_offset_m,
-             f"makes the finger radius {radius_m:g} m",
-             "give more than minus the scene's finger.radius_m")
-        )  # fmt: skip
-    width_m = base.sheet.width_m + apparatus.sheet.slack_width_offset_m
-    if width_m <= 0.0:
-        found.append(
-            (("sheet", "slack_width_offset_m"), apparatus.sheet.slack_width_offset_m,
-             f"makes the sheet width {width_m:g} m",
-             "give more than minus the scene's sheet.width_m")
-        )  # fmt: skip
-    if base.eyes.interocular_m + apparatus.eyes.interocular_offset_m < 0.0:
-        found.append(
-            (("eyes", "interocular_offset_m"), apparatus.eyes.interocular_offset_m,
-             "makes the distance between the eyes negative",
-             "give at least minus the scene's eyes.interocular_m")
-        )  # fmt: skip
-    hand = apparatus.finger
-    given = [hand.hand_mass_kg, hand.hand_damping_ratio, hand.hand_stiffness_n_per_m]
-    if any(one is None for one in given) and any(one is not None for one in given):
-        found.append(
-            (("finger", "hand_mass_kg"), hand.hand_mass_kg,
-             "hand mass, damping ratio and stiffness are not given together",
-             "give all three or none")
-        )  # fmt: skip
-    if hand.tremor_frequency_hz <= 0.5 * hand.tremor_width_hz:
-        found.append(
-            (("finger", "tremor_width_hz"), hand.tremor_width_hz,
-             "makes the tremor band begin below 0 Hz",
-             "give less than twice finger.tremor_frequency_hz")
-        )  # fmt: skip
-    return found
+    hand, sheet, eyes = apparatus.finger, apparatus.sheet, apparatus.eyes
+    radius_m = base.finger.radius_m + hand.radius_offset_m
+    width_m = base.sheet.width_m + sheet.slack_width_offset_m
+    missing = [hand.hand_mass_kg, hand.hand_damping_ratio, hand.hand_stiffness_n_per_m].count(None)
+    rules = (
+        (radius_m <= 0.0, ("finger", "radius_offset_m"), hand.radius_offset_m,
+         f"makes the finger radius {radius_m:g} m",
+         "give more than minus the scene's finger.radius_m"),
+        (width_m <= 0.0, ("sheet", "slack_width_offset_m"), sheet.slack_width_offset_m,
+         f"makes the sheet width {width_m:g} m",
+         "give more than minus the scene's sheet.width_m"),
+        (base.eyes.interocular_m + eyes.interocular_offset_m < 0.0,
+         ("eyes", "interocular_offset_m"), eyes.interocular_offset_m,
+         "makes the distance between the eyes negative",
+         "give at least minus the scene's eyes.interocular_m"),
+        (missing in (1, 2), ("finger", "hand_mass_kg"), hand.hand_mass_kg,
+         "hand mass, damping ratio and stiffness are not given together",
+         "give all three or none"),
+        (hand.tremor_frequency_hz <= 0.5 * hand.tremor_width_hz,
+         ("finger", "tremor_width_hz"), hand.tremor_width_hz,
+         "makes the tremor band begin below 0 Hz",
+         "give less than twice finger.tremor_frequency_hz"),
+    )  # fmt: skip
+    return [
+        (key, value, problem, remedy) for is_wrong, key, value, problem, remedy in rules if is_wrong
+    ]

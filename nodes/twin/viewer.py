@@ -40,9 +40,7 @@ class HeadSway:
 
     @classmethod
     def drawn(cls, eyes: EyesTruth, seed: int) -> Self | None:
-        """Generate a random head motion from the true eye parameters; return None for a head at
-        rest.
-        """
+        """Generate a random head motion from the true eye parameters; None for a head at rest."""
         if not eyes.sway_m:
             return None
         band_hz = (MIN_SWAY_FREQUENCY_RATIO * eyes.sway_frequency_hz, eyes.sway_frequency_hz)
@@ -54,9 +52,7 @@ class HeadSway:
 
 
 class Viewer:
-    """A simulated person whose eyes have the true positions of a scene, and who aligns points by
-    sight.
-    """
+    """A simulated person who aligns points by sight."""
 
     def __init__(
         self, true_scene: Scene, sway: HeadSway | None, random: np.random.Generator
@@ -77,10 +73,10 @@ class Viewer:
     def align(self, side: Side, bead: Floats, sheet: DeformedSheet, time_s: float) -> Floats | None:
         """Return the point (3,) of the sheet, world frame, m, that an eye sees behind a bead.
 
-        bead (3,): position, world frame, m.
-
         The point contains a random alignment error. Return None if the sheet is not behind the
         bead.
+
+        bead (3,): position, world frame, m.
         """
         eye = self.locate_eye(side, time_s)
         error = rotation_from_vector(self._random.normal(0.0, ALIGNMENT_RAD, 3))
