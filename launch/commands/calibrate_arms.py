@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
-import shutil
-import sys
 import tempfile
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -20,13 +17,15 @@ from flexsheet.launch.commands.calibrate import (
     DictionaryOption,
     MarkerOption,
     SquareOption,
-    _parse_board,
-    _progress,
-    edit_scene,
+    app,
+    command_line,
     load_optics,
     load_true_devices,
+    parse_board,
+    pose_values,
     require_twin,
     round_digits,
+    write_scene_values,
 )
 from flexsheet.launch.commands.graph import run_interruptible
 from flexsheet.launch.commands.options import (
@@ -43,6 +42,8 @@ from flexsheet.launch.commands.output import (
     examples,
     print_fields,
     print_json,
+    print_outcome,
+    progress_bar,
     words,
 )
 
@@ -69,30 +70,14 @@ CalibrationOption = Annotated[
 SIDES: tuple[Side, Side] = ("left", "right")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands that calibrate the arms to `flexsheet calibrate`."""
-    app.command(
-        "arms",
-        epilog=examples(
-            "flexsheet calibrate arms --scene lab.yaml --left-arm places-left --right-arm "
-            "places-right --board 9x6 --square-mm 10 -o arms.yaml",
-            "flexsheet calibrate arms --scene launch/scenes/cylinder.yaml --twin --board 9x6 "
-            "--square-mm 10 -o arms.yaml",
-        ),
-    )(arms)
-    app.command(
-        "arms-capture",
-        epilog=examples(
-            "flexsheet calibrate arms-capture --arm left --scene lab.yaml --board 9x6 "
-            "--square-mm 10 -o places-left"
-        ),
-    )(capture)
-    app.command(
-        "arms-scene",
-        epilog=examples("flexsheet calibrate arms-scene arms.yaml lab.yaml -o lab-measured.yaml"),
-    )(write_scene)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate arms --scene lab.yaml --left-arm places-left --right-arm "
+        "places-right --board 9x6 --square-mm 10 -o arms.yaml",
+        "flexsheet calibrate arms --scene launch/scenes/cylinder.yaml --twin --board 9x6 "
+        "--square-mm 10 -o arms.yaml",
+    ),
+)
 def arms(
     *,
     scene_file: SceneOption,
@@ -147,28 +132,24 @@ def arms(
         _check_new_file(copy, "--write-scene")
     scene = load_scene(scene_file)
     true = load_true_devices(apparatus, scene)
-    described = _parse_board(board, square_mm, marker_mm, dictionary)
+    described = parse_board(board, square_mm, marker_mm, dictionary)
     optics = load_optics(calibration, scene)
     folders: dict[Side, Path | None] = {"left": left_arm, "right": right_arm}
     fits: dict[Side, BaseFit] = {}
     blind: dict[Side, list[tuple[str, str]]] = {}
-    simulated = Path(tempfile.mkdtemp(prefix="flexsheet-arms-")) if twin else None
-    try:
+    with tempfile.TemporaryDirectory(prefix="flexsheet-arms-") as simulated:
         for side in SIDES:
-            if simulated is not None:
+            if twin:
                 folders[side] = simulate_folder(
-                    scene, described, side, true, folder=simulated, places=places, seed=seed
+                    scene, described, side, true, folder=Path(simulated), places=places, seed=seed
                 )
             folder = folders[side]
             if folder is not None:
                 fits[side], blind[side] = fit_folder(folder, described, scene, optics, side)
-    finally:
-        if simulated is not None:
-            shutil.rmtree(simulated)
     measured = make_calibration(fits, scene, described)
-    save_arms_calibration(measured, output, comment=shlex.join(["flexsheet", *sys.argv[1:]]))
+    save_arms_calibration(measured, output, comment=command_line())
     if copy is not None:
-        _write_copy(scene_file, measured, copy)
+        write_scene_values(scene_file, list_scene_values(measured), copy)
     truth = (
         {side: _true_errors(scene, side, fits[side], true, seed) for side in fits} if twin else {}
     )
@@ -177,6 +158,10 @@ def arms(
     )
 
 
+@app.command(
+    "arms-scene",
+    epilog=examples("flexsheet calibrate arms-scene arms.yaml lab.yaml -o lab-measured.yaml"),
+)
 def write_scene(
     calibration: Annotated[
         Path, typer.Argument(metavar="CALIBRATION", help="Arm calibration file.")
@@ -191,13 +176,17 @@ def write_scene(
 
     _check_new_file(output, "-o")
     load_scene(scene_file)
-    _write_copy(scene_file, load_arms_calibration(calibration), output)
-    if as_json:
-        print_json({"scene": str(output)})
-    else:
-        words.print(f"scene: {output}")
+    write_scene_values(scene_file, list_scene_values(load_arms_calibration(calibration)), output)
+    print_outcome({"scene": str(output)}, f"scene: {output}", as_json=as_json)
 
 
+@app.command(
+    "arms-capture",
+    epilog=examples(
+        "flexsheet calibrate arms-capture --arm left --scene lab.yaml --board 9x6 "
+        "--square-mm 10 -o places-left"
+    ),
+)
 def capture(
     *,
     side: Annotated[
@@ -235,7 +224,7 @@ def capture(
     if side not in SIDES:
         raise CommandError(f"--arm {side}: unknown arm; give left or right")
     scene = load_scene(scene_file)
-    described = _parse_board(board, square_mm, marker_mm, dictionary)
+    described = parse_board(board, square_mm, marker_mm, dictionary)
     try:
         output.mkdir(parents=True)
     except OSError as error:
@@ -253,10 +242,11 @@ def capture(
     run_interruptible(
         record_poses(recorder, on_arm, [f"arm_{side}"], size=size, places=places, run=run)
     )
-    if as_json:
-        print_json({"folder": str(output), "poses": recorder.count})
-    else:
-        words.print(f"{recorder.count} poses in {output}")
+    print_outcome(
+        {"folder": str(output), "poses": recorder.count},
+        f"{recorder.count} poses in {output}",
+        as_json=as_json,
+    )
 
 
 async def record_poses(
@@ -334,11 +324,11 @@ def simulate_folder(
 
     poses = folder / side
     poses.mkdir()
-    with _progress(f"simulating the {side} arm") as progress:
+    with progress_bar(f"simulating the {side} arm") as progress:
         for done in simulate_poses(
             scene, board, side, poses, places=places, seed=seed, apparatus=apparatus
         ):
-            progress(done, places, f"simulating the {side} arm")
+            progress(done, places)
     return poses
 
 
@@ -352,7 +342,7 @@ def fit_folder(
     size = (scene.camera.width_px, scene.camera.height_px)
     detections: list[BoardDetection]
     try:
-        with _progress(f"{side} arm: detecting the board") as progress:
+        with progress_bar(f"{side} arm: detecting the board") as progress:
             detections, blind = read_detections(folder, board, rig, size, progress)
         with words.status(f"{side} arm: fitting"):
             return calibrate_base(detections, rig, getattr(scene.arms, side).model), blind
@@ -414,16 +404,13 @@ def _make_arm_base(fit: BaseFit) -> ArmBase:
     )
 
 
-def _write_copy(scene_file: Path, measured: ArmsCalibration, copy: Path) -> None:
-    with edit_scene(scene_file, copy) as tree:
-        for side in SIDES:
-            base: ArmBase | None = getattr(measured, side)
-            if base is None:
-                continue
-            target = tree["arms"][side]["world_from_base"]
-            for key in ("position_m", "rpy_rad"):
-                for index, value in enumerate(getattr(base.world_from_base, key)):
-                    target[key][index] = round_digits(value)
+def list_scene_values(measured: ArmsCalibration) -> dict[str, Any]:
+    """Return the calibrated poses of the arm bases, by their dotted paths in a scene file."""
+    values = {}
+    for side, base in (("left", measured.left), ("right", measured.right)):
+        if base is not None:
+            values |= pose_values(f"arms.{side}.world_from_base", base.world_from_base)
+    return values
 
 
 def _true_errors(

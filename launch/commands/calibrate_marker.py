@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.calibrate import load_true_devices
+from flexsheet.launch.commands.calibrate import app, command_line, load_true_devices
 from flexsheet.launch.commands.options import (
     CYLINDER,
     JsonOption,
@@ -33,18 +32,13 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `marker` to `flexsheet calibrate`."""
-    app.command(
-        "marker",
-        epilog=examples(
-            "flexsheet calibrate marker --rows touches.csv --scene lab.yaml -o marker.yaml",
-            "flexsheet calibrate marker --twin launch/scenes/cylinder.yaml --apparatus seed:3 "
-            "-o marker.yaml",
-        ),
-    )(marker)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate marker --rows touches.csv --scene lab.yaml -o marker.yaml",
+        "flexsheet calibrate marker --twin launch/scenes/cylinder.yaml --apparatus seed:3 "
+        "-o marker.yaml",
+    ),
+)
 def marker(
     *,
     output: Annotated[Path, output_file("Marker calibration file to write.")],
@@ -87,11 +81,9 @@ def marker(
     for name, value in (("--apparatus", apparatus), ("--calibration", calibration_file)):
         if value is not None and twin is None:
             raise CommandError(f"{name} {value}: the option is for --twin SCENE only; remove it")
-    command = ["flexsheet", "calibrate", "marker"]
     if rows is not None:
         scene = load_scene(scene_file)
         touches = read_touches(rows, scene)
-        command += ["--rows", str(rows), "--scene", str(scene_file)]
         source = str(rows)
     else:
         assert twin is not None
@@ -99,12 +91,9 @@ def marker(
         true = load_true_devices(apparatus, scene) or nominal_apparatus(scene)
         optics = None if calibration_file is None else load_calibration(calibration_file)
         touches = simulate_touches(scene, true, calibration=optics, seed=seed)
-        command += ["--twin", str(twin), "--seed", str(seed)]
-        command += [] if apparatus is None else ["--apparatus", apparatus]
-        command += [] if calibration_file is None else ["--calibration", str(calibration_file)]
         source = f"twin of {scene.name}"
     calibration = make_calibration(touches, scene, source)
-    save_marker_calibration(calibration, output, comment=shlex.join([*command, "-o", str(output)]))
+    save_marker_calibration(calibration, output, comment=command_line())
     _print_result(calibration, output, as_json)
 
 
@@ -140,8 +129,7 @@ def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerC
 
 def _print_result(calibration: MarkerCalibration, output: Path, as_json: bool) -> None:
     if as_json:
-        values = calibration.model_dump(mode="json")
-        print_json({"calibration": str(output), **values})
+        print_json({"calibration": str(output), **calibration.model_dump(mode="json")})
         return
     offsets = zip(calibration.marker_from_pad_m, calibration.standard_deviations_m, strict=True)
     print_fields(

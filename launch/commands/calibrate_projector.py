@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flexsheet.launch.commands.calibrate import (
-    edit_scene,
+    app,
     load_optics,
     load_true_devices,
+    pose_values,
     require_twin,
     round_digits,
+    write_scene_values,
 )
 from flexsheet.launch.commands.options import (
     JsonOption,
@@ -42,21 +44,18 @@ if TYPE_CHECKING:
     Views = tuple[list[Image], list[Image]]
 
 VOLUME_HALF_M = 0.1
+TWIN_POSES = 6
+"""The number of simulated poses of the sheet."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `projector` to `flexsheet calibrate`."""
-    app.command(
-        "projector",
-        epilog=examples(
-            "flexsheet calibrate projector --scene lab.yaml --write-patterns patterns",
-            "flexsheet calibrate projector --scene lab.yaml --pictures poses -o lab-measured.yaml",
-            "flexsheet calibrate projector --scene lab.yaml --corners '599,499 199,499 199,99 "
-            "599,99' --rectangle-mm 200x200",
-        ),
-    )(projector)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate projector --scene lab.yaml --write-patterns patterns",
+        "flexsheet calibrate projector --scene lab.yaml --pictures poses -o lab-measured.yaml",
+        "flexsheet calibrate projector --scene lab.yaml --corners '599,499 199,499 199,99 "
+        "599,99' --rectangle-mm 200x200",
+    ),
+)
 def projector(
     *,
     scene_file: SceneOption,
@@ -106,7 +105,6 @@ def projector(
             "--twin", help="Calibrate a simulated projector that deviates from the scene."
         ),
     ] = False,
-    poses: Annotated[int, typer.Option(min=3, help="Number of sheet poses for --twin.")] = 6,
     apparatus: TwinApparatusOption = None,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
@@ -153,7 +151,7 @@ def projector(
                 true = make_true_projector(require_projector(scene), seed=seed)
             else:
                 true = require_projector(apply_apparatus(scene, devices))
-            views = list(simulate_views(scene, true, devices, poses, seed))
+            views = list(simulate_views(scene, true, devices, TWIN_POSES, seed))
         else:
             assert pictures is not None
             views = list(read_views(pictures, len(gray_code.make_patterns(*size))))
@@ -162,7 +160,7 @@ def projector(
             measure_points(views, camera, require_projector(scene)), require_projector(scene)
         )
     if output is not None:
-        write_scene(scene_file, fit.projector, output)
+        write_scene_values(scene_file, list_scene_values(fit.projector), output)
     _print_result(scene, fit, true, output, as_json=as_json)
 
 
@@ -230,8 +228,10 @@ def simulate_views(
 
 
 def load_camera(scene: Scene, calibration: Path | None) -> StereoCamera:
-    """Return the stereo camera of the scene, with the lenses and baseline of a calibration if
-    given."""
+    """Return the stereo camera of the scene.
+
+    If a calibration is given, the camera has the calibrated lenses and baseline.
+    """
     optics = load_optics(calibration, scene)
     if optics is None:
         return scene.camera
@@ -262,24 +262,13 @@ def _fit_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
     return fit_keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, require_projector(scene))
 
 
-def write_scene(scene_file: Path, projector: Projector, copy: Path) -> None:
-    """Write a copy of a scene file with another projector; preserve comments and layout."""
-    with edit_scene(scene_file, copy) as tree:
-        lens, pose = tree["projector"]["lens"], tree["projector"]["world_from_projector"]
-        for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
-            lens[key] = round_digits(getattr(projector.lens, key))
-        if any(projector.lens.distortion) or "distortion" in lens:
-            lens["distortion"] = _make_flow_list(projector.lens.distortion)
-        for key in ("position_m", "rpy_rad"):
-            pose[key] = _make_flow_list(getattr(projector.world_from_projector, key))
-
-
-def _make_flow_list(values: Iterable[float]) -> Any:
-    from ruamel.yaml.comments import CommentedSeq
-
-    row = CommentedSeq([round_digits(value) for value in values])
-    row.fa.set_flow_style()
-    return row
+def list_scene_values(projector: Projector) -> dict[str, Any]:
+    """Return the pose and the lens of a projector, by their dotted paths in a scene file."""
+    values = pose_values("projector.world_from_projector", projector.world_from_projector)
+    for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
+        values[f"projector.lens.{key}"] = round_digits(getattr(projector.lens, key))
+    values["projector.lens.distortion"] = [round_digits(k) for k in projector.lens.distortion]
+    return values
 
 
 def _print_result(

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import shlex
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from flexsheet.launch.commands.calibrate import load_true_devices, require_twin
+from flexsheet.launch.commands.calibrate import (
+    app,
+    command_line,
+    load_true_devices,
+    require_twin,
+)
 from flexsheet.launch.commands.options import (
     CYLINDER,
     JsonOption,
@@ -24,6 +28,7 @@ from flexsheet.launch.commands.output import (
     examples,
     print_fields,
     print_json,
+    progress_bar,
     words,
 )
 
@@ -33,19 +38,17 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
     from flexsheet.messages.sheet_calibration import SheetCalibration
 
-
-def register(app: typer.Typer) -> None:
-    """Add the command `sheet` to `flexsheet calibrate`."""
-    app.command(
-        "sheet",
-        epilog=examples(
-            "flexsheet calibrate sheet --rows pushes.csv --scene lab.yaml -o sheet.yaml",
-            "flexsheet calibrate sheet --bag pushes.mcap -o sheet.yaml",
-            "flexsheet calibrate sheet --twin launch/scenes/cylinder.yaml -o sheet.yaml",
-        ),
-    )(sheet)
+GAUGE_N = 0.005
+"""The standard deviation of the noise of the simulated force gauge, in newtons."""
 
 
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate sheet --rows pushes.csv --scene lab.yaml -o sheet.yaml",
+        "flexsheet calibrate sheet --bag pushes.mcap -o sheet.yaml",
+        "flexsheet calibrate sheet --twin launch/scenes/cylinder.yaml -o sheet.yaml",
+    ),
+)
 def sheet(
     *,
     output: Annotated[Path, output_file("Sheet calibration file to write.")],
@@ -91,10 +94,6 @@ def sheet(
             "ratios above 1.15.",
         ),
     ] = False,
-    noise_n: Annotated[
-        float,
-        typer.Option(help="With --twin: standard deviation of the force noise, N.", min=0.0),
-    ] = 0.005,
     apparatus: TwinApparatusOption = None,
     seed: SeedOption = 1,
     as_json: JsonOption = False,
@@ -105,6 +104,7 @@ def sheet(
     cubic term of the force. The pushes are rows of a CSV file (--rows, --scene), come from a
     recording with a force gauge (--bag), or are simulated (--twin).
     """
+    from flexsheet.launch.calibration.sheet_bag import read_pushes
     from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
     from flexsheet.launch.calibration.sheet_rows import read_rows
     from flexsheet.launch.plans.plan import load_scene
@@ -116,29 +116,24 @@ def sheet(
             "give exactly one source of pushes: --rows CSV, --bag BAG or --twin SCENE"
         )
     require_twin(apparatus, simulated=twin is not None)
-    command = ["flexsheet", "calibrate", "sheet"]
     if rows is not None:
         scene = load_scene(scene_file)
         pushes, lines = read_rows(rows, scene.sheet, scene.finger.radius_m)
-        command += ["--rows", str(rows), "--scene", str(scene_file)]
         source = str(rows)
     elif bag is not None:
-        scene, pushes = _read_bag(bag)
+        try:
+            scene, pushes = read_pushes(bag)
+        except SheetModelFitError as error:
+            raise CommandError(f"{bag}: {error}") from error
         lines = list(range(1, len(pushes) + 1))
-        command += ["--bag", str(bag)]
         source = str(bag)
     else:
         assert twin is not None
         scene = load_scene(twin)
         true = load_true_devices(apparatus, scene)
-        pushes = simulate_pushes(scene, true, places=places, noise_n=noise_n, seed=seed)
+        pushes = simulate_pushes(scene, true, places=places, seed=seed)
         lines = list(range(1, len(pushes) + 1))
-        command += ["--twin", str(twin), "--noise-n", f"{noise_n:g}", "--seed", str(seed)]
-        command += [] if apparatus is None else ["--apparatus", apparatus]
-        command += ["--places"] if places else []
         source = f"twin of {scene.name}"
-    command += ["--table"] if table else []
-    command += ["--mooney"] if mooney else []
     try:
         calibration = make_calibration(
             scene,
@@ -151,7 +146,7 @@ def sheet(
         )
     except SheetModelFitError as error:
         raise CommandError(f"{source}: {error}") from error
-    save_sheet_calibration(calibration, output, comment=shlex.join([*command, "-o", str(output)]))
+    save_sheet_calibration(calibration, output, comment=command_line())
     _print_result(calibration, output, as_json)
 
 
@@ -248,37 +243,23 @@ def make_calibration(
     )
 
 
-def _read_bag(bag: Path) -> tuple[Scene, list[MeasuredPush]]:
-    from flexsheet.launch.calibration.sheet_bag import read_pushes
-    from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
-
-    try:
-        return read_pushes(bag)
-    except SheetModelFitError as error:
-        raise CommandError(f"{bag}: {error}") from error
-
-
 def simulate_pushes(
-    scene: Scene, apparatus: Apparatus | None, *, places: bool, noise_n: float, seed: int
+    scene: Scene, apparatus: Apparatus | None, *, places: bool, seed: int
 ) -> list[MeasuredPush]:
-    """Simulate measured pushes on the sheet of a scene, and show a progress bar.
+    """Simulate measured pushes on the sheet of a scene.
 
-    places: push the whole sheet instead of only its centre. noise_n: standard deviation of the
-    force noise, N.
+    places: push the whole sheet instead of only its centre.
     """
-    from rich.progress import Progress
-
     from flexsheet.launch.calibration.sheet_rows import simulate_rows
 
-    with Progress(console=words.console, transient=True) as bar:
-        task = bar.add_task("simulating pushes", total=None)
+    with progress_bar("simulating pushes") as progress:
         return simulate_rows(
             scene,
             places=places,
-            noise_n=noise_n,
+            noise_n=GAUGE_N,
             seed=seed,
             apparatus=apparatus,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
+            progress=progress,
         )
 
 

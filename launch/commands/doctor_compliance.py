@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from flexsheet.launch.commands.doctor import app
 from flexsheet.launch.commands.options import JsonOption, SceneArgument
 from flexsheet.launch.commands.output import (
     FAILED,
@@ -18,14 +19,9 @@ from flexsheet.launch.commands.output import (
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `compliance` to `flexsheet doctor`."""
-    app.command(
-        "compliance",
-        epilog=examples("flexsheet doctor compliance launch/scenes/cylinder.yaml"),
-    )(compliance)
-
-
+@app.command(
+    epilog=examples("flexsheet doctor compliance launch/scenes/cylinder.yaml"),
+)
 def compliance(
     scene_file: SceneArgument,
     calibration: Annotated[

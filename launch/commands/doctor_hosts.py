@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.doctor import app
 from flexsheet.launch.commands.graph import running_graph
 from flexsheet.launch.commands.options import JsonOption, find_launch_file
 from flexsheet.launch.commands.output import (
@@ -29,18 +30,13 @@ if TYPE_CHECKING:
 TIMEOUT_S = 4.0
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `hosts` to `flexsheet doctor`."""
-    app.command(
-        "hosts",
-        epilog=examples(
-            "flexsheet doctor hosts",
-            "flexsheet doctor hosts launch/lab.yaml",
-            "flexsheet doctor hosts launch/lab.yaml --host left --json",
-        ),
-    )(hosts)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet doctor hosts",
+        "flexsheet doctor hosts launch/lab.yaml",
+        "flexsheet doctor hosts launch/lab.yaml --host left --json",
+    ),
+)
 def hosts(
     launch_file: Annotated[
         Path | None,

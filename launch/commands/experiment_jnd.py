@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.experiment import make_result_folder
+from flexsheet.launch.commands.experiment import app, make_result_folder
 from flexsheet.launch.commands.options import (
     DEMO,
     JsonOption,
@@ -33,16 +33,12 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command `jnd` to `flexsheet experiment`."""
-    app.command(
-        epilog=examples(
-            "flexsheet experiment jnd --participant k7x2 --output runs/jnd",
-            "flexsheet experiment jnd --simulated-participant --repeats 20 --seed 100",
-        )
-    )(jnd)
-
-
+@app.command(
+    epilog=examples(
+        "flexsheet experiment jnd --participant k7x2 --output runs/jnd",
+        "flexsheet experiment jnd --simulated-participant --repeats 20 --seed 100",
+    )
+)
 def jnd(
     *,
     participant: Annotated[

@@ -14,6 +14,7 @@ import typer
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.experiment import (
     StrokeOption,
+    app,
     make_result_folder,
     print_followed,
 )
@@ -41,26 +42,13 @@ from flexsheet.launch.commands.output import (
 )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands `robustness`, `sensitivity` and `follow` to `flexsheet experiment`."""
-    app.command(
-        epilog=examples(
-            "flexsheet experiment robustness --seeds 0-9 --output runs/draws",
-            "flexsheet experiment robustness --seeds 0-29 --profile paper --calibrated --json",
-            "flexsheet experiment robustness --seeds 0-3 --commissioned",
-        )
-    )(robustness)
-    app.command(
-        epilog=examples(
-            "flexsheet experiment sensitivity --calibrated",
-            "flexsheet experiment sensitivity --parameter sheet.modulus_ratio --json",
-        )
-    )(sensitivity)
-    app.command(epilog=examples("flexsheet experiment follow --finger-path finger.csv --json"))(
-        follow
+@app.command(
+    epilog=examples(
+        "flexsheet experiment robustness --seeds 0-9 --output runs/draws",
+        "flexsheet experiment robustness --seeds 0-29 --profile paper --calibrated --json",
+        "flexsheet experiment robustness --seeds 0-3 --commissioned",
     )
-
-
+)
 def robustness(
     *,
     seeds: Annotated[
@@ -159,6 +147,12 @@ def _print_predictions(found: dict[str, Any]) -> None:
     )
 
 
+@app.command(
+    epilog=examples(
+        "flexsheet experiment sensitivity --calibrated",
+        "flexsheet experiment sensitivity --parameter sheet.modulus_ratio --json",
+    )
+)
 def sensitivity(
     *,
     parameters: Annotated[
@@ -242,6 +236,7 @@ def sensitivity(
     words.print(f"image: {image}")
 
 
+@app.command(epilog=examples("flexsheet experiment follow --finger-path finger.csv --json"))
 def follow(
     *,
     finger_path: Annotated[

@@ -26,8 +26,7 @@ PROGRESS_LINE_S = 2.0
 
 
 class CommandError(FlexsheetError):
-    """Raised to end a command with an error text and an exit code, for instance for a wrong
-    option."""
+    """Raised to end a command with an error text and an exit code."""
 
     code = "command"
     remedy = "Correct the option or file that the error names."
@@ -49,8 +48,8 @@ def check_folder(option: str, file: Path) -> None:
 class Words:
     """A printer of messages for the user on stderr.
 
-    Colours and status lines are used only in terminals; the environment variable NO_COLOR disables
-    colours. The module rich is imported with the first message, so that commands start fast.
+    Colours and status lines are used only in terminals. The environment variable NO_COLOR disables
+    colours. The module rich is imported with the first message, because its import is slow.
     """
 
     @cached_property
@@ -86,8 +85,7 @@ def examples(*lines: str) -> str:
 
 
 def examples_in(epilog: str | None) -> list[str]:
-    """Return the example command lines in a help epilog that the function `examples` has
-    formatted."""
+    """Return the example command lines in the epilog of a command's help."""
     heading, *lines = (epilog or "").split("\n")
     return [line.replace(r"\[", "[") for line in lines] if heading == EXAMPLES else []
 
@@ -100,6 +98,14 @@ def print_json(data: Any) -> None:
 def print_json_line(data: Any) -> None:
     """Print a JSON document on one line of stdout and flush it; NaN and infinity become null."""
     print(json.dumps(replace_non_finite(data), allow_nan=False), flush=True)
+
+
+def print_outcome(data: Any, text: str, *, as_json: bool) -> None:
+    """Print data as JSON on stdout, or a text for the user on stderr."""
+    if as_json:
+        print_json(data)
+    else:
+        words.print(text)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
@@ -116,8 +122,27 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
         print(f"\x1b[1m{line}\x1b[0m" if in_terminal and number == 0 else line)
 
 
+def print_columns(
+    rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[str, str]]
+) -> None:
+    """Print a table with selected values of the rows; None is shown as "-".
+
+    columns: key and format of the values in each column, by heading.
+    """
+    print_table(
+        list(columns),
+        [
+            ["-" if row[key] is None else format(row[key], form) for key, form in columns.values()]
+            for row in rows
+        ],
+    )
+
+
 def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
-    """Print rows with the same keys on stdout, as JSON or as a table; None is shown as "-"."""
+    """Print rows with the same keys on stdout, as JSON or as a table.
+
+    In a table, None is shown as "-", and truth values as "yes" or "no".
+    """
     if as_json:
         print_json(rows)
     elif rows:
@@ -127,7 +152,7 @@ def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
 
 
 def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace nested mappings by their values, with joined names such as "interval_ms p50"."""
+    """Replace nested mappings by their values, with names such as "interval_ms p50"."""
     flat: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(value, Mapping):
@@ -138,6 +163,8 @@ def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _show(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list | tuple):
@@ -184,16 +211,16 @@ def progress_words() -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
-    """Show a progress bar on stderr, and yield its update function (done, total).
+def progress_bar(label: str) -> Iterator[Callable[..., None]]:
+    """Show a progress bar on stderr, and yield its update function (done, total, text).
 
-    If stderr is not a terminal, lines with the progress are printed: one for every 5 %, and at
-    most one in PROGRESS_LINE_S seconds.
+    The optional text replaces the label in a terminal. If stderr is not a terminal, lines with the
+    progress are printed: one for every 5 %, and at most one in PROGRESS_LINE_S seconds.
     """
     if not words.is_terminal:
         printed_s, printed = time.monotonic(), 0.0
 
-        def print_line(done: float, total: float) -> None:
+        def print_line(done: float, total: float, _: str = "") -> None:
             nonlocal printed_s, printed
             due = time.monotonic() - printed_s >= PROGRESS_LINE_S
             if due and total > 0.0 and done / total - printed >= 0.05:
@@ -219,14 +246,16 @@ def progress_bar(label: str) -> Iterator[Callable[[float, float], None]]:
     )
     with Progress(*columns, console=words.console, transient=True) as bar:
         task = bar.add_task(label, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        yield lambda done, total, text=label: bar.update(
+            task, completed=done, total=total, description=text
+        )
 
 
 def logs_on_stderr() -> None:
-    """Write log records of a command with level warning or higher to stderr.
+    """Write the warnings and errors in the log of a command to stderr.
 
-    By default they go to stdout, which is reserved for the results of the command. Call this
-    function before any logger is created.
+    By default, structlog writes to stdout, which is reserved for results. Call this function before
+    any logger is created.
     """
     import logging
 
