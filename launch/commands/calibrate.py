@@ -16,12 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.options import (
-    JsonOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
-)
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
     CommandError,
     check_folder,
@@ -79,7 +74,7 @@ def stereo(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, output_file("Stereo calibration file to write.")],
+    output: Annotated[Path, options.output_file("Stereo calibration file to write.")],
     left: LeftOption = "",
     right: RightOption = "",
     device_source: Annotated[
@@ -94,17 +89,15 @@ def stereo(
         Path | None,
         typer.Option(
             "--scene",
-            metavar="FILE",
             help="Scene file with the camera: its device name, image size, exposure time, and "
             "distance from the screen.",
         ),
     ] = None,
     twin: Annotated[
-        Path | None,
-        typer.Option(metavar="SCENE", help="Simulate the camera of this scene file."),
+        Path | None, typer.Option(metavar="SCENE", help="Simulate the camera of this scene file.")
     ] = None,
-    apparatus: TwinApparatusOption = None,
-    seed: SeedOption = 1,
+    apparatus: options.TwinApparatusOption = None,
+    seed: options.SeedOption = 1,
     pairs: Annotated[int, typer.Option(help="Number of image pairs to capture.", min=5)] = 20,
     pictures: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="New folder for captured images.")
@@ -114,7 +107,7 @@ def stereo(
     report: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Folder to write a report with plots to.")
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate both cameras of a stereo camera and their relative pose.
 
@@ -236,7 +229,7 @@ def check(
     square_mm: SquareOption,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Check a calibration with images of a board that were not used to compute it."""
     from flexsheet.launch.calibration.check import check_stereo
@@ -280,7 +273,7 @@ def cross_check(
     leave_out: Annotated[
         int, typer.Option(help="Number of image pairs that each calibration omits.", min=1)
     ] = 1,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Cross-validate a calibration with image pairs that were not used to compute it.
 
@@ -327,10 +320,10 @@ def print_board(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, output_file("Image file to write (.svg or .png).", "IMAGE")],
+    output: Annotated[Path, options.output_file("Image file to write (.svg or .png).", "IMAGE")],
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Write an image of a calibration board for printing at true size.
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
     FOUR_BITS,
     BoardOption,
@@ -28,14 +29,6 @@ from flexsheet.launch.commands.calibrate import (
     write_scene_values,
 )
 from flexsheet.launch.commands.graph import run_interruptible
-from flexsheet.launch.commands.options import (
-    JsonOption,
-    RunOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
-)
 from flexsheet.launch.commands.output import (
     CommandError,
     check_folder,
@@ -80,10 +73,10 @@ SIDES: tuple[Side, Side] = ("left", "right")
 )
 def arms(
     *,
-    scene_file: SceneOption,
+    scene_file: options.SceneOption,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, output_file("Arm calibration file to write.")],
+    output: Annotated[Path, options.output_file("Arm calibration file to write.")],
     left_arm: Annotated[
         Path | None,
         typer.Option(
@@ -100,20 +93,18 @@ def arms(
         bool, typer.Option("--twin", help="Calibrate simulated arms instead of recorded poses.")
     ] = False,
     places: Annotated[int, typer.Option(help="Number of simulated poses per arm.", min=6)] = 16,
-    apparatus: TwinApparatusOption = None,
-    seed: SeedOption = 1,
+    apparatus: options.TwinApparatusOption = None,
+    seed: options.SeedOption = 1,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     copy: Annotated[
         Path | None,
         typer.Option(
-            "--write-scene",
-            metavar="FILE",
-            help="Copy of the scene to write, with the measured base poses.",
+            "--write-scene", help="Copy of the scene to write, with the measured base poses."
         ),
     ] = None,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the poses of the arm bases in the world frame of the stereo camera.
 
@@ -163,12 +154,10 @@ def arms(
     epilog=examples("flexsheet calibrate arms-scene arms.yaml lab.yaml -o lab-measured.yaml"),
 )
 def write_scene(
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION", help="Arm calibration file.")
-    ],
+    calibration: Annotated[Path, typer.Argument(help="Arm calibration file.")],
     scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to copy.")],
-    output: Annotated[Path, output_file("Scene file to write.")],
-    as_json: JsonOption = False,
+    output: Annotated[Path, options.output_file("Scene file to write.")],
+    as_json: options.JsonOption = False,
 ) -> None:
     """Write a copy of a scene file with the base poses of an arm calibration."""
     from flexsheet.launch.plans.plan import load_scene
@@ -203,15 +192,15 @@ def capture(
             "-o", "--output", metavar="FOLDER", help="New folder for joints.csv and board images."
         ),
     ],
-    scene_file: SceneOption,
+    scene_file: options.SceneOption,
     places: Annotated[
         int, typer.Option(help="Number of poses to record; then the command stops.", min=1)
     ] = 20,
     calibration: CalibrationOption = None,
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Record joint angles and board images for `calibrate arms`, from the running graph.
 

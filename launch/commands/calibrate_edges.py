@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
     app,
     load_optics,
@@ -18,15 +19,6 @@ from flexsheet.launch.commands.calibrate import (
 )
 from flexsheet.launch.commands.calibrate_arms import CalibrationOption, record_poses
 from flexsheet.launch.commands.graph import run_interruptible
-from flexsheet.launch.commands.options import (
-    CYLINDER,
-    JsonOption,
-    RunOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
-)
 from flexsheet.launch.commands.output import (
     CommandError,
     check_folder,
@@ -53,21 +45,21 @@ POSES = 24
 )
 def edges(
     *,
-    output: Annotated[Path, output_file("Copy of the scene file with the measured arms.")],
+    output: Annotated[Path, options.output_file("Copy of the scene file with the measured arms.")],
     rows: Annotated[
         Path | None,
         typer.Option(
             metavar="CSV", help="CSV file of measured marks, from `calibrate edges-capture`."
         ),
     ] = None,
-    scene_file: SceneOption = CYLINDER,
+    scene_file: options.SceneOption = options.CYLINDER,
     twin: Annotated[
         bool, typer.Option("--twin", help="Simulate the marks instead of reading a file.")
     ] = False,
-    apparatus: TwinApparatusOption = None,
+    apparatus: options.TwinApparatusOption = None,
     calibration: CalibrationOption = None,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure where the arms hold the sheet, from camera images of marks on the clamps.
 
@@ -146,11 +138,11 @@ def _print_result(fits: dict[Side, EdgeFit], output: Path, *, as_json: bool) -> 
 @app.command("edges-capture", epilog=examples("flexsheet calibrate edges-capture -o marks.csv"))
 def edges_capture(
     *,
-    output: Annotated[Path, output_file("New CSV file for the marks.")],
-    scene_file: SceneOption = CYLINDER,
+    output: Annotated[Path, options.output_file("New CSV file for the marks.")],
+    scene_file: options.SceneOption = options.CYLINDER,
     calibration: CalibrationOption = None,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Record marks on both clamps for `calibrate edges`, from the running graph.
 

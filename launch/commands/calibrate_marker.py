@@ -9,15 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import app, command_line, load_true_devices
-from flexsheet.launch.commands.options import (
-    CYLINDER,
-    JsonOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
-)
 from flexsheet.launch.commands.output import (
     CommandError,
     check_folder,
@@ -41,7 +34,7 @@ if TYPE_CHECKING:
 )
 def marker(
     *,
-    output: Annotated[Path, output_file("Marker calibration file to write.")],
+    output: Annotated[Path, options.output_file("Marker calibration file to write.")],
     rows: Annotated[
         Path | None,
         typer.Option(
@@ -49,20 +42,18 @@ def marker(
             help="CSV file of touches of known points; docs/set-up-marker.md lists its columns.",
         ),
     ] = None,
-    scene_file: SceneOption = CYLINDER,
+    scene_file: options.SceneOption = options.CYLINDER,
     twin: Annotated[
         Path | None,
         typer.Option(metavar="SCENE", help="Simulate the touches with the finger of this scene."),
     ] = None,
-    apparatus: TwinApparatusOption = None,
+    apparatus: options.TwinApparatusOption = None,
     calibration_file: Annotated[
         Path | None,
-        typer.Option(
-            "--calibration", metavar="FILE", help="With --twin: stereo calibration of the camera."
-        ),
+        typer.Option("--calibration", help="With --twin: stereo calibration of the camera."),
     ] = None,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Determine the position of the marker relative to the finger pad, which touches the sheet.
 

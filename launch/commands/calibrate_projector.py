@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
     app,
     load_optics,
@@ -16,13 +17,6 @@ from flexsheet.launch.commands.calibrate import (
     require_twin,
     round_digits,
     write_scene_values,
-)
-from flexsheet.launch.commands.options import (
-    JsonOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
 )
 from flexsheet.launch.commands.output import (
     CommandError,
@@ -58,16 +52,13 @@ TWIN_POSES = 6
 )
 def projector(
     *,
-    scene_file: SceneOption,
+    scene_file: options.SceneOption,
     output: Annotated[
         Path | None,
-        output_file("Scene file to write with the result; may be the file of --scene."),
+        options.output_file("Scene file to write with the result; may be the file of --scene."),
     ] = None,
     calibration: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Stereo calibration file; default: the camera of the scene."
-        ),
+        Path | None, typer.Option(help="Stereo calibration file; default: the camera of the scene.")
     ] = None,
     write_patterns: Annotated[
         Path | None,
@@ -105,9 +96,9 @@ def projector(
             "--twin", help="Calibrate a simulated projector that deviates from the scene."
         ),
     ] = False,
-    apparatus: TwinApparatusOption = None,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    apparatus: options.TwinApparatusOption = None,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate pose and lens of the projector, and write the result into a scene.
 

@@ -8,19 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
     app,
     command_line,
     load_true_devices,
     require_twin,
-)
-from flexsheet.launch.commands.options import (
-    CYLINDER,
-    JsonOption,
-    SceneOption,
-    SeedOption,
-    TwinApparatusOption,
-    output_file,
 )
 from flexsheet.launch.commands.output import (
     CommandError,
@@ -51,7 +44,7 @@ GAUGE_N = 0.005
 )
 def sheet(
     *,
-    output: Annotated[Path, output_file("Sheet calibration file to write.")],
+    output: Annotated[Path, options.output_file("Sheet calibration file to write.")],
     rows: Annotated[
         Path | None,
         typer.Option(
@@ -68,7 +61,7 @@ def sheet(
             "finger rests at several depths; its scene replaces --scene.",
         ),
     ] = None,
-    scene_file: SceneOption = CYLINDER,
+    scene_file: options.SceneOption = options.CYLINDER,
     twin: Annotated[
         Path | None,
         typer.Option(
@@ -94,9 +87,9 @@ def sheet(
             "ratios above 1.15.",
         ),
     ] = False,
-    apparatus: TwinApparatusOption = None,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    apparatus: options.TwinApparatusOption = None,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Fit the force model of a sheet to the forces on a finger that pushes the sheet.
 

@@ -70,8 +70,6 @@ def chart(
     blocks: Annotated[
         int,
         typer.Option(
-            "--blocks",
-            metavar="N",
             min=1,
             max=1000,
             help="For system: number of repetitions; each runs every configuration once.",
@@ -90,8 +88,6 @@ def chart(
     apparatuses: Annotated[
         int,
         typer.Option(
-            "--apparatuses",
-            metavar="N",
             min=0,
             max=100,
             help="For system: number of random samples of inaccurate hardware (apparatuses) for "

@@ -7,14 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.options import (
-    DEMO,
-    ApparatusOption,
-    JsonOption,
-    LaunchOption,
-    OtherSceneOption,
-    SeedOption,
-)
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
@@ -50,30 +43,23 @@ def commission(
             help="Folder for state and results; if it exists, the commissioning continues.",
         ),
     ],
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    apparatus: ApparatusOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    apparatus: options.ApparatusOption = None,
     data: Annotated[
         list[str] | None,
         typer.Option(
-            "--data",
             metavar="STEP=PATH",
             help="Captured data of a step; repeat the option for several steps.",
         ),
     ] = None,
     finger_radius_mm: Annotated[
         float | None,
-        typer.Option(
-            "--finger-radius-mm",
-            metavar="MM",
-            min=1.0,
-            help="Measured radius of the fingertip, mm.",
-        ),
+        typer.Option(metavar="MM", min=1.0, help="Measured radius of the fingertip, mm."),
     ] = None,
     sheet_kg_per_m2: Annotated[
         float | None,
         typer.Option(
-            "--sheet-kg-per-m2",
             metavar="DENSITY",
             min=0.0,
             help="Measured mass per area of the sheet, kg/m²; it determines the sag.",
@@ -128,14 +114,13 @@ def commission(
     duration: Annotated[
         float,
         typer.Option(
-            "--duration",
             metavar="SECONDS",
             min=2.0,
             help="Duration of the finger's stroke in the verification, s.",
         ),
     ] = 10.0,
-    seed: SeedOption = 1,
-    as_json: JsonOption = False,
+    seed: options.SeedOption = 1,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Calibrate all devices of a laboratory in sequence, and verify the result.
 

@@ -25,15 +25,11 @@ from flexsheet.launch.commands.output import (
 def compliance(
     scene_file: SceneArgument,
     calibration: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Sheet calibration file from `flexsheet calibrate sheet`."
-        ),
+        Path | None, typer.Option(help="Sheet calibration file from `flexsheet calibrate sheet`.")
     ] = None,
     delay_ms: Annotated[
         float,
         typer.Option(
-            "--delay-ms",
             metavar="MS",
             min=0.0,
             max=500.0,

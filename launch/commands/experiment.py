@@ -7,21 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.options import (
-    DEMO,
-    ApparatusOption,
-    JsonOption,
-    LaunchOption,
-    OtherSceneOption,
-    ResultFolderOption,
-    SchedulerOption,
-    SettingsOption,
-    WorkersOption,
-    make_app,
-    split_names,
-    with_scene,
-)
+from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.output import (
     CommandError,
     examples,
@@ -39,7 +25,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.experiments.hand_gestures import FeltForce
     from flexsheet.launch.experiments.image import Series
 
-app = make_app("Run the experiments of Furukawa et al. 2007, and further ones, on a graph.")
+app = options.make_app("Run the experiments of Furukawa et al. 2007, and further ones, on a graph.")
 
 StrokeOption = Annotated[
     float,
@@ -111,18 +97,17 @@ def stroke(
         bool,
         typer.Option("--radii", help="Also measure strokes on a cylinder of twice the radius."),
     ] = False,
-    workers: WorkersOption = 1,
-    scheduler: SchedulerOption = None,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
+    workers: options.WorkersOption = 1,
+    scheduler: options.SchedulerOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
     without: Annotated[
         list[Feature] | None,
         typer.Option(
-            "--without",
             help="Part of the display to omit: the projected image or the rendered force. Without "
-            "the image, frame latencies are null. Not with several strokes or variants.",
+            "the image, frame latencies are null. Not with several strokes or variants."
         ),
     ] = None,
     switches: Annotated[
@@ -135,15 +120,15 @@ def stroke(
             "camera. Not with several strokes.",
         ),
     ] = 0,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate a finger that strokes a cylinder over 60 degrees, and measure the sheet's errors.
 
     This is the experiment of Furukawa et al. 2007, section V and Table I. To continue a command
     with several strokes or variants that was interrupted, repeat it with the same --output.
     """
-    given = with_scene(settings, scene)
+    given = options.with_scene(settings, scene)
     if radii and scene is not None:
         raise CommandError("--radii uses the cylinder scenes of the package; remove --scene")
     if repeats > 1 or ablations or radii:
@@ -206,12 +191,12 @@ def tilt(
     *,
     map_file: MapOption = None,
     both_eyes: BothEyesOption = False,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure image errors on a tilted sheet (Furukawa et al. 2007, section VI-B, Fig. 11)."""
     from flexsheet.launch.experiments.image import TILT
@@ -221,7 +206,7 @@ def tilt(
         TILT,
         bag,
         launch_file,
-        with_scene(settings, scene),
+        options.with_scene(settings, scene),
         map_file=map_file,
         both_eyes=both_eyes,
         apparatus=apparatus,
@@ -254,12 +239,12 @@ def push(
     ] = 0.0,
     map_file: MapOption = None,
     both_eyes: BothEyesOption = False,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure image errors on a pushed sheet (Furukawa et al. 2007, section VI-C, Fig. 13).
 
@@ -271,7 +256,7 @@ def push(
 
     settings = [
         *make_settings(launch_file, "planner", "compliance_mode=stiffness"),
-        *with_scene(settings, scene),
+        *options.with_scene(settings, scene),
     ]
     bag = make_result_folder(output, "push") / "push.mcap"
     _measure_images(
@@ -290,10 +275,10 @@ def push(
 @app.command(epilog=examples("flexsheet experiment compliance --output runs/soft"))
 def compliance(
     *,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
     complete_table: Annotated[
         bool,
         typer.Option(
@@ -302,8 +287,8 @@ def compliance(
             "the coarse table, if the complete one is not in the cache.",
         ),
     ] = False,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Compare the force on the finger with the force of the virtual object at several push depths.
 
@@ -319,7 +304,7 @@ def compliance(
     with progress_words() as progress:
         table: TableMethod = "nonlinear_table" if complete_table else "quick_table"
         procedure = experiment.make_compliance_procedure(progress, table)
-        given = with_scene(settings, scene)
+        given = options.with_scene(settings, scene)
         run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.compliance_result(bag, progress)
         draw_compliance(result, image)
@@ -436,12 +421,12 @@ def gestures(
             autocompletion=complete.gestures,
         ),
     ] = None,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the accuracy of fingertip tracking during simulated human gestures.
 
@@ -451,11 +436,11 @@ def gestures(
     from flexsheet.launch.experiments import select_names
     from flexsheet.launch.experiments.run import run_experiment
 
-    selected = select_names(split_names(names), experiment.GESTURES, "gesture")
+    selected = select_names(options.split_names(names), experiment.GESTURES, "gesture")
     bag = make_result_folder(output, "gestures") / "gestures.mcap"
     with progress_words() as progress:
         procedure = experiment.make_gestures_procedure(selected, progress)
-        given = with_scene(settings, scene)
+        given = options.with_scene(settings, scene)
         run_experiment(launch_file, given, bag, procedure, progress, apparatus=apparatus)
         result = experiment.gestures_result(bag, selected)
     if as_json:
@@ -564,13 +549,13 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
 )
 def stability(
     *,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
     hands: Annotated[
-        int, typer.Option(metavar="N", min=1, max=100, help="Number of random hands per kind.")
+        int, typer.Option(min=1, max=100, help="Number of random hands per kind.")
     ] = 4,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed of the hands.")] = 100,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed of the hands.")] = 100,
     gestures: Annotated[
         bool,
         typer.Option(
@@ -587,9 +572,9 @@ def stability(
             "gestures run in simulated time.",
         ),
     ] = False,
-    apparatus: ApparatusOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    apparatus: options.ApparatusOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Simulate whether a hand in contact with the sheet starts to oscillate.
 
@@ -611,7 +596,7 @@ def stability(
         raise CommandError(
             "--graph requires --gestures, and --apparatus requires --gestures and --graph; add them"
         )
-    given = with_scene(settings, scene)
+    given = options.with_scene(settings, scene)
     loaded = require_scene(load_graph(launch_file, settings=given))
     folder = make_result_folder(output, "stability")
     with progress_words() as progress:

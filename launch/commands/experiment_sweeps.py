@@ -11,27 +11,12 @@ from typing import Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
+from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.experiment import (
     StrokeOption,
     app,
     make_result_folder,
     print_followed,
-)
-from flexsheet.launch.commands.options import (
-    DEMO,
-    ApparatusOption,
-    CalibratedOption,
-    JsonOption,
-    LaunchOption,
-    OtherSceneOption,
-    ProfileOption,
-    ResultFolderOption,
-    SchedulerOption,
-    SettingsOption,
-    WorkersOption,
-    split_names,
-    with_scene,
 )
 from flexsheet.launch.commands.output import (
     examples,
@@ -54,14 +39,13 @@ def robustness(
     seeds: Annotated[
         str,
         typer.Option(
-            "--seeds",
             metavar="A-B",
             help="Range of random seeds; each seed sets the errors of one simulated hardware. "
             "Seeds 0-99 are for development, higher seeds for reports.",
         ),
     ],
-    profile: ProfileOption = "modern",
-    calibrated: CalibratedOption = False,
+    profile: options.ProfileOption = "modern",
+    calibrated: options.CalibratedOption = False,
     commissioned: Annotated[
         bool,
         typer.Option(
@@ -71,16 +55,16 @@ def robustness(
         ),
     ] = False,
     seconds: StrokeOption = 10.0,
-    workers: WorkersOption = 1,
-    scheduler: SchedulerOption = None,
+    workers: options.WorkersOption = 1,
+    scheduler: options.SchedulerOption = None,
     keep_bags: Annotated[
         bool, typer.Option("--keep-bags", help="Keep the recording of each trial in the folder.")
     ] = False,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the errors of sheet, fingertip, image and force with randomly inaccurate hardware.
 
@@ -96,7 +80,7 @@ def robustness(
     with progress_words() as progress:
         result = experiment.run_robustness(
             launch_file,
-            with_scene(settings, scene),
+            options.with_scene(settings, scene),
             folder,
             selected,
             progress,
@@ -163,16 +147,16 @@ def sensitivity(
             help="Parameter in the table of tolerances; repeat the option; default: all.",
         ),
     ] = None,
-    profile: ProfileOption = "modern",
-    calibrated: CalibratedOption = False,
+    profile: options.ProfileOption = "modern",
+    calibrated: options.CalibratedOption = False,
     seconds: StrokeOption = 10.0,
-    workers: WorkersOption = 1,
-    scheduler: SchedulerOption = None,
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    workers: options.WorkersOption = 1,
+    scheduler: options.SchedulerOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the errors that each hardware parameter causes if only this parameter is inaccurate.
 
@@ -185,13 +169,13 @@ def sensitivity(
     from flexsheet.launch.experiments.pictures import draw_sensitivity
     from flexsheet.nodes.twin.tolerance_table import TOLERANCES, Profile
 
-    selected = select_names(split_names(parameters), TOLERANCES, "parameter")
+    selected = select_names(options.split_names(parameters), TOLERANCES, "parameter")
     folder = make_result_folder(output, "sensitivity")
     image = folder / "sensitivity.png"
     with progress_words() as progress:
         result = experiment.run_sensitivity(
             launch_file,
-            with_scene(settings, scene),
+            options.with_scene(settings, scene),
             folder,
             selected,
             progress,
@@ -242,17 +226,16 @@ def follow(
     finger_path: Annotated[
         str,
         typer.Option(
-            "--finger-path",
             metavar="NAME_OR_FILE",
             help="CSV file with a recorded fingertip path (columns t_s,x_mm,y_mm,z_mm), or the "
             "name of a gesture.",
             autocompletion=complete.gestures,
         ),
     ],
-    launch_file: LaunchOption = DEMO,
-    scene: OtherSceneOption = None,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
+    launch_file: options.LaunchOption = options.DEMO,
+    scene: options.OtherSceneOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
     simulated_time: Annotated[
         bool,
         typer.Option(
@@ -260,8 +243,8 @@ def follow(
             help="Run tracking, planning and arms in simulated time instead of in a graph.",
         ),
     ] = False,
-    output: ResultFolderOption = None,
-    as_json: JsonOption = False,
+    output: options.ResultFolderOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Measure the sheet's error while it follows a recorded finger, and compute a lower bound.
 
@@ -271,7 +254,7 @@ def follow(
     from flexsheet.launch.experiments import follow as experiment
     from flexsheet.launch.experiments.gestures import finger_path as load_path
 
-    given = with_scene(settings, scene)
+    given = options.with_scene(settings, scene)
     path = load_path(launch_file, finger_path, given)
     bag = None if simulated_time else make_result_folder(output, "follow") / "follow.mcap"
     with progress_words() as progress:

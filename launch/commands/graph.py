@@ -76,13 +76,7 @@ async def receive_until(
         return receive
 
     subscribers = [
-        make_subscriber(
-            topic,
-            plan,
-            run,
-            make_handler(handle),
-            on_problem=words.print,
-        )
+        make_subscriber(topic, plan, run, make_handler(handle), on_problem=words.print)
         for topic, handle in handlers.items()
     ]
     for each in subscribers:

@@ -13,7 +13,8 @@ from flexsheet.launch.commands.output import (
     CommandError,
     examples,
     print_json,
-    print_table,
+    print_outcome,
+    print_rows,
     words,
 )
 
@@ -77,10 +78,7 @@ def new(
 @app.command(epilog=examples("flexsheet keys show", "flexsheet keys show left"))
 def show(
     host: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="HOST", help="Name of the host in the launch file; default: all hosts."
-        ),
+        str | None, typer.Argument(help="Name of the host in the launch file; default: all hosts.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -109,9 +107,8 @@ def show(
         print_json({"keys": rows, "problems": problems})
     elif host and rows:
         print(rows[0]["public"])
-    elif rows:
-        columns = ("host", "public", "secret_file")
-        print_table(columns, [tuple(row[name] for name in columns) for row in rows])
+    else:
+        print_rows(rows, as_json=False)
     for problem in problems:
         words.print(problem)
     if problems:
@@ -128,10 +125,7 @@ def install(
     launch_file: LaunchArgument,
     host: HostArgument,
     key: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="KEY", help="Public key; default: key of HOST stored on this computer."
-        ),
+        str | None, typer.Argument(help="Public key; default: key of HOST stored on this computer.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -149,7 +143,8 @@ def install(
         except SecurityError as error:
             raise CommandError(str(error), FAILED) from error
     install_key(launch_file, host, key)
-    if as_json:
-        print_json({"launch_file": str(launch_file), "host": host, "public": key})
-    else:
-        words.print(f"{launch_file}: hosts.{host}.key = {key}")
+    print_outcome(
+        {"launch_file": str(launch_file), "host": host, "public": key},
+        f"{launch_file}: hosts.{host}.key = {key}",
+        as_json=as_json,
+    )

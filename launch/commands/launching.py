@@ -11,17 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.options import (
-    ApparatusOption,
-    DurationOption,
-    JsonOption,
-    LaunchArgument,
-    OtherSceneOption,
-    SettingsOption,
-    make_app,
-    with_scene,
-)
+from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.output import (
     FAILED,
     examples,
@@ -38,7 +28,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.runs import Run
     from flexsheet.launch.running.supervisor import RunningGraph
 
-app = make_app()
+app = options.make_app()
 
 LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
 
@@ -54,8 +44,8 @@ LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
 )
 def launch(
     *,
-    launch_file: LaunchArgument,
-    scene: OtherSceneOption = None,
+    launch_file: options.LaunchArgument,
+    scene: options.OtherSceneOption = None,
     host: Annotated[
         str | None,
         typer.Option(
@@ -72,12 +62,11 @@ def launch(
             help="Check the launch file and print the resolved graph without starting it.",
         ),
     ] = False,
-    settings: SettingsOption = None,
-    apparatus: ApparatusOption = None,
+    settings: options.SettingsOption = None,
+    apparatus: options.ApparatusOption = None,
     without: Annotated[
         list[str] | None,
         typer.Option(
-            "--without",
             metavar="NODE",
             help="Node to omit, so that `flexsheet run NODE` can start it; repeat the option for "
             "several nodes.",
@@ -91,11 +80,10 @@ def launch(
         ),
     ] = None,
     console: Annotated[
-        bool,
-        typer.Option("--console", help="Add a browser console and a recorder to the graph."),
+        bool, typer.Option("--console", help="Add a browser console and a recorder to the graph.")
     ] = False,
-    duration: DurationOption = None,
-    as_json: JsonOption = False,
+    duration: options.DurationOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Start the nodes of a launch file and supervise them until Ctrl-C.
 
@@ -109,7 +97,7 @@ def launch(
 
     plan = load_graph(
         launch_file,
-        settings=with_scene(settings, scene),
+        settings=options.with_scene(settings, scene),
         record=record,
         console=console,
         apparatus=apparatus,

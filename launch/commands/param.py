@@ -16,8 +16,8 @@ from flexsheet.launch.commands.output import (
     CommandError,
     examples,
     print_json,
+    print_outcome,
     print_rows,
-    words,
 )
 
 if TYPE_CHECKING:
@@ -49,11 +49,7 @@ ParameterArgument = Annotated[
 def list_parameters(
     node: Annotated[
         str | None,
-        typer.Argument(
-            metavar="NODE",
-            help="Name of a node; default: all nodes.",
-            autocompletion=complete.nodes,
-        ),
+        typer.Argument(help="Name of a node; default: all nodes.", autocompletion=complete.nodes),
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
@@ -72,9 +68,6 @@ def list_parameters(
         for name, value in one.parameters.items()
         if name != "apparatus"
     ]
-    if not as_json:
-        for row in rows:
-            row["live"] = "yes" if row["live"] else ""
     print_rows(rows, as_json=as_json)
 
 
@@ -101,7 +94,7 @@ def get_parameter(
 )
 def set_parameter(
     parameter: ParameterArgument,
-    value: Annotated[str, typer.Argument(metavar="VALUE", help="New value, in YAML syntax.")],
+    value: Annotated[str, typer.Argument(help="New value, in YAML syntax.")],
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -135,10 +128,8 @@ def set_parameter(
         raise CommandError(f"{parameter}={value}: invalid value: {text}") from error
     new = checked.model_dump(mode="json")[name]
     run_interruptible(_set(plan, found, node.name, name, new))
-    if as_json:
-        print_json({"parameter": parameter, "value": new})
-    else:
-        words.print(f"{parameter} = {json.dumps(new)}")
+    result = {"parameter": parameter, "value": new}
+    print_outcome(result, f"{parameter} = {json.dumps(new)}", as_json=as_json)
 
 
 def _find_node(plan: ResolvedGraph, name: str) -> ResolvedNode:
@@ -168,10 +159,7 @@ def _live(node: ResolvedNode) -> frozenset[str]:
 
 
 def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, dict[str, Any]]:
-    """Return the parameters that have changed since the start of the graph.
-
-    The result contains a dictionary of values by parameter name for each of the nodes.
-    """
+    """Return the changed parameters of running nodes, by node and parameter name."""
     found: dict[str, dict[str, Any]] = {}
     if nodes:
         run_interruptible(_await_statuses(plan, run, lambda: nodes <= found.keys(), found))
@@ -181,9 +169,9 @@ def _read_changes(plan: ResolvedGraph, run: Run, nodes: set[str]) -> dict[str, d
 async def _await_statuses(
     plan: ResolvedGraph, run: Run, done: Callable[[], bool], found: dict[str, dict[str, Any]]
 ) -> int:
-    """Store the changed parameters from node statuses in `found` until `done` returns True.
+    """Store the changed parameters by node and name until `done` returns True.
 
-    found: changed values by node and parameter name. Returns 0, or 1 on a timeout.
+    Returns 0, or 1 on a timeout.
     """
 
     def add(status: Status) -> None:
@@ -193,8 +181,7 @@ async def _await_statuses(
 
 
 async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) -> int:
-    """Publish a parameter change, wait until the node's status confirms it, and return the exit
-    code."""
+    """Publish a parameter change, and wait until the node's status confirms it; return 0."""
     from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
     from flexsheet.messages.types import ParameterChange
 

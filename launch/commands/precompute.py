@@ -32,9 +32,7 @@ def precompute(
     scene_file: SceneArgument,
     cache: Annotated[
         Path | None,
-        typer.Option(
-            "--cache", metavar="FOLDER", help="Cache folder; default: the cache of this user."
-        ),
+        typer.Option(metavar="FOLDER", help="Cache folder; default: the cache of this user."),
     ] = None,
     skin_spacing_m: Annotated[
         float | None,

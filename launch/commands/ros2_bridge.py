@@ -9,17 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
+from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
-from flexsheet.launch.commands.options import (
-    DurationOption,
-    JsonOption,
-    RunOption,
-    TopicsOption,
-    make_app,
-)
 from flexsheet.launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
 
-app = make_app()
+app = options.make_app()
 
 
 class ExternalTopic(StrEnum):
@@ -38,19 +32,17 @@ class ExternalTopic(StrEnum):
 )
 def ros2_bridge(
     *,
-    topics: TopicsOption = None,
+    topics: options.TopicsOption = None,
     accept: Annotated[
         list[ExternalTopic] | None,
         typer.Option(
-            "--accept",
             help="Topic that ROS nodes may publish, as /external/eye or /external/fingertip; can "
-            "be repeated; default: none.",
+            "be repeated; default: none."
         ),
     ] = None,
     noise_mm: Annotated[
         float,
         typer.Option(
-            "--noise-mm",
             metavar="MM",
             min=0.01,
             max=50.0,
@@ -59,9 +51,7 @@ def ros2_bridge(
     ] = 1.0,
     domain: Annotated[
         int | None,
-        typer.Option(
-            metavar="N", min=0, max=232, help="DDS domain number; default: ROS_DOMAIN_ID or 0."
-        ),
+        typer.Option(min=0, max=232, help="DDS domain number; default: ROS_DOMAIN_ID or 0."),
     ] = None,
     interface: Annotated[
         str,
@@ -71,9 +61,9 @@ def ros2_bridge(
             "everyone in that network can read the topics and publish external inputs.",
         ),
     ] = "lo",
-    duration: DurationOption = None,
-    run: RunOption = None,
-    as_json: JsonOption = False,
+    duration: options.DurationOption = None,
+    run: options.RunOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Publish the topics of the running graph to ROS 2, and accept external inputs.
 

@@ -43,7 +43,6 @@ def tune(
     family: Annotated[
         list[str] | None,
         typer.Option(
-            "--family",
             metavar="NAME",
             help="Method family to tune; repeat the option for several; default: all.",
             autocompletion=complete.tuned_families,
@@ -64,7 +63,6 @@ def tune(
     runs: Annotated[
         int,
         typer.Option(
-            "--runs",
             min=0,
             max=100,
             help="Number of simulated strokes per configuration that is tested in the graph; 0: "

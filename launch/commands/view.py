@@ -36,8 +36,7 @@ def view(
         typer.Option(metavar="HZ", help="Maximum rate of numeric values per channel, Hz.", min=0.1),
     ] = 30.0,
     image_rate: Annotated[
-        float,
-        typer.Option(metavar="HZ", help="Maximum rate of images and meshes, Hz.", min=0.1),
+        float, typer.Option(metavar="HZ", help="Maximum rate of images and meshes, Hz.", min=0.1)
     ] = 10.0,
     run: RunOption = None,
     duration: DurationOption = None,
