@@ -202,12 +202,11 @@ class _Arms:
         from flexsheet.launch.running.tools import make_subscriber
 
         for topic in TOPICS:
-            self._subscribers.append(
-                make_subscriber(
-                    topic, self._plan, self._run, self._on_state, on_problem=self.problems.append
-                )
+            subscriber = make_subscriber(
+                topic, self._plan, self._run, self._on_state, on_problem=self.problems.append
             )
-            self._subscribers[-1].start()
+            self._subscribers.append(subscriber)
+            subscriber.start()
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -250,13 +249,9 @@ class _Arms:
         """Wait until `done` returns True for the recent arm states; return False on a timeout."""
         for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
             now_s = self._loop.time()
-            if done(
-                {
-                    s: arm
-                    for s, arm in self.states.items()
-                    if now_s - self._received_s[s] < MAX_STATE_AGE_S
-                }
-            ):
+            ages_s = {side: now_s - received_s for side, received_s in self._received_s.items()}
+            recent = {s: arm for s, arm in self.states.items() if ages_s[s] < MAX_STATE_AGE_S}
+            if done(recent):
                 return True
             await asyncio.sleep(POLL_PERIOD_S)
         return False

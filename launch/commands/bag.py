@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from flexsheet.launch.commands import complete, options
-from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.graph import run_interruptible, run_node_here, running_graph
 from flexsheet.launch.commands.launching import print_omitted
 from flexsheet.launch.commands.output import (
     FAILED,
@@ -22,6 +22,7 @@ from flexsheet.launch.commands.output import (
     print_fields,
     print_json,
     print_outcome,
+    print_result,
     print_table,
     progress_bar,
     words,
@@ -226,21 +227,7 @@ def recover(
     output = _require_output(output or target)
     with progress_bar(f"recovering {bag.name}") as progress:
         report = recover_bag(bag, output, progress=progress)
-    if as_json:
-        print_json({**asdict(report), "output": str(output)})
-        return
-    print_fields(
-        [
-            ("bag", output),
-            ("from", f"{bag}, {'complete' if report.was_complete else report.problem}"),
-            ("recovered", f"{report.messages} messages, {report.attachments} attachments"),
-            (
-                "lost",
-                f"{report.damaged_chunks} damaged chunks, "
-                f"{report.orphan_messages} messages of unknown topics",
-            ),
-        ]
-    )
+    print_result({**asdict(report), "output": str(output)}, as_json=as_json)
 
 
 @app.command(
@@ -427,9 +414,7 @@ def _print_export(result: ExportResult, unit: str, *, as_json: bool) -> None:
         listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
         more = len(result.unreadable) - MAX_TOPICS_LISTED
         also = f" and {more} more" if more > 0 else ""
-        words.print(
-            f"not exported: {listed}{also} (recorded with incompatible message types)", markup=False
-        )
+        words.print(f"not exported: {listed}{also} (recorded with incompatible message types)")
     if as_json:
         print_json({**asdict(result), "output": str(result.output)})
         return
@@ -521,7 +506,7 @@ async def _record(
     from flexsheet.nodes.node import further_port
     from flexsheet.nodes.recorder.node import Recorder
     from flexsheet.nodes.recorder.parameters import RUN_FILES, RecorderParameters
-    from flexsheet.nodes.runner import NodeConfig, PortConfig, run_node
+    from flexsheet.nodes.runner import NodeConfig, PortConfig
 
     attached = tuple(run.directory / file.relative_to(RUN_DIRECTORY) for file in RUN_FILES)
     parameters = RecorderParameters.model_validate({**given, "attach": attached})
@@ -549,16 +534,11 @@ async def _record(
         run_dir=str(run.directory),
     )
     words.print(f"recording {len(names)} topics; press Ctrl-C to stop")
-    stop = asyncio.Event()
-    work = asyncio.create_task(run_node(config, stop))
     countdown = asyncio.create_task(_show_remaining(parameters.bag.name, seconds))
     try:
-        await asyncio.wait((work,), timeout=seconds)
+        await run_node_here(config, seconds)
     finally:
-        # Also after an interruption, wait until the recorder has closed the bag.
         countdown.cancel()
-        stop.set()
-        await work
     return 0
 
 

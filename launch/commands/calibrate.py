@@ -23,6 +23,7 @@ from flexsheet.launch.commands.output import (
     examples,
     print_fields,
     print_json,
+    print_result,
     print_table,
     progress_bar,
     words,
@@ -170,16 +171,14 @@ def stereo(
 def _print_result(
     calibration: StereoCalibration, output: Path, page: Path | None, as_json: bool
 ) -> None:
-    used = sum(pair.used for pair in calibration.pairs)
-    baseline_mm = float((calibration.right_from_left[:3, 3] ** 2).sum() ** 0.5) * 1e3
     uncertainty = calibration.uncertainty
     assert uncertainty is not None
     result = {
         "calibration": str(output),
-        "pairs": used,
+        "pairs": sum(pair.used for pair in calibration.pairs),
         "pairs_left_out": {pair.left: pair.reason for pair in calibration.pairs if not pair.used},
         "reprojection_rms_px": calibration.reprojection_rms_px,
-        "baseline_mm": baseline_mm,
+        "baseline_mm": 1e3 * math.hypot(*calibration.right_from_left[:3, 3]),
         "left_f_px": calibration.left.fx_px,
         "right_f_px": calibration.right.fx_px,
         "uncertainty": {
@@ -190,28 +189,7 @@ def _print_result(
         },
         "report": None if page is None else str(page),
     }
-    if as_json:
-        print_json(result)
-        return
-    print_fields(
-        [
-            ("calibration", output),
-            ("pairs used", f"{used} of {len(calibration.pairs)}"),
-            ("reprojection", f"{calibration.reprojection_rms_px:.3f} px rms"),
-            ("baseline", f"{baseline_mm:.2f} mm"),
-            ("focal lengths", f"{calibration.left.fx_px:.1f}, {calibration.right.fx_px:.1f} px"),
-            (
-                "uncertainty",
-                f"{1e3 * uncertainty.depth_std_m:.2f} mm depth, "
-                f"{1e3 * uncertainty.lateral_std_m:.2f} mm lateral, "
-                f"at {1e3 * uncertainty.working_distance_m:.0f} mm",
-            ),
-            *([] if page is None else [("report", page)]),
-        ]
-    )
-    for pair in calibration.pairs:
-        if not pair.used:
-            words.print(f"excluded: {pair.left}: {pair.reason}")
+    print_result(result, as_json=as_json)
 
 
 @app.command(
@@ -249,10 +227,7 @@ def check(
             f"{', '.join(reused)}: these images were used to calibrate, so the errors are "
             "underestimated; use other images"
         )
-    if as_json:
-        print_json(result)
-    else:
-        print_fields((name, _format(value)) for name, value in result.items() if value != reused)
+    print_result(result, as_json=as_json)
 
 
 @app.command(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tempfile
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -25,17 +24,15 @@ from flexsheet.launch.commands.calibrate import (
     parse_board,
     pose_values,
     require_twin,
-    round_digits,
     write_scene_values,
 )
-from flexsheet.launch.commands.graph import run_interruptible
+from flexsheet.launch.commands.graph import receiving, run_interruptible
 from flexsheet.launch.commands.output import (
     CommandError,
     check_folder,
     examples,
-    print_fields,
-    print_json,
     print_outcome,
+    print_result,
     progress_bar,
     words,
 )
@@ -272,9 +269,7 @@ async def record_poses(
     subscribers = [make_listener(TOPICS["stereo"], run, on_stereo)]
     subscribers += [make_listener(TOPICS[name], run, on_state) for name in arms]
     printed = ""
-    try:
-        for subscriber in subscribers:
-            subscriber.start()
+    with receiving(subscribers):
         while recorder.count < places:
             pair, time_s = await images.get()
             if (pair.left.shape[1], pair.left.shape[0]) != size or any(pair.left_origin_px):
@@ -286,9 +281,6 @@ async def record_poses(
             if hint != printed:
                 words.print(hint)
             printed = hint
-    finally:
-        for subscriber in subscribers:
-            subscriber.close()
     return 0
 
 
@@ -441,15 +433,11 @@ def _print_result(
         "scene": None if copy is None else str(copy),
         "arms": {},
     }
-    lines = []
     for side in SIDES:
         base: ArmBase | None = getattr(measured, side)
         if base is None:
             continue
-        lines += [f"  {side}:", f"    world_from_base: {_format_pose(base)}"]
         outliers = [(one.name, one.reason) for one in base.poses if not one.used]
-        for name, reason in [*blind[side], *outliers]:
-            words.print(f"{side} arm, excluded {name}: {reason}")
         moved_m, turned_rad = _compute_shift(base, scene, side)
         result["arms"][side] = {
             "world_from_base": base.world_from_base.model_dump(mode="json"),
@@ -468,59 +456,7 @@ def _print_result(
             "arm_sigma_rad": base.arm_sigma_rad,
             **truth.get(side, {}),
         }
-    if as_json:
-        print_json(result)
-        return
-    print_fields([("calibration", output), *([] if copy is None else [("scene", copy)])])
-    for side, one in result["arms"].items():
-        print()
-        print_fields(_list_fields(side, one))
-    if copy is None:
-        print("\narms:\n" + "\n".join(lines))
-
-
-def _list_fields(side: str, one: dict[str, Any]) -> list[tuple[str, str]]:
-    rows = [
-        (f"{side} arm", f"{one['poses_used']} of {one['poses']} poses used"),
-        (
-            "uncertainty",
-            f"standard deviation {1e3 * one['position_std_m']:.2f} mm at the screen's centre, "
-            f"{math.degrees(one['rotation_std_rad']):.3f} degrees",
-        ),
-        (
-            "shift from scene",
-            f"{1e3 * one['moved_from_scene_m']:.1f} mm, "
-            f"{math.degrees(one['rotation_from_scene_rad']):.2f} degrees",
-        ),
-        (
-            "leave-one-out",
-            f"omitting one pose moves the base by up to {1e3 * one['max_change_m']:.2f} mm, "
-            f"{math.degrees(one['max_change_rad']):.3f} degrees; "
-            f"jackknife ratio {one['jackknife_ratio']:.2f}",
-        ),
-        ("corners", f"{one['corner_sigma_px']:.3f} px"),
-        (
-            "arm positioning error",
-            f"{1e3 * one['arm_sigma_m']:.2f} mm, {math.degrees(one['arm_sigma_rad']):.3f} degrees",
-        ),
-    ]
-    if "true_error_m" in one:
-        rows.append(
-            (
-                "true error",
-                f"{1e3 * one['true_error_m']:.2f} mm at the screen's centre, "
-                f"{math.degrees(one['true_error_rad']):.3f} degrees",
-            )
-        )
-    return rows
-
-
-def _format_pose(base: ArmBase) -> str:
-    position, rpy = (
-        ", ".join(repr(round_digits(value)) for value in values)
-        for values in (base.world_from_base.position_m, base.world_from_base.rpy_rad)
-    )
-    return f"{{position_m: [{position}], rpy_rad: [{rpy}]}}"
+    print_result(result, as_json=as_json)
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:

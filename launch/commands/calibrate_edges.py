@@ -23,9 +23,8 @@ from flexsheet.launch.commands.output import (
     CommandError,
     check_folder,
     examples,
-    print_fields,
-    print_json,
     print_outcome,
+    print_result,
 )
 
 if TYPE_CHECKING:
@@ -87,7 +86,19 @@ def edges(
     except EdgeFitError as error:
         raise CommandError(f"{rows or scene_file}: {error}; {error.remedy}") from error
     write_scene_values(scene_file, list_scene_values(fits), output)
-    _print_result(fits, output, as_json=as_json)
+    found = {
+        side: {
+            "marks": fit.marks,
+            "poses": fit.poses,
+            "residual_rms_m": fit.residual_rms_m,
+            "edge_std_m": fit.edge_std_m,
+            "joint_offsets_rad": fit.arm.joint_offsets_rad,
+            "flange_compliance_m_per_n": fit.arm.flange_compliance_m_per_n,
+            "compliance_std_m_per_n": fit.compliance_std_m_per_n,
+        }
+        for side, fit in fits.items()
+    }
+    print_result({"scene": str(output), "arms": found}, as_json=as_json)
 
 
 def list_scene_values(fits: dict[Side, EdgeFit]) -> dict[str, Any]:
@@ -100,39 +111,6 @@ def list_scene_values(fits: dict[Side, EdgeFit]) -> dict[str, Any]:
         values[f"{key}.joint_offsets_rad"] = [round_digits(one) for one in arm.joint_offsets_rad]
         values[f"{key}.flange_compliance_m_per_n"] = round_digits(arm.flange_compliance_m_per_n)
     return values
-
-
-def _print_result(fits: dict[Side, EdgeFit], output: Path, *, as_json: bool) -> None:
-    if as_json:
-        found = {
-            side: {
-                "marks": fit.marks,
-                "poses": fit.poses,
-                "residual_rms_m": fit.residual_rms_m,
-                "edge_std_m": fit.edge_std_m,
-                "joint_offsets_rad": fit.arm.joint_offsets_rad,
-                "flange_compliance_m_per_n": fit.arm.flange_compliance_m_per_n,
-                "compliance_std_m_per_n": fit.compliance_std_m_per_n,
-            }
-            for side, fit in fits.items()
-        }
-        print_json({"scene": str(output), "arms": found})
-        return
-    print_fields([("scene", output)])
-    for side, fit in fits.items():
-        print()
-        compliance = 1e6 * fit.arm.flange_compliance_m_per_n
-        print_fields(
-            [
-                (f"{side} arm", f"{fit.marks} marks in {fit.poses} poses"),
-                ("residual", f"{1e3 * fit.residual_rms_m:.3f} mm rms"),
-                ("uncertainty of the edge", f"{1e3 * fit.edge_std_m:.3f} mm"),
-                (
-                    "compliance of the flange",
-                    f"{compliance:.0f} ± {1e6 * fit.compliance_std_m_per_n:.0f} µm/N",
-                ),
-            ]
-        )
 
 
 @app.command("edges-capture", epilog=examples("flexsheet calibrate edges-capture -o marks.csv"))

@@ -15,8 +15,7 @@ from flexsheet.launch.commands.output import (
     CommandError,
     check_folder,
     examples,
-    print_fields,
-    print_json,
+    print_result,
 )
 
 if TYPE_CHECKING:
@@ -85,7 +84,8 @@ def marker(
         source = f"twin of {scene.name}"
     calibration = make_calibration(touches, scene, source)
     save_marker_calibration(calibration, output, comment=command_line())
-    _print_result(calibration, output, as_json)
+    values = calibration.model_dump(mode="json")
+    print_result({"calibration": str(output), **values}, as_json=as_json)
 
 
 def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerCalibration:
@@ -115,30 +115,4 @@ def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerC
         touches=len(touches),
         points=fit.points,
         orientations=fit.orientations,
-    )
-
-
-def _print_result(calibration: MarkerCalibration, output: Path, as_json: bool) -> None:
-    if as_json:
-        print_json({"calibration": str(output), **calibration.model_dump(mode="json")})
-        return
-    offsets = zip(calibration.marker_from_pad_m, calibration.standard_deviations_m, strict=True)
-    print_fields(
-        [
-            ("calibration", output),
-            (
-                "touches",
-                f"{calibration.touches} of {calibration.points} points in "
-                f"{calibration.orientations} orientations",
-            ),
-            *(
-                (f"marker from pad, {axis}", f"{1e3 * value:.2f} ± {1e3 * deviation:.2f} mm")
-                for axis, (value, deviation) in zip("xyz", offsets, strict=True)
-            ),
-            (
-                "residuals",
-                f"{1e3 * calibration.residual_rms_m:.2f} mm rms, "
-                f"{1e3 * calibration.max_residual_m:.2f} mm max",
-            ),
-        ]
     )

@@ -22,8 +22,8 @@ from flexsheet.launch.commands.output import (
     CommandError,
     check_folder,
     examples,
-    print_fields,
     print_json,
+    print_result,
     words,
 )
 from flexsheet.messages.files import write_file
@@ -265,7 +265,6 @@ def list_scene_values(projector: Projector) -> dict[str, Any]:
 def _print_result(
     scene: Scene, fit: ProjectorFit, true: Projector | None, output: Path | None, *, as_json: bool
 ) -> None:
-    held_out = None if fit.held_out_rms_px != fit.held_out_rms_px else fit.held_out_rms_px
     lens, pose = fit.projector.lens, fit.projector.world_from_projector
     result: dict[str, Any] = {
         "scene": None if output is None else str(output),
@@ -274,7 +273,7 @@ def _print_result(
         "outliers": fit.outliers,
         "rms_px": fit.rms_px,
         "rms_mm": 1e3 * fit.rms_m,
-        "held_out_rms_px": held_out,
+        "held_out_rms_px": fit.held_out_rms_px,
         "before_rms_px": fit.before_rms_px,
         "coverage_ratio": fit.coverage_ratio,
         "depth_range_mm": 1e3 * fit.depth_range_m,
@@ -293,26 +292,7 @@ def _print_result(
                 "rpy_rad": true.world_from_projector.rpy_rad.tolist(),
             },
         }
-    if as_json:
-        print_json(result)
-        return
-    held_out_text = "-" if held_out is None else f"{held_out:.2f} px rms"
-    print_fields(
-        [
-            ("scene", "not written (no -o FILE)" if output is None else output),
-            ("points", f"{fit.points} in {fit.poses} poses, {fit.outliers} outliers excluded"),
-            ("before", f"{fit.before_rms_px:.2f} px rms"),
-            ("after", f"{fit.rms_px:.2f} px rms, {1e3 * fit.rms_m:.2f} mm on the sheet"),
-            ("held-out poses", held_out_text),
-            ("coverage", f"{100 * fit.coverage_ratio:.0f} % of the image"),
-            ("depth", f"{1e3 * fit.depth_range_m:.0f} mm along the projection"),
-        ]
-    )
-    for when, error in result.get("eye_error_mm", {}).items():
-        words.print(
-            f"true image error at the eye {when} the calibration: {error['mean']:.3f} mm mean, "
-            f"{error['max']:.3f} mm max"
-        )
+    print_result(result, as_json=as_json)
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:

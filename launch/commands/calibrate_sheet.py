@@ -19,10 +19,8 @@ from flexsheet.launch.commands.output import (
     CommandError,
     check_folder,
     examples,
-    print_fields,
-    print_json,
+    print_result,
     progress_bar,
-    words,
 )
 
 if TYPE_CHECKING:
@@ -257,55 +255,25 @@ def simulate_pushes(
 
 
 def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
-    mooney, hysteresis = calibration.mooney_ratio, calibration.hysteresis_ratio
     fitted = {
-        "modulus_thickness_n_per_m": calibration.modulus_thickness_n_per_m,
-        "slack_width_m": calibration.slack_width_m,
-        "cubic_ratio": calibration.cubic_ratio,
-        **({} if mooney is None else {"mooney_ratio": mooney}),
-        **({} if hysteresis is None else {"hysteresis_ratio": hysteresis}),
-    }
-    if as_json:
-        print_json(
-            {
-                "calibration": str(output),
-                "rows": calibration.rows,
-                "left_out": [one.model_dump() for one in calibration.left_out],
-                "residual_rms_ratio": calibration.residual_rms_ratio,
-                "max_residual_ratio": calibration.max_residual_ratio,
-                "residual_rms_sigmas": calibration.residual_rms_sigmas,
-                "table": calibration.table is not None,
-                **{name: one.model_dump() for name, one in fitted.items()},
-            }
+        name: getattr(calibration, name)
+        for name in (
+            "modulus_thickness_n_per_m",
+            "slack_width_m",
+            "cubic_ratio",
+            "mooney_ratio",
+            "hysteresis_ratio",
         )
-        return
-    units = {
-        "modulus_thickness_n_per_m": ("modulus x thickness", 1.0, "N/m"),
-        "slack_width_m": ("width without tension", 1e3, "mm"),
-        "cubic_ratio": ("cubic term relative to ideal rubber", 1.0, ""),
-        "mooney_ratio": ("Mooney weight", 1.0, ""),
-        "hysteresis_ratio": ("energy lost in a cycle", 100.0, "%"),
     }
-    print_fields(
-        [
-            ("calibration", output),
-            ("rows used", f"{calibration.rows - len(calibration.left_out)} of {calibration.rows}"),
-            *(
-                (
-                    units[name][0],
-                    f"{units[name][1] * one.value:.4g} "
-                    f"± {units[name][1] * one.standard_deviation:.2g} {units[name][2]}".rstrip(),
-                )
-                for name, one in fitted.items()
-            ),
-            (
-                "residuals",
-                f"{100 * calibration.residual_rms_ratio:.1f} % rms, "
-                f"{100 * calibration.max_residual_ratio:.1f} % max, "
-                f"{calibration.residual_rms_sigmas:.2f} standard deviations",
-            ),
-            ("table", "none" if calibration.table is None else calibration.table.ratios.shape),
-        ]
-    )
-    for one in calibration.left_out:
-        words.print(f"line {one.line} excluded: its residual is {100 * one.residual_ratio:+.0f} %")
+    excluded = {f"line {one.line}": one.residual_ratio for one in calibration.left_out}
+    result = {
+        "calibration": str(output),
+        "rows": calibration.rows,
+        "left_out": [one.model_dump() for one in calibration.left_out] if as_json else excluded,
+        "residual_rms_ratio": calibration.residual_rms_ratio,
+        "max_residual_ratio": calibration.max_residual_ratio,
+        "residual_rms_sigmas": calibration.residual_rms_sigmas,
+        "table": calibration.table is not None,
+        **{name: one.model_dump() for name, one in fitted.items() if one is not None},
+    }
+    print_result(result, as_json=as_json)

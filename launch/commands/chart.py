@@ -114,17 +114,18 @@ def chart(
     logs_on_stderr()
     chosen = [find_file(one, SCENES) for one in scene_files or ()]
     if family == SYSTEM:
-        from flexsheet.launch.commands.chart_system import measure_system
+        from flexsheet.launch.methods.system_chart import run_system_chart
 
-        measure_system(
-            chosen,
+        measure = partial(
+            run_system_chart,
+            chosen or sorted(SCENES.glob("*.yaml")),
             output,
             blocks=blocks,
             seconds=seconds,
             apparatuses=apparatuses,
             configurations=configurations or (),
-            as_json=as_json,
         )
+        _measure_system(measure, output / "system.svg", as_json=as_json)
         return
     from flexsheet.launch.methods import charts
     from flexsheet.launch.methods.results import describe_load
@@ -166,6 +167,67 @@ def chart(
 
 def _report(progress: Callable[[str], None], family: str, text: str) -> None:
     progress(f"{family}: {text}")
+
+
+def _measure_system(measure: Callable[..., dict[str, Any]], image: Path, *, as_json: bool) -> None:
+    """Measure graph configurations, and write the results and a chart.
+
+    measure: function that measures and reports its progress to a given function.
+    """
+    import json
+
+    from flexsheet.launch.methods.results import describe_load
+    from flexsheet.launch.methods.system_picture import draw_system_chart
+    from flexsheet.messages.files import write_file
+
+    if busy := describe_load():
+        words.print(busy, style="yellow")
+    with progress_words() as progress:
+        result = measure(progress=progress)
+    draw_system_chart(result, image)
+    result = replace_non_finite({**result, "picture": str(image)})
+    write_file(image.with_suffix(".json"), json.dumps(result, indent=1) + "\n")
+    if as_json:
+        print_json(result)
+        return
+    _print_configurations(result)
+    for one in result["failed"]:
+        words.print(f"{one['scene']}: {one['trial']} failed: {one['error']}")
+    words.print(f"chart: {image}")
+
+
+def _print_configurations(result: dict[str, Any]) -> None:
+    from flexsheet.launch.methods.system_chart import ERRORS
+
+    front = {(one["scene"], one["configuration"]) for one in result["front"]}
+    columns = ("scene", "configuration", "cores", "to arm, ms", "to image, ms", *ERRORS)
+    rows = [
+        (
+            point["scene"],
+            point["configuration"],
+            f"{point['cpu_cores']:.2f}",
+            _latency(point["exposure_to_arm_ms"]),
+            _latency(point["exposure_to_light_ms"]),
+            *(_error(point, key) for key in ERRORS),
+            "front" if (point["scene"], point["configuration"]) in front else "",
+            "" if point["meets_tolerances"] else "fails: " + ", ".join(point["failing"]),
+        )
+        for point in result["points"]
+    ]
+    print_table((*columns, "", ""), rows)
+
+
+def _latency(found: dict[str, float] | None) -> str:
+    return "-" if found is None else f"{found['p50']:.1f} / {found['p99']:.1f}"
+
+
+def _error(point: dict[str, Any], key: str) -> str:
+    spread = point["spread"].get(f"{key}.p95")
+    if spread is None:
+        return "-"
+    if spread["low"] is None:
+        return f"{spread['value']:.3g}"
+    return f"{spread['value']:.3g} ({spread['low']:.3g}-{spread['high']:.3g})"
 
 
 def _print_methods(result: dict[str, Any]) -> None:

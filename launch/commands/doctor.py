@@ -122,8 +122,7 @@ def check_scene(
 
 
 def _describe_branch(branch: dict[str, Any]) -> str:
-    """Return a text that describes a joint solution, by its names or by its joint angles in
-    degrees."""
+    """Describe a joint solution by its names, or by its joint angles in degrees."""
     if "seed_rad" not in branch:
         return ", ".join(branch.values())
     degrees = (f"{math.degrees(angle):.0f}" for angle in branch["seed_rad"])

@@ -11,6 +11,7 @@ from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.output import (
     CommandError,
     examples,
+    print_columns,
     print_json,
     print_table,
     progress_words,
@@ -53,11 +54,7 @@ MapOption = Annotated[
 
 
 def make_result_folder(output: Path | None, name: str) -> Path:
-    """Create and return a folder for an experiment's bag and results.
-
-    The folder is `output`; if `output` is None, it is a new folder in runs/ whose name contains
-    `name`.
-    """
+    """Create and return the folder `output`, or a new folder runs/...-`name` if it is None."""
     from flexsheet.launch.experiments.run import new_folder
 
     if output is None:
@@ -312,25 +309,19 @@ def compliance(
         print_json({**result, "figure": str(image)})
         return
     columns = {
-        "position": "at",
-        "depth, mm": "depth_mm",
-        "reference, N": "reference_n",
-        "wanted, N": "wanted_n",
-        "felt, N": "felt_n",
-        "error, %": "error_percent",
-        "model's, %": "model_error_percent",
-        "model": "method",
-        "offset, mm": "normal_offset_mm",
+        "position": ("at", ""),
+        "depth, mm": ("depth_mm", ".2f"),
+        "reference, N": ("reference_n", ".2f"),
+        "wanted, N": ("wanted_n", ".2f"),
+        "felt, N": ("felt_n", ".2f"),
+        "error, %": ("error_percent", ".2f"),
+        "model's, %": ("model_error_percent", ".2f"),
+        "model": ("method", ""),
+        "offset, mm": ("normal_offset_mm", ".2f"),
     }
-    columns |= {"measured, N": "measured_n"} if "measured_n" in result["rows"][0] else {}
-    cells = [
-        [
-            cell if isinstance(cell, str) else "–" if cell is None else f"{cell:.2f}"
-            for cell in (row[key] for key in columns.values())
-        ]
-        for row in result["rows"]
-    ]
-    print_table(list(columns), cells)
+    if "measured_n" in result["rows"][0]:
+        columns["measured, N"] = ("measured_n", ".2f")
+    print_columns(result["rows"], columns)
     words.print(f"errors are relative to {result['reference']}")
     for place in result["against_reference"]:
         words.print(
@@ -515,8 +506,7 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 
 
 def _print_stroke_table(table: dict[str, Any]) -> None:
-    """Print one line per variant, with the mean errors over all strokes and their 95 %
-    intervals."""
+    """Print the mean errors of each variant over all strokes, with their 95 % intervals."""
 
     def shown(found: dict[str, Any] | None) -> str:
         if found is None:
@@ -527,13 +517,10 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
 
     columns = ["variant", "strokes", "Δd, mm", "Δθ, °", "true Δd, mm", "true Δθ, °"]
     keys = ("delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")
-    print_table(
-        columns,
-        [
-            [row["variant"], row["strokes"], *(shown(row[key]) for key in keys)]
-            for row in table["rows"]
-        ],
-    )
+    rows = [
+        [row["variant"], row["strokes"], *(shown(row[k]) for k in keys)] for row in table["rows"]
+    ]
+    print_table(columns, rows)
     for row in table["rows"]:
         for error in row["failed"]:
             words.print(f"{row['variant']}: a stroke failed: {error}")
@@ -648,8 +635,7 @@ def _report_gestures(
     *,
     as_json: bool,
 ) -> None:
-    """Write the result and the figure of `experiment stability --gestures`, and print the
-    results."""
+    """Write the result and the figure of `experiment stability --gestures`, and print a table."""
     import json
 
     from flexsheet.launch.experiments.pictures import draw_hand_gestures
@@ -660,25 +646,20 @@ def _report_gestures(
     if as_json:
         print_json({**result, "picture": str(image)})
         return
-    columns = ["gesture", "mass, g", "stiffness, N/m", "peak force, N", "error, N: peak", "mean"]
-    columns += ["median, %", "transient, N", "touches", "chatter", "watchdog"]
-    print_table(
-        columns,
-        [
-            [
-                row["gesture"],
-                f"{1e3 * row['mass_kg']:.0f}",
-                f"{row['stiffness_n_per_m']:.0f}",
-                f"{row['peak_force_n']:.2f}",
-                f"{row['peak_error_n']:.2f}",
-                f"{row['mean_error_n']:.3f}",
-                f"{row['median_error_percent']:.0f}",
-                f"{row['transient_n']:.2f}",
-                row["touches"],
-                row["chatter"],
-                row["watchdog_triggers"],
-            ]
-            for row in result["gestures"]
-        ],
+    print_columns(
+        result["gestures"],
+        {
+            "gesture": ("gesture", ""),
+            "mass, kg": ("mass_kg", ".3f"),
+            "stiffness, N/m": ("stiffness_n_per_m", ".0f"),
+            "peak force, N": ("peak_force_n", ".2f"),
+            "error, N: peak": ("peak_error_n", ".2f"),
+            "mean": ("mean_error_n", ".3f"),
+            "median, %": ("median_error_percent", ".0f"),
+            "transient, N": ("transient_n", ".2f"),
+            "touches": ("touches", ""),
+            "chatter": ("chatter", ""),
+            "watchdog": ("watchdog_triggers", ""),
+        },
     )
     words.print(f"image: {image}")

@@ -52,8 +52,7 @@ class Entry:
 
 @cache
 def entries() -> tuple[Entry, ...]:
-    """Return the explanations of all errors, of the nodes' notes, and of texts that the console
-    shows."""
+    """Return the explanations of all errors, notes of nodes, and texts of the console."""
     from flexsheet.messages.notes import (
         FINGERTIP_REMEDIES,
         SELF_CHECK_FINDINGS,
@@ -100,8 +99,8 @@ def _meaning(kind: type[FlexsheetError]) -> str:
 def find_entries(text: str) -> list[Entry]:
     """Return the explanations of a code, a class name or an error text, with the best match first.
 
-    An error text matches explanations whose class name or phrase it contains. If there are none, it
-    matches explanations with at least MIN_SHARED_WORDS common words, weighted by their rarity.
+    If the text contains no class name and no phrase, it is compared word by word. Explanations with
+    at least MIN_SHARED_WORDS common words match, and rare words have more weight.
     """
     code = text.replace(" ", "_")  # the console shows the codes of fingertips with spaces
     if exact := [one for one in entries() if text in (one.code, one.name) or one.code == code]:

@@ -57,16 +57,13 @@ def new(
     import re
 
     from flexsheet.launch.running.keys import secret_file
-    from flexsheet.messages.security import SecurityError, make_key_pair, write_secret
+    from flexsheet.messages.security import make_key_pair, write_secret
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
         raise CommandError(f'"{host}": invalid host name; use lower-case letters, digits and _')
     public, secret = make_key_pair()
     file = secret_file(host)
-    try:
-        write_secret(file, secret, replace=replace)
-    except SecurityError as error:
-        raise CommandError(str(error), FAILED) from error
+    write_secret(file, secret, replace=replace)
     words.print(f"secret key: {file}; do not copy it to another computer")
     words.print(f"run on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'")
     if as_json:
@@ -135,13 +132,10 @@ def install(
     """
     from flexsheet.launch.running.keys import install as install_key
     from flexsheet.launch.running.keys import secret_file
-    from flexsheet.messages.security import SecurityError, derive_public_key, read_secret
+    from flexsheet.messages.security import derive_public_key, read_secret
 
     if key is None:
-        try:
-            key = derive_public_key(read_secret(secret_file(host)))
-        except SecurityError as error:
-            raise CommandError(str(error), FAILED) from error
+        key = derive_public_key(read_secret(secret_file(host)))
     install_key(launch_file, host, key)
     print_outcome(
         {"launch_file": str(launch_file), "host": host, "public": key},

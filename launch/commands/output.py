@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sys
 import time
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.units import UNITS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -191,6 +193,41 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
     width = max(len(name) for name, _ in pairs)
     for name, value in pairs:
         print(f"{name:<{width}}  {value}".rstrip())
+
+
+SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "°")}
+"""The factor and the unit of printed values, by SI unit; other units are not converted."""
+
+
+def print_result(result: Mapping[str, Any], *, as_json: bool) -> None:
+    """Print a result on stdout, as JSON or as one line for each of its values.
+
+    In the lines, lengths are in mm, angles are in degrees, and missing values are omitted.
+    """
+    if as_json:
+        print_json(result)
+    else:
+        print_fields(_list_values(replace_non_finite(result)))
+
+
+def _list_values(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield label and text of all values; the unit of a value is the suffix of its name."""
+    for name, value in values.items():
+        found = (pair for pair in UNITS.items() if name.endswith(pair[0]))
+        suffix, unit = next(found, ("", ""))
+        factor, unit = SHOWN_UNITS.get(unit, (1.0, unit.removeprefix("1")))
+        label = name.removesuffix(suffix) if unit else name
+        label = prefix + (label.replace("_", " ") if label.isidentifier() else label)
+        if isinstance(value, Mapping):
+            yield from _list_values(value, f"{prefix}{name.replace('_', ' ')} ")
+        elif value is not None:
+            yield label, f"{_show(_scale(value, factor))} {unit}".rstrip()
+
+
+def _scale(value: Any, factor: float) -> Any:
+    if isinstance(value, list):
+        return [_scale(one, factor) for one in value]
+    return factor * value if isinstance(value, float) else value
 
 
 @contextmanager

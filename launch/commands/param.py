@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import json
+from contextlib import closing
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from flexsheet.launch.commands import complete
-from flexsheet.launch.commands.graph import receive_until, run_interruptible, running_graph
+from flexsheet.launch.commands.graph import (
+    find_node,
+    receive_until,
+    run_interruptible,
+    running_graph,
+)
 from flexsheet.launch.commands.options import JsonOption, RunOption, make_app
 from flexsheet.launch.commands.output import (
     FAILED,
@@ -56,7 +62,7 @@ def list_parameters(
 ) -> None:
     """List the parameters of the running graph, and state which can be changed while it runs."""
     plan, found = running_graph(run)
-    nodes = [_find_node(plan, node)] if node else list(plan.nodes.values())
+    nodes = [find_node(plan, node)] if node else list(plan.nodes.values())
     changed = _read_changes(plan, found, {one.name for one in nodes if _live(one)})
     rows = [
         {
@@ -132,19 +138,11 @@ def set_parameter(
     print_outcome(result, f"{parameter} = {json.dumps(new)}", as_json=as_json)
 
 
-def _find_node(plan: ResolvedGraph, name: str) -> ResolvedNode:
-    from flexsheet.launch.plans.documents import did_you_mean
-
-    if name not in plan.nodes:
-        raise CommandError(f'"{name}": unknown node; {did_you_mean(name, list(plan.nodes))}')
-    return plan.nodes[name]
-
-
 def _find_parameter(plan: ResolvedGraph, text: str) -> tuple[ResolvedNode, str]:
     from flexsheet.launch.plans.documents import did_you_mean
 
     node_name, _, name = text.partition(".")
-    node = _find_node(plan, node_name)
+    node = find_node(plan, node_name)
     if name not in node.parameters:
         raise CommandError(
             f'"{text}": unknown parameter; {did_you_mean(name, list(node.parameters))}'
@@ -185,18 +183,14 @@ async def _set(plan: ResolvedGraph, run: Run, node: str, name: str, value: Any) 
     from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
     from flexsheet.messages.types import ParameterChange
 
-    writer = GraphWriter(plan, run, ["parameter"])
-    try:
+    with closing(GraphWriter(plan, run, ["parameter"])) as writer:
         await asyncio.sleep(READER_RECONNECT_S)
         change = ParameterChange(node=node, parameter=name, value=json.dumps(value))
         writer.publish("parameter", change)
-
         found: dict[str, dict[str, Any]] = {}
         if await _await_statuses(plan, run, lambda: found.get(node, {}).get(name) == value, found):
             raise CommandError(
                 f"{node}.{name}: the node did not confirm the change; see flexsheet logs {node}",
                 FAILED,
             )
-    finally:
-        writer.close()
     return 0

@@ -1,7 +1,4 @@
-"""`flexsheet precompute`: compute the tables of a scene and store them in a cache.
-
-A graph then reads the tables from the cache, and starts faster.
-"""
+"""`flexsheet precompute`: compute the tables of a scene, so that a graph starts faster."""
 
 from __future__ import annotations
 

@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import os
-from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import run_interruptible, running_graph
-from flexsheet.launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
+from flexsheet.launch.commands.output import CommandError, examples, print_json, words
 
 app = options.make_app()
-
-
-class ExternalTopic(StrEnum):
-    """The topics that ROS nodes may publish for flexsheet."""
-
-    EYE = "eye"
-    FINGERTIP = "fingertip"
 
 
 @app.command(
@@ -34,7 +26,7 @@ def ros2_bridge(
     *,
     topics: options.TopicsOption = None,
     accept: Annotated[
-        list[ExternalTopic] | None,
+        list[Literal["eye", "fingertip"]] | None,
         typer.Option(
             help="Topic that ROS nodes may publish, as /external/eye or /external/fingertip; can "
             "be repeated; default: none."
@@ -79,34 +71,31 @@ def ros2_bridge(
     for name in names:
         find_topic(name)
         if name not in plan.writers:
-            raise CommandError(
-                f"--topic {name}: the topic has no writer in the running graph", BAD_INPUT
-            )
+            raise CommandError(f"--topic {name}: the topic has no writer in the running graph")
     if domain is None:
         given = os.environ.get("ROS_DOMAIN_ID", "0")
         if not given.isdigit() or int(given) > MAX_DOMAIN:
             raise CommandError(
                 f"ROS_DOMAIN_ID={given}: expected a number from 0 to {MAX_DOMAIN}; correct it, or "
-                "give --domain",
-                BAD_INPUT,
+                "give --domain"
             )
         domain = int(given)
     participant = RosParticipant(domain, interface)
-    options = {
+    settings = {
         "topics": names,
-        "accept": [one.value for one in accept or ()],
+        "accept": accept or (),
         "noise_m": noise_mm * 1e-3,
     }
-    words.print(f"ROS domain {domain} on {interface}; press Ctrl-C to stop", markup=False)
+    words.print(f"ROS domain {domain} on {interface}; press Ctrl-C to stop")
     counts: dict[str, Any] = {"published": {}, "accepted": {}, "rejected": {}}
-    work = _run(plan, found, participant, options=options, duration_s=duration, counts=counts)
+    work = _run(plan, found, participant, options=settings, duration_s=duration, counts=counts)
     run_interruptible(work)
     if as_json:
         print_json(counts)
         return
     for what, numbers in counts.items():
         listed = ", ".join(f"{number} {name}" for name, number in sorted(numbers.items()))
-        words.print(f"{what}: {listed or 'none'}", markup=False)
+        words.print(f"{what}: {listed or 'none'}")
 
 
 async def _run(
@@ -126,7 +115,7 @@ async def _run(
             run,
             participant,
             **options,
-            on_problem=lambda text: words.print(text, markup=False),
+            on_problem=words.print,
         )
     except BaseException:
         participant.close()

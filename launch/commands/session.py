@@ -16,8 +16,10 @@ import typer
 from flexsheet.launch.commands import complete, options
 from flexsheet.launch.commands.graph import (
     NoGraphError,
+    find_node,
     receive_until,
     run_interruptible,
+    run_node_here,
     running_graph,
 )
 from flexsheet.launch.commands.launching import format_log_line, run_graph
@@ -300,7 +302,6 @@ def run_node(
     launch LAUNCH_FILE --without NODE`. With --launch, the command instead starts a new graph that
     contains only this node.
     """
-    from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan import load_graph
 
     given = options.with_scene(settings, scene)
@@ -313,10 +314,7 @@ def run_node(
                 "--set and --scene require --launch LAUNCH_FILE, because the running graph has "
                 "fixed settings"
             )
-    if node not in plan.nodes:
-        raise CommandError(
-            f'"{node}": unknown node of {plan.launch_file}; {did_you_mean(node, list(plan.nodes))}'
-        )
+    find_node(plan, node)
     if launch_file is not None:
         without = [name for name in plan.nodes if name != node]
         code = asyncio.run(run_graph(plan, None, duration, without=without))
@@ -329,7 +327,6 @@ def run_node(
 
 async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | None) -> int:
     from flexsheet.launch.running.supervisor import node_config
-    from flexsheet.nodes.runner import run_node as run_config
 
     if (run.directory / f"{name}.status").exists():
         raise CommandError(
@@ -338,11 +335,5 @@ async def _join(plan: ResolvedGraph, run: Run, name: str, duration_s: float | No
             FAILED,
         )
     words.print(f"running {name} in {run.directory}; press Ctrl-C to stop")
-    stop_event = asyncio.Event()
-    work = asyncio.create_task(run_config(node_config(plan, plan.nodes[name], run), stop_event))
-    try:
-        await asyncio.wait((work,), timeout=duration_s)
-    finally:
-        stop_event.set()
-        await work
+    await run_node_here(node_config(plan, plan.nodes[name], run), duration_s)
     return 0

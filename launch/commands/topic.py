@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from flexsheet.launch.commands.graph import run_interruptible, running_graph
+from flexsheet.launch.commands.graph import (
+    list_readers,
+    receiving,
+    run_interruptible,
+    running_graph,
+)
 from flexsheet.launch.commands.options import JsonOption, RunOption, TopicArgument, make_app
 from flexsheet.launch.commands.output import (
     FAILED,
@@ -88,11 +94,7 @@ def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = Fals
             raise
     else:
         description["writers"] = [writer.name for writer in plan.writers.get(topic, ())]
-        description["readers"] = [
-            node.name
-            for node in plan.nodes.values()
-            if any(port.topic == topic for port in node.inputs)
-        ]
+        description["readers"] = list_readers(plan, topic)
     if as_json:
         print_json(description)
         return
@@ -443,20 +445,19 @@ async def _read(
         topic, run, lambda message, header: arrived.put_nowait((message, header))
     )
     waiting = asyncio.get_running_loop().call_later(REPORT_DELAY_S, _report_no_message, topic)
-    subscriber.start()
-    try:
-        shown = 0
-        while limit is None or shown < limit:
-            async with asyncio.timeout(timeout_s):
-                message, header = await arrived.get()
+    with receiving([subscriber]):
+        try:
+            shown = 0
+            while limit is None or shown < limit:
+                async with asyncio.timeout(timeout_s):
+                    message, header = await arrived.get()
+                waiting.cancel()
+                show(message, header)
+                shown += 1
+        except TimeoutError:
+            raise make_silence_error(topic.name, timeout_s or 0.0) from None
+        finally:
             waiting.cancel()
-            show(message, header)
-            shown += 1
-    except TimeoutError:
-        raise make_silence_error(topic.name, timeout_s or 0.0) from None
-    finally:
-        waiting.cancel()
-        subscriber.close()
     return 0
 
 
@@ -485,12 +486,8 @@ async def _collect(
         size_bytes = sum(memoryview(frame).nbytes for frame in frames)
         arrivals.append(Arrival(header, size_bytes, clock.now_ns()))
 
-    subscriber = make_listener(topic, run, receive, raw=True)
-    subscriber.start()
-    try:
+    with receiving([make_listener(topic, run, receive, raw=True)]):
         await asyncio.sleep(duration_s)
-    finally:
-        subscriber.close()
     return 0
 
 
@@ -553,8 +550,7 @@ async def _publish(
     from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
 
     plan, found = running_graph(run)
-    writer = GraphWriter(plan, found, [topic.name])
-    try:
+    with closing(GraphWriter(plan, found, [topic.name])) as writer:
         await asyncio.sleep(READER_RECONNECT_S)
         sent = 0
         while times is None or sent < times:
@@ -566,6 +562,4 @@ async def _publish(
         # Wait for readers that are still connecting, because the latched message is lost with the
         # publisher's socket.
         await asyncio.sleep(READER_RECONNECT_S / 2)
-    finally:
-        writer.close()
     return 0

@@ -38,13 +38,12 @@ HEADER = "std_msgs/Header header\nstring writer\nuint64 sequence_number\n"
 ELEMENTS = {"<f8": "float64", "<f4": "float32", "<i4": "int32", "<i8": "int64", "|u1": "uint8"}
 """The ROS element types of array fields, by NumPy element type."""
 
-Make = Callable[[str, dict[str, Any]], Any]
-"""The type of a function that makes a ROS message from the name of its type and its fields."""
+Make = Callable[..., Any]
+"""The type of a function that makes a ROS message from its type name and its fields (keywords)."""
 
 
 class Ros2Error(FlexsheetError, RuntimeError):
-    """Raised if messages cannot be exchanged with ROS 2; the text states the reason and the
-    remedy."""
+    """Raised if messages cannot be exchanged with ROS 2."""
 
     code = "ros2"
     remedy = "Install the packages of the extra `flexsheet[ros2]`, or correct the named value."
@@ -217,8 +216,8 @@ def _plain(value: Any, _: Make) -> Any:
 
 
 def _convert_group(value: BaseModel, make: Make) -> Any:
-    return make(ros_name(type(value)), convert_fields(value, make))
+    return make(ros_name(type(value)), **convert_fields(value, make))
 
 
 def _convert_stamp(value: int, make: Make) -> Any:
-    return make("builtin_interfaces/msg/Time", split_time(value))
+    return make("builtin_interfaces/msg/Time", **split_time(value))
