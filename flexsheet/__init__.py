@@ -1,6 +1,6 @@
 """Build, run, record and evaluate node graphs of an encountered-type visual-haptic display.
 
-A name is imported on first use, so that `import flexsheet` is fast. The message types are in
+A name is imported on first use, because importing all names takes long. The message types are in
 `flexsheet.messages.types`, and the types of scenes are in `flexsheet.messages.scene`.
 """
 

@@ -12,7 +12,7 @@ from flexsheet.launch.commands.output import (
     examples,
     print_json,
     print_outcome,
-    print_table,
+    print_rows,
     words,
 )
 
@@ -101,22 +101,7 @@ def show(
         print_json({"scene": loaded.scene, "origin": loaded.origin, "differences": rows})
         return
     words.print(f"scene {loaded.scene}, {loaded.origin}: {len(rows)} differences")
-    print_table(
-        ("parameter", "value", "nominal", "unit", ""),
-        [
-            (
-                row["parameter"],
-                _format(row["value"]),
-                "value in scene or node" if row["nominal"] is None else _format(row["nominal"]),
-                row["unit"],
-                "" if row["simulated"] else "not simulated",
-            )
-            for row in rows
-        ],
-    )
-
-
-def _format(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(_format, value))
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    for row in rows:
+        if row["nominal"] is None:
+            row["nominal"] = "value in scene or node"
+    print_rows(rows, as_json=False)

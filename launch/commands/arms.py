@@ -80,7 +80,7 @@ def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOptio
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
-    """Engage the software e-stop of the arms, which stays engaged until it is reset.
+    """Engage the software e-stop of the arms until `flexsheet arms reset`.
 
     This command does not replace the hard-wired e-stop. Without --run, it stops the arms of all
     graphs of this user on this computer.
@@ -102,7 +102,7 @@ async def _confirm_stop(
 ) -> int:
     """Print the results of the stop attempts and the states of the arms; return the exit code.
 
-    If no launcher has confirmed a stop, also publish an e-stop on the topic `estop`.
+    If no launcher has confirmed a stop, an e-stop is published on the topic `estop`.
     """
     from flexsheet.launch.running.stopping import StopOutcome, StopPath
     from flexsheet.messages.types import EStop

@@ -151,7 +151,6 @@ def play(
     launch: Annotated[
         Path | None,
         typer.Option(
-            metavar="LAUNCH_FILE",
             help="Launch file of a graph to start before playback and stop after it.",
             **options.LAUNCH_FILE,
         ),

@@ -19,7 +19,6 @@ import typer
 from flexsheet.launch.commands import options
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_fields,
     print_json,
@@ -61,6 +60,14 @@ MarkerOption = Annotated[
 ]
 DictionaryOption = Annotated[str, typer.Option(help="OpenCV dictionary of the ChArUco markers.")]
 FOUR_BITS = "DICT_4X4_50"
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--calibration",
+        metavar="FILE",
+        help="Stereo calibration file; default: the camera of the scene.",
+    ),
+]
 
 
 @app.command(
@@ -75,7 +82,7 @@ def stereo(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, options.output_file("Stereo calibration file to write.")],
+    output: Annotated[Path, options.result_file("Stereo calibration file to write.")],
     left: LeftOption = "",
     right: RightOption = "",
     device_source: Annotated[
@@ -121,7 +128,6 @@ def stereo(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.calibration import save_calibration
 
-    check_folder("-o", output)
     _check_single_source(left, right, device_source, twin)
     require_twin(apparatus, simulated=twin is not None)
     described = parse_board(board, square_mm, marker_mm, dictionary)
@@ -295,7 +301,7 @@ def print_board(
     *,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, options.output_file("Image file to write (.svg or .png).", "IMAGE")],
+    output: Annotated[Path, options.result_file("Image file to write (.svg or .png).", "IMAGE")],
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     as_json: options.JsonOption = False,
@@ -306,7 +312,6 @@ def print_board(
     """
     from flexsheet.launch.calibration.printing import make_caption, write_board
 
-    check_folder("-o", output)
     described = parse_board(board, square_mm, marker_mm, dictionary)
     write_board(described, output)
     if as_json:

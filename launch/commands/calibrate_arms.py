@@ -14,6 +14,7 @@ from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
     FOUR_BITS,
     BoardOption,
+    CalibrationOption,
     DictionaryOption,
     MarkerOption,
     SquareOption,
@@ -29,7 +30,6 @@ from flexsheet.launch.commands.calibrate import (
 from flexsheet.launch.commands.graph import receiving, run_interruptible
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_outcome,
     print_result,
@@ -49,14 +49,6 @@ if TYPE_CHECKING:
     from flexsheet.messages.scene import Scene
     from flexsheet.messages.types import Side
 
-CalibrationOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--calibration",
-        metavar="FILE",
-        help="Stereo calibration file; default: the camera of the scene.",
-    ),
-]
 SIDES: tuple[Side, Side] = ("left", "right")
 
 
@@ -73,7 +65,7 @@ def arms(
     scene_file: options.SceneOption,
     board: BoardOption,
     square_mm: SquareOption,
-    output: Annotated[Path, options.output_file("Arm calibration file to write.")],
+    output: Annotated[Path, options.result_file("Arm calibration file to write.")],
     left_arm: Annotated[
         Path | None,
         typer.Option(
@@ -98,7 +90,9 @@ def arms(
     copy: Annotated[
         Path | None,
         typer.Option(
-            "--write-scene", help="Copy of the scene to write, with the measured base poses."
+            "--write-scene",
+            help="Copy of the scene to write, with the measured base poses.",
+            callback=options.check_folder,
         ),
     ] = None,
     as_json: options.JsonOption = False,
@@ -112,7 +106,6 @@ def arms(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.arms_calibration import save_arms_calibration
 
-    check_folder("-o", output)
     if twin == (left_arm is not None or right_arm is not None):
         raise CommandError("give either --twin, or --left-arm, --right-arm or both")
     require_twin(apparatus, simulated=twin)
@@ -153,7 +146,7 @@ def arms(
 def write_scene(
     calibration: Annotated[Path, typer.Argument(help="Arm calibration file.")],
     scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to copy.")],
-    output: Annotated[Path, options.output_file("Scene file to write.")],
+    output: Annotated[Path, options.result_file("Scene file to write.")],
     as_json: options.JsonOption = False,
 ) -> None:
     """Write a copy of a scene file with the base poses of an arm calibration."""
@@ -287,7 +280,6 @@ async def record_poses(
 def _check_new_file(path: Path, option: str) -> None:
     if path.exists():
         raise CommandError(f"{option} {path}: the file exists; name a new file")
-    check_folder(option, path)
 
 
 def simulate_folder(

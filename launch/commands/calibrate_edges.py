@@ -9,6 +9,7 @@ import typer
 
 from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
+    CalibrationOption,
     app,
     load_optics,
     load_true_devices,
@@ -17,11 +18,10 @@ from flexsheet.launch.commands.calibrate import (
     round_digits,
     write_scene_values,
 )
-from flexsheet.launch.commands.calibrate_arms import CalibrationOption, record_poses
+from flexsheet.launch.commands.calibrate_arms import record_poses
 from flexsheet.launch.commands.graph import run_interruptible
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_outcome,
     print_result,
@@ -44,7 +44,7 @@ POSES = 24
 )
 def edges(
     *,
-    output: Annotated[Path, options.output_file("Copy of the scene file with the measured arms.")],
+    output: Annotated[Path, options.result_file("Copy of the scene file with the measured arms.")],
     rows: Annotated[
         Path | None,
         typer.Option(
@@ -70,7 +70,6 @@ def edges(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.apparatus import nominal_apparatus
 
-    check_folder("-o", output)
     if twin == (rows is not None):
         raise CommandError("give exactly one source of marks: --rows CSV or --twin")
     require_twin(apparatus, simulated=twin)

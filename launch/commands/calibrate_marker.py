@@ -13,7 +13,6 @@ from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import app, command_line, load_true_devices
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_result,
 )
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 )
 def marker(
     *,
-    output: Annotated[Path, options.output_file("Marker calibration file to write.")],
+    output: Annotated[Path, options.result_file("Marker calibration file to write.")],
     rows: Annotated[
         Path | None,
         typer.Option(
@@ -65,7 +64,6 @@ def marker(
     from flexsheet.messages.calibration import load_calibration
     from flexsheet.messages.marker_calibration import save_marker_calibration
 
-    check_folder("-o", output)
     if (rows is None) == (twin is None):
         raise CommandError("give exactly one source of touches: --rows CSV or --twin SCENE")
     for name, value in (("--apparatus", apparatus), ("--calibration", calibration_file)):

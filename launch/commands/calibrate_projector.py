@@ -10,6 +10,7 @@ import typer
 
 from flexsheet.launch.commands import options
 from flexsheet.launch.commands.calibrate import (
+    CalibrationOption,
     app,
     load_optics,
     load_true_devices,
@@ -20,7 +21,6 @@ from flexsheet.launch.commands.calibrate import (
 )
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_json,
     print_result,
@@ -55,11 +55,9 @@ def projector(
     scene_file: options.SceneOption,
     output: Annotated[
         Path | None,
-        options.output_file("Scene file to write with the result; may be the file of --scene."),
+        options.result_file("Scene file to write with the result; may be the file of --scene."),
     ] = None,
-    calibration: Annotated[
-        Path | None, typer.Option(help="Stereo calibration file; default: the camera of the scene.")
-    ] = None,
+    calibration: CalibrationOption = None,
     write_patterns: Annotated[
         Path | None,
         typer.Option(
@@ -127,8 +125,6 @@ def projector(
             "the patterns with --write-patterns FOLDER"
         )
     require_twin(apparatus, simulated=twin)
-    if output is not None:
-        check_folder("-o", output)
     true: Projector | None = None
     if corners is not None:
         fit = _fit_corners(scene, corners, rectangle_mm)

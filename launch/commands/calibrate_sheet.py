@@ -17,7 +17,6 @@ from flexsheet.launch.commands.calibrate import (
 )
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_result,
     progress_bar,
@@ -42,7 +41,7 @@ GAUGE_N = 0.005
 )
 def sheet(
     *,
-    output: Annotated[Path, options.output_file("Sheet calibration file to write.")],
+    output: Annotated[Path, options.result_file("Sheet calibration file to write.")],
     rows: Annotated[
         Path | None,
         typer.Option(
@@ -101,7 +100,6 @@ def sheet(
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.sheet_calibration import save_sheet_calibration
 
-    check_folder("-o", output)
     if sum(one is not None for one in (rows, bag, twin)) != 1:
         raise CommandError(
             "give exactly one source of pushes: --rows CSV, --bag BAG or --twin SCENE"

@@ -26,10 +26,7 @@ if TYPE_CHECKING:
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
 POSES_PER_PAIR = 3
-"""The number of simulated board poses per requested image pair.
-
-It is greater than one because some poses are rejected.
-"""
+"""The number of simulated board poses per requested image pair; some poses are rejected."""
 
 
 def read_device_views(source: str, scene: Scene) -> Iterator[Views]:

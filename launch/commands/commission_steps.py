@@ -70,7 +70,7 @@ CALLIPER_M = 3e-4
 WEIGHING_RATIO = 0.004
 """The relative standard deviation of the measured mass per area of a simulated sheet.
 
-It is caused by the errors of the scale (0.2 g) and of the ruler (0.5 mm).
+The causes are the errors of the scale (0.2 g) and of the ruler (0.5 mm).
 """
 
 INSTRUCTIONS: dict[StepName, str] = {

@@ -11,7 +11,6 @@ from flexsheet.launch.commands import options
 from flexsheet.launch.commands.graph import running_graph
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_json,
     words,
@@ -38,7 +37,7 @@ def graph(
     scene: options.OtherSceneOption = None,
     settings: options.SettingsOption = None,
     output: Annotated[
-        Path | None, options.output_file("Drawing to write: .svg image, or .mmd file for Mermaid.")
+        Path | None, options.result_file("Drawing to write: .svg image, or .mmd file for Mermaid.")
     ] = None,
     run: options.RunOption = None,
     as_json: options.JsonOption = False,
@@ -56,7 +55,6 @@ def graph(
     else:
         plan = load_graph(launch_file, settings=options.with_scene(settings, scene))
     if output is not None:
-        check_folder("--output", output)
         if output.suffix not in (".svg", ".mmd"):
             raise CommandError(f"--output {output}: unknown file type; name a .svg or .mmd file")
         write_file(output, mermaid(plan) if output.suffix == ".mmd" else svg(lay_out(plan)))

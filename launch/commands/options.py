@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.shipped import LAUNCH_FILES, SCENES, find_file
 
 DEMO, CYLINDER = Path("demo"), Path("cylinder")
@@ -201,18 +202,30 @@ SeedOption = Annotated[
     typer.Option(
         "--seed",
         metavar="N",
-        help="Random seed of the simulated measurements: poses, noise and tremor. The true "
-        "parameters of the hardware have their own seed, --apparatus seed:N.",
+        help="Random seed of the simulated measurements, such as poses and noise. The errors of "
+        "the simulated hardware have another seed, which --apparatus seed:N sets.",
     ),
 ]
 
 
-def output_file(text: str, metavar: str = "FILE") -> Any:
+def output_file(text: str, metavar: str = "FILE", **settings: Any) -> Any:
     """Return the declaration of the option -o/--output.
 
     text: help of the option. metavar: placeholder of the value in the help.
     """
-    return typer.Option("-o", "--output", metavar=metavar, help=text)
+    return typer.Option("-o", "--output", metavar=metavar, help=text, **settings)
+
+
+def result_file(text: str, metavar: str = "FILE") -> Any:
+    """Return the declaration of the option -o/--output for a file in an existing folder."""
+    return output_file(text, metavar, callback=check_folder)
+
+
+def check_folder(file: Path | None) -> Path | None:
+    """Return an output file; raise CommandError if its parent folder does not exist."""
+    if file is not None and not file.resolve().parent.is_dir():
+        raise CommandError(f"{file}: the folder {file.parent} does not exist; create it")
+    return file
 
 
 def with_scene(settings: list[str] | None, scene: Path | None) -> list[str]:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.results import replace_non_finite
@@ -36,15 +35,6 @@ class CommandError(FlexsheetError):
     def __init__(self, text: str, exit_code: int = BAD_INPUT) -> None:
         super().__init__(text)
         self.exit_code = exit_code
-
-
-def check_folder(option: str, file: Path) -> None:
-    """Raise CommandError if the parent folder of an output file does not exist.
-
-    option: command-line option that names the file, for the error text.
-    """
-    if not file.resolve().parent.is_dir():
-        raise CommandError(f"{option} {file}: the folder {file.parent} does not exist; create it")
 
 
 class Words:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import os
-from typing import Annotated, Any, Literal
+from enum import StrEnum
+from typing import Annotated, Any
 
 import typer
 
@@ -13,6 +14,13 @@ from flexsheet.launch.commands.graph import run_interruptible, running_graph
 from flexsheet.launch.commands.output import CommandError, examples, print_json, words
 
 app = options.make_app()
+
+
+class ExternalTopic(StrEnum):
+    """The topics that ROS nodes may publish for flexsheet."""
+
+    EYE = "eye"
+    FINGERTIP = "fingertip"
 
 
 @app.command(
@@ -26,7 +34,7 @@ def ros2_bridge(
     *,
     topics: options.TopicsOption = None,
     accept: Annotated[
-        list[Literal["eye", "fingertip"]] | None,
+        list[ExternalTopic] | None,
         typer.Option(
             help="Topic that ROS nodes may publish, as /external/eye or /external/fingertip; can "
             "be repeated; default: none."
@@ -83,7 +91,7 @@ def ros2_bridge(
     participant = RosParticipant(domain, interface)
     settings = {
         "topics": names,
-        "accept": accept or (),
+        "accept": [one.value for one in accept or ()],
         "noise_m": noise_mm * 1e-3,
     }
     words.print(f"ROS domain {domain} on {interface}; press Ctrl-C to stop")

@@ -7,10 +7,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, output_file
+from flexsheet.launch.commands.options import JsonOption, SceneArgument, make_app, result_file
 from flexsheet.launch.commands.output import (
     CommandError,
-    check_folder,
     examples,
     print_json,
     words,
@@ -45,7 +44,7 @@ def export(
     ] = None,
     output: Annotated[
         Path | None,
-        output_file("File to write: .urdf, .gltf, or .glb (binary glTF); default: print the text."),
+        result_file("File to write: .urdf, .gltf, or .glb (binary glTF); default: print the text."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -62,7 +61,6 @@ def export(
 
     found = form or "urdf"
     if output is not None:
-        check_folder("--output", output)
         if output.suffix not in SUFFIXES:
             raise CommandError(
                 f"--output {output}: unknown file type; name a .urdf, .gltf or .glb file"

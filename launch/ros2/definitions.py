@@ -1,7 +1,6 @@
-"""Generate the ROS 2 package `flexsheet_msgs`, whose message types equal those of flexsheet.
+"""Generate ROS 2 message types, in the package `flexsheet_msgs`, from those of flexsheet.
 
-A message type or a named group of fields becomes a ROS type of the same name. Fields are converted
-as follows:
+A message type or a group of fields becomes a ROS type of the same name. Fields become:
 
     bool, int, float, text              bool, int64, float64, string
     timestamp                           builtin_interfaces/Time
@@ -51,7 +50,7 @@ class Ros2Error(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class OwnField:
-    """A field of a generated ROS type: name, ROS type, and function that converts its values."""
+    """A field of a generated ROS type, with a function that converts its values."""
 
     name: str
     ros_type: str
@@ -118,7 +117,7 @@ def convert_fields(value: BaseModel, make: Make) -> dict[str, Any]:
 
 
 def _list_groups(kind: type[BaseModel]) -> list[type[BaseModel]]:
-    """Return the groups of fields to which the ROS type of a message or group refers by name."""
+    """Return the groups of fields that the ROS type of a message or group contains."""
     named = {one.ros_type.partition("[")[0] for one in list_fields(kind)}
     groups: list[type[BaseModel]] = []
 

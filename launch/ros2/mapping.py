@@ -1,8 +1,7 @@
 """Map topics of flexsheet to topics of ROS 2, for exported bags and for the live bridge.
 
-`VIEWS` lists the ROS topics with standard types, and `inputs.INPUTS` lists the topics that a ROS
-node may publish for flexsheet. In addition, each topic is published with all its fields as
-`flexsheet/TOPIC`. The module `definitions` generates the types of these topics.
+`VIEWS` lists the ROS topics with standard types. In addition, each topic is published with all
+fields except images as `flexsheet/TOPIC`, with a type that the module `definitions` generates.
 
 Children of the frame `world`: `object`, `camera_left`, `camera_right`, `projector`, `left_base`,
 `right_base`, `left_flange_measured`, `right_flange_measured`, `sheet`, `fingertip`. The measured
@@ -155,7 +154,7 @@ class View:
     """A ROS topic with a standard type that represents some fields of a message.
 
     message: type of the message. fields: names of the fields. name: name of the ROS topic without
-    its first slash; {topic} is replaced by the flexsheet topic. make: function that converts a
+    the first slash, in which {topic} represents the flexsheet topic. make: function that converts a
     message, or returns None if there is nothing to publish.
     """
 
@@ -518,7 +517,7 @@ VIEWS = (
 def list_ros_topics(topic: Topic) -> list[tuple[RosTopic, View | None]]:
     """Return the ROS topics for a flexsheet topic, with their views.
 
-    Topics with standard types come first. The last topic contains all fields, and its view is None.
+    Topics with standard types come first. The last topic contains all fields and has no view.
     """
     found: list[tuple[RosTopic, View | None]] = [
         (RosTopic("/" + view.name.format(topic=topic.name), view.ros_type, view.latched), view)
@@ -550,10 +549,10 @@ class Converter:
         shift_ns: int,
         wanted: Callable[[RosTopic], bool] = lambda _: True,
     ) -> Iterator[tuple[RosTopic, Any]]:
-        """Convert a message, and yield each resulting ROS message with its ROS topic.
+        """Convert a message, and yield pairs of a ROS topic and a ROS message.
 
         shift_ns: difference between the time since 1970 and the clock of the header. wanted:
-        function that returns whether a ROS topic needs a message.
+        function that returns whether messages of a ROS topic are needed.
         """
         match message:
             case Scene():
