@@ -104,4 +104,4 @@ def show(
     for row in rows:
         if row["nominal"] is None:
             row["nominal"] = "value in scene or node"
-    print_rows(rows, as_json=False)
+    print_rows(rows, as_json=False, digits=6)

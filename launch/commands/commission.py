@@ -212,11 +212,12 @@ def summarize(lab: Commissioning) -> dict[str, Any]:
         row = dict.fromkeys(("residual", "unit", "limit", "within_limit", "advice"))
         row |= {"uncertainty": {}, "missing": []}
         if (result := record.result) is not None:
-            row = result.model_dump(include={"residual", "unit", "limit", "uncertainty", "missing"})
+            shown = {"residual", "unit", "limit", "uncertainty", "missing"}
+            row = result.model_dump(mode="json", include=shown)
             row["within_limit"] = result.within_limit
             row["advice"] = None if result.within_limit else result.advice
-        given = record.model_dump(include={"name", "seconds", "cpu_seconds", "skipped_because"})
-        steps.append({**given, **row})
+        shown = {"name", "seconds", "cpu_seconds", "skipped_because"}
+        steps.append({**record.model_dump(mode="json", include=shown), **row})
     verified = lab.state.steps.get(StepName.VERIFICATION)
     found = None if verified is None or verified.result is None else verified.result.figures
     apparatus = lab.folder / APPARATUS_FILE

@@ -16,6 +16,7 @@ from flexsheet.launch.commands.output import (
     print_json,
     print_result,
     progress_words,
+    words,
 )
 
 
@@ -77,7 +78,8 @@ def compliance(
                 "normal offset, mm": ("normal_offset_mm", ".2f"),
             },
         )
-        figures = {name: value for name, value in result.items() if name != "rows"}
+        figures = {name: one for name, one in result.items() if name not in ("rows", "note")}
         print_result(figures, as_json=False)
+        words.print(result["note"] or "the error is within the tolerance")
     if result["note"]:
         raise typer.Exit(FAILED)

@@ -130,17 +130,19 @@ def print_columns(
     )
 
 
-def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
+def print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool, digits: int = 4) -> None:
     """Print rows with the same keys on stdout, as JSON or as a table.
 
-    In a table, None is shown as "-", and truth values as "yes" or "no".
+    In a table, None is shown as "-", and truth values as "yes" or "no". digits: number of
+    significant digits in a table.
     """
     if as_json:
         print_json(rows)
     elif rows:
         columns = dict.fromkeys(name for row in rows for name in _flatten(row))
         table = [_flatten(row) for row in rows]
-        print_table(list(columns), [[_show(row.get(name)) for name in columns] for row in table])
+        cells = [[_show(row.get(name), digits) for name in columns] for row in table]
+        print_table(list(columns), cells)
 
 
 def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -154,13 +156,13 @@ def _flatten(row: Mapping[str, Any]) -> dict[str, Any]:
     return flat
 
 
-def _show(value: Any) -> str:
+def _show(value: Any, digits: int) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.{digits}g}"
     if isinstance(value, list | tuple):
-        return ", ".join(map(_show, value))
+        return ", ".join(_show(one, digits) for one in value)
     return "-" if value is None else str(value)
 
 
@@ -185,7 +187,7 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
         print(f"{name:<{width}}  {value}".rstrip())
 
 
-SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (math.degrees(1.0), "°")}
+SHOWN_UNITS = {"m": (1e3, "mm"), "m/N": (1e6, "µm/N"), "rad": (math.degrees(1.0), "°")}
 """The factor and the unit of printed values, by SI unit; other units are not converted."""
 
 
@@ -200,18 +202,23 @@ def print_result(result: Mapping[str, Any], *, as_json: bool) -> None:
         print_fields(_list_values(replace_non_finite(result)))
 
 
-def _list_values(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield label and text of all values; the unit of a value is the suffix of its name."""
+def _list_values(
+    values: Mapping[str, Any], prefix: str = "", outer_unit: str = ""
+) -> Iterator[tuple[str, str]]:
+    """Yield label and text of all values.
+
+    The unit of a value is the suffix of its name, or `outer_unit` for a name without unit.
+    """
     for name, value in values.items():
-        found = (pair for pair in UNITS.items() if name.endswith(pair[0]))
-        suffix, unit = next(found, ("", ""))
-        factor, unit = SHOWN_UNITS.get(unit, (1.0, unit.removeprefix("1")))
-        label = name.removesuffix(suffix) if unit else name
-        label = prefix + (label.replace("_", " ") if label.isidentifier() else label)
+        suffix = next((one for one in UNITS if name.endswith(one)), "")
+        si_unit = UNITS.get(suffix, outer_unit)
+        label = name if si_unit == "1" else name.removesuffix(suffix)
+        label = prefix + (label.replace("_", " ") if name.isidentifier() else label)
         if isinstance(value, Mapping):
-            yield from _list_values(value, f"{prefix}{name.replace('_', ' ')} ")
+            yield from _list_values(value, f"{label} ", si_unit)
         elif value is not None:
-            yield label, f"{_show(_scale(value, factor))} {unit}".rstrip()
+            factor, unit = SHOWN_UNITS.get(si_unit, (1.0, si_unit.removeprefix("1")))
+            yield label, f"{_show(_scale(value, factor), 5)} {unit}".rstrip()
 
 
 def _scale(value: Any, factor: float) -> Any:
