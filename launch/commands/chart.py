@@ -18,6 +18,7 @@ from flexsheet.launch.commands.output import (
     print_json,
     print_table,
     progress_words,
+    shown,
     words,
 )
 from flexsheet.launch.methods.results import replace_non_finite
@@ -238,7 +239,7 @@ def _print_methods(result: dict[str, Any]) -> None:
             one["method"],
             format_duration(one["median_s"]),
             format_duration(one["p99_s"]),
-            *("-" if one[key] is None else f"{one[key]:.3g}" for key in ("error", "error_outside")),
+            *(shown(one[key]) for key in ("error", "error_outside")),
             f"{one['inside']} of {one['cases']}",
             "front" if one["front"] else "",
         )
@@ -258,7 +259,7 @@ def _print_points(result: dict[str, Any]) -> None:
             ", ".join(f"{key} {_short(value)}" for key, value in point["params"].items()),
             f"{point['median_s'] * 1e6:.1f}",
             f"{point['p99_s'] * 1e6:.1f}",
-            "-" if point["error"] is None else f"{point['error']:.4g}",
+            shown(point["error"], ".4g"),
             *(_short(point["extra_metrics"].get(name)) for name in extra_names),
             "yes" if point["in_range"] else "no",
             "front" if point["method"] in result["front"] else "",

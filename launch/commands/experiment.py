@@ -15,6 +15,7 @@ from flexsheet.launch.commands.output import (
     print_json,
     print_table,
     progress_words,
+    shown,
     words,
 )
 from flexsheet.launch.plans.features import Feature
@@ -444,10 +445,6 @@ def gestures(
 
 def _print_gestures(results: list[dict[str, Any]]) -> None:
     """Print a table of tracking errors (mm) and delays (ms), one line per gesture."""
-
-    def shown(value: float | None, form: str) -> str:
-        return "-" if value is None else format(value, form)
-
     columns = ["gesture", "valid", "missing", "error rms", "99 %", "max", "jump, σ", "lag, ms"]
     for each in results[0]["prediction"][1:]:
         columns += [f"+{each['horizon_ms']:.0f} ms rms", "lag, ms"]
@@ -469,19 +466,16 @@ def print_followed(results: list[dict[str, Any]]) -> None:
     Δd and Δθ are the distance and the angle between the true sheet and the true finger in contact.
     """
 
-    def shown(values: dict[str, float] | None) -> list[str]:
-        if values is None:
-            return ["-", "-", "-"]
-        return [f"{values[key]:.3f}" for key in ("mean", "p95", "max")]
-
     columns = ["path", "in contact", "followed", "drop-outs", "true Δd, mm: mean", "95 %", "max"]
     columns += ["true Δθ, °: mean", "95 %", "max"]
     rows = []
     for result in results:
         ratio, contact = result["following_ratio"], result["contact"]
         row = [result["path"], f"{result['contact_ratio']:.1%}"]
-        row += ["-" if ratio is None else f"{ratio:.1%}", str(result["drop_outs"])]
-        row += shown(contact["true_delta_d_mm"]) + shown(contact["true_delta_theta_deg"])
+        row += [shown(ratio, ".1%"), str(result["drop_outs"])]
+        for key in ("true_delta_d_mm", "true_delta_theta_deg"):
+            errors = contact[key] or dict.fromkeys(("mean", "p95", "max"))
+            row += [shown(errors[name], ".3f") for name in ("mean", "p95", "max")]
         rows.append(row)
     print_table(columns, rows)
 
@@ -508,19 +502,18 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 def _print_stroke_table(table: dict[str, Any]) -> None:
     """Print the mean errors of each variant over all strokes, with their 95 % intervals."""
 
-    def shown(found: dict[str, Any] | None) -> str:
-        if found is None:
-            return "-"
-        if found["interval"] is None:
-            return f"{found['mean']:.3f}"
+    def with_interval(found: dict[str, Any] | None) -> str:
+        if found is None or found["interval"] is None:
+            return shown(found and found["mean"], ".3f")
         return f"{found['mean']:.3f} ± {found['interval']:.3f}"
 
     columns = ["variant", "strokes", "Δd, mm", "Δθ, °", "true Δd, mm", "true Δθ, °"]
     keys = ("delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")
-    rows = [
-        [row["variant"], row["strokes"], *(shown(row[k]) for k in keys)] for row in table["rows"]
+    cells = [
+        [row["variant"], row["strokes"], *(with_interval(row[key]) for key in keys)]
+        for row in table["rows"]
     ]
-    print_table(columns, rows)
+    print_table(columns, cells)
     for row in table["rows"]:
         for error in row["failed"]:
             words.print(f"{row['variant']}: a stroke failed: {error}")

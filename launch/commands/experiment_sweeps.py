@@ -23,6 +23,7 @@ from flexsheet.launch.commands.output import (
     print_json,
     print_table,
     progress_words,
+    shown,
     words,
 )
 
@@ -98,14 +99,14 @@ def robustness(
     rows = [
         [
             row["seed"],
-            *(_shown(row[metric]) for metric in experiment.METRICS),
+            *(shown(row[metric]) for metric in experiment.METRICS),
             ", ".join(row["out_of_tolerance"]) or "-",
             ", ".join(row["flagged"]) or "-",
         ]
         for row in result["rows"]
     ]
     for statistic in ("median", "p95", "worst"):
-        values = [_shown(result["summary"][metric][statistic]) for metric in experiment.METRICS]
+        values = [shown(result["summary"][metric][statistic]) for metric in experiment.METRICS]
         rows.append([statistic, *values, "", ""])
     print_table(["seed", *experiment.METRICS, "out of tolerance", "flagged"], rows)
     if "commissioning" in result:
@@ -125,7 +126,7 @@ def _print_predictions(found: dict[str, Any]) -> None:
     print_table(
         ["report", *(case.replace("_", " ") for case in cases), "stated / true error, median"],
         [
-            [name, *(one[case] for case in cases), _shown(one["stated_over_true"]["median"])]
+            [name, *(one[case] for case in cases), shown(one["stated_over_true"]["median"])]
             for name, one in (every | found["predictions"]).items()
         ],
     )
@@ -192,7 +193,7 @@ def sensitivity(
     metrics = list(result["tolerances"])
     largest = {
         parameter: [
-            _shown(max((abs(row[one]) for row in rows if row[one] is not None), default=None))
+            shown(max((abs(row[one]) for row in rows if row[one] is not None), default=None))
             for one in metrics
         ]
         for parameter in (row["parameter"] for row in result["ranking"])
@@ -265,11 +266,7 @@ def follow(
     print_followed([result])
     bound = result["lower_bound_mm"]
     words.print(
-        f"lower bound of the error: mean {_shown(bound['mean'])} mm, 95 % {_shown(bound['p95'])} mm"
+        f"lower bound of the error: mean {shown(bound['mean'])} mm, 95 % {shown(bound['p95'])} mm"
     )
     if bag is not None:
         words.print(f"bag: {bag}")
-
-
-def _shown(value: Any) -> str:
-    return "-" if value is None else f"{value:.3g}"

@@ -114,6 +114,11 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Non
         print(f"\x1b[1m{line}\x1b[0m" if in_terminal and number == 0 else line)
 
 
+def shown(value: float | None, form: str = ".3g") -> str:
+    """Format a number; return "-" for None."""
+    return "-" if value is None else format(value, form)
+
+
 def print_columns(
     rows: Iterable[Mapping[str, Any]], columns: Mapping[str, tuple[str, str]]
 ) -> None:
@@ -123,10 +128,7 @@ def print_columns(
     """
     print_table(
         list(columns),
-        [
-            ["-" if row[key] is None else format(row[key], form) for key, form in columns.values()]
-            for row in rows
-        ],
+        [[shown(row[key], form) for key, form in columns.values()] for row in rows],
     )
 
 
