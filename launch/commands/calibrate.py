@@ -10,7 +10,7 @@ import math
 import shlex
 import sys
 from collections.abc import Mapping
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -373,6 +373,14 @@ def measure_distance_m(scene: Scene) -> float:
 def command_line() -> str:
     """Return the command line of this process, for the comment in a calibration file."""
     return shlex.join(["flexsheet", *sys.argv[1:]])
+
+
+def make_provenance() -> dict[str, Any]:
+    """Return the date and the code version for a calibration file."""
+    from importlib.metadata import version
+
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"date": now, "code_version": version("flexsheet")}
 
 
 def write_scene_values(scene_file: Path, values: Mapping[str, Any], copy: Path) -> None:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from datetime import UTC, datetime
-from importlib.metadata import version
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +21,7 @@ from flexsheet.launch.commands.calibrate import (
     command_line,
     load_optics,
     load_true_devices,
+    make_provenance,
     parse_board,
     pose_values,
     require_twin,
@@ -327,8 +327,7 @@ def make_calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> A
     from flexsheet.messages.arms_calibration import ArmsCalibration
 
     return ArmsCalibration(
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-        code_version=version("flexsheet"),
+        **make_provenance(),
         scene=scene.name,
         device=scene.camera.device,
         board=board,
@@ -363,17 +362,7 @@ def _make_arm_base(fit: BaseFit) -> ArmBase:
         corner_sigma_px=fit.corner_sigma_px,
         arm_sigma_m=fit.arm_sigma_m,
         arm_sigma_rad=fit.arm_sigma_rad,
-        poses=tuple(
-            ArmPoseFit(
-                name=one.name,
-                used=not one.reason,
-                reason=one.reason,
-                shift_m=one.shift_m,
-                rotation_rad=one.rotation_rad,
-                rms_px=one.rms_px,
-            )
-            for one in fit.residuals
-        ),
+        poses=tuple(ArmPoseFit(used=not one.reason, **asdict(one)) for one in fit.residuals),
     )
 
 
@@ -425,35 +414,24 @@ def _print_result(
         "scene": None if copy is None else str(copy),
         "arms": {},
     }
-    for side in SIDES:
-        base: ArmBase | None = getattr(measured, side)
-        if base is None:
-            continue
+    for side, without_board in blind.items():
+        base: ArmBase = getattr(measured, side)
         outliers = [(one.name, one.reason) for one in base.poses if not one.used]
         moved_m, turned_rad = _compute_shift(base, scene, side)
         result["arms"][side] = {
-            "world_from_base": base.world_from_base.model_dump(mode="json"),
-            "position_std_m": base.position_std_m,
-            "rotation_std_rad": base.rotation_std_rad,
+            **base.model_dump(mode="json", exclude={"flange_from_board", "covariance", "poses"}),
             "moved_from_scene_m": moved_m,
             "rotation_from_scene_rad": turned_rad,
             "poses_used": sum(one.used for one in base.poses),
-            "poses": len(base.poses) + len(blind[side]),
-            "left_out": dict([*blind[side], *outliers]),
-            "jackknife_ratio": base.jackknife_ratio,
-            "max_change_m": base.max_change_m,
-            "max_change_rad": base.max_change_rad,
-            "corner_sigma_px": base.corner_sigma_px,
-            "arm_sigma_m": base.arm_sigma_m,
-            "arm_sigma_rad": base.arm_sigma_rad,
+            "poses": len(base.poses) + len(without_board),
+            "left_out": dict([*without_board, *outliers]),
             **truth.get(side, {}),
         }
     print_result(result, as_json=as_json)
 
 
 def _compute_shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
-    """Return the distance (m) and angle (rad) between an arm's base poses in scene and
-    calibration."""
+    """Return the distance (m) and the angle (rad) of a calibrated base from that in the scene."""
     import numpy as np
 
     from flexsheet.nodes.models.rigid import pose_matrix, vector_from_rotation

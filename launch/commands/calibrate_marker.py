@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from flexsheet.launch.commands import options
-from flexsheet.launch.commands.calibrate import app, command_line, load_true_devices
+from flexsheet.launch.commands.calibrate import (
+    app,
+    command_line,
+    load_true_devices,
+    make_provenance,
+)
 from flexsheet.launch.commands.output import (
     CommandError,
     examples,
@@ -100,8 +103,7 @@ def make_calibration(touches: list[Touch], scene: Scene, source: str) -> MarkerC
     except MarkerFitError as error:
         raise CommandError(f"{source}: {error}; {error.remedy}") from error
     return MarkerCalibration(
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-        code_version=version("flexsheet"),
+        **make_provenance(),
         source=source,
         scene=scene.name,
         marker_from_pad_m=tuple(fit.marker_from_pad_m.tolist()),

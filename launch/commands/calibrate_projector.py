@@ -105,10 +105,7 @@ def projector(
     simulated.
     """
     from flexsheet.launch.calibration import gray_code
-    from flexsheet.launch.calibration.projector import (
-        calibrate_projector,
-        measure_points,
-    )
+    from flexsheet.launch.calibration.projector import calibrate_projector, measure_points
     from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
@@ -274,26 +271,17 @@ def _print_result(
         "coverage_ratio": fit.coverage_ratio,
         "depth_range_mm": 1e3 * fit.depth_range_m,
         "lens": lens.model_dump(),
-        "position_m": [float(value) for value in pose.position_m],
-        "rpy_rad": [float(value) for value in pose.rpy_rad],
+        **pose.model_dump(mode="json"),
     }
     if true is not None:
         result["eye_error_mm"] = _eye_errors_mm(scene, fit.projector, true)
-        result["make_true_projector"] = {
-            "width_px": true.width_px,
-            "height_px": true.height_px,
-            "lens": true.lens.model_dump(),
-            "world_from_projector": {
-                "position_m": true.world_from_projector.position_m.tolist(),
-                "rpy_rad": true.world_from_projector.rpy_rad.tolist(),
-            },
-        }
+        shown = {"width_px", "height_px", "lens", "world_from_projector"}
+        result["true_projector"] = true.model_dump(mode="json", include=shown)
     print_result(result, as_json=as_json)
 
 
 def _eye_errors_mm(scene: Scene, fitted: Projector, true: Projector) -> dict[str, dict[str, float]]:
-    """Return the mean and maximum image errors (mm) that the eye sees, before and after
-    calibration.
+    """Return mean and maximum image errors (mm) at the eye, before and after calibration.
 
     fitted: calibrated projector. true: simulated projector.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +12,7 @@ from flexsheet.launch.commands.calibrate import (
     app,
     command_line,
     load_true_devices,
+    make_provenance,
     require_twin,
 )
 from flexsheet.launch.commands.output import (
@@ -155,7 +155,6 @@ def make_calibration(
     SheetModelFitError if the pushes do not determine the parameters.
     """
     from functools import partial
-    from importlib.metadata import version
 
     from flexsheet.launch.calibration.sheet_fit import (
         estimate_hysteresis,
@@ -200,8 +199,7 @@ def make_calibration(
         )
     stretches = [push.edge_distance_m / scene.sheet.width_m for push in pushes]
     return SheetCalibration(
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-        code_version=version("flexsheet"),
+        **make_provenance(),
         source=source,
         nominal_width_m=scene.sheet.width_m,
         height_m=scene.sheet.height_m,
@@ -243,26 +241,13 @@ def simulate_pushes(
 
     with progress_bar("simulating pushes") as progress:
         return simulate_rows(
-            scene,
-            places=places,
-            noise_n=GAUGE_N,
-            seed=seed,
-            apparatus=apparatus,
-            progress=progress,
+            scene, places=places, noise_n=GAUGE_N, seed=seed, apparatus=apparatus, progress=progress
         )
 
 
 def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
-    fitted = {
-        name: getattr(calibration, name)
-        for name in (
-            "modulus_thickness_n_per_m",
-            "slack_width_m",
-            "cubic_ratio",
-            "mooney_ratio",
-            "hysteresis_ratio",
-        )
-    }
+    names = {"modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio"}
+    fitted = calibration.model_dump(include=names | {"mooney_ratio", "hysteresis_ratio"})
     excluded = {f"line {one.line}": one.residual_ratio for one in calibration.left_out}
     result = {
         "calibration": str(output),
@@ -272,6 +257,6 @@ def _print_result(calibration: SheetCalibration, output: Path, as_json: bool) ->
         "max_residual_ratio": calibration.max_residual_ratio,
         "residual_rms_sigmas": calibration.residual_rms_sigmas,
         "table": calibration.table is not None,
-        **{name: one.model_dump() for name, one in fitted.items() if one is not None},
+        **{name: one for name, one in fitted.items() if one is not None},
     }
     print_result(result, as_json=as_json)
