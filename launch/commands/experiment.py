@@ -55,7 +55,10 @@ MapOption = Annotated[
 
 
 def make_result_folder(output: Path | None, name: str) -> Path:
-    """Create and return the folder `output`, or a new folder runs/...-`name` if it is None."""
+    """Create a folder for results, and return its path.
+
+    output: path of the folder; None for a new folder in runs/ whose name contains `name`.
+    """
     from flexsheet.launch.experiments.run import new_folder
 
     if output is None:
@@ -123,8 +126,8 @@ def stroke(
 ) -> None:
     """Simulate a finger that strokes a cylinder over 60 degrees, and measure the sheet's errors.
 
-    This is the experiment of Furukawa et al. 2007, section V and Table I. To continue a command
-    with several strokes or variants that was interrupted, repeat it with the same --output.
+    Furukawa et al. 2007 describe this experiment in section V and Table I. To continue an
+    interrupted command with several strokes or variants, repeat it with the same --output.
     """
     given = options.with_scene(settings, scene)
     if radii and scene is not None:

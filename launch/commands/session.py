@@ -58,7 +58,7 @@ NodeArgument = Annotated[
 def status(run: options.RunOption = None, as_json: options.JsonOption = False) -> None:
     """Show the nodes of the running graph with their message rates, lost messages and notes.
 
-    Skipped messages are older messages that a slow reader does not read. Lost messages were lost in
+    Skipped messages are older messages that a slow node does not read. Lost messages were lost in
     transit or refused.
 
     The command also prints the problems that the self-checks of the nodes suspect. The exit code is

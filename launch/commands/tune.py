@@ -81,11 +81,11 @@ def tune(
 ) -> None:
     """Choose the fastest methods that meet the tolerances of a scene, and write them to the scene.
 
-    The command measures each method family on this computer over the working range of the scene,
-    which takes seconds to minutes. It then predicts the errors of combined methods, and tests the
-    fastest promising configuration in a graph. It accepts a configuration that meets all
-    tolerances, including those of latency and force. With --family, it chooses only the methods of
-    these method families, each separately. Nodes use the chosen method if their parameter is
+    The command measures each method family on this computer over the working range of the scene.
+    This takes seconds to minutes. Then the command predicts the errors of combined methods, and
+    tests the fastest promising configuration in a graph. An accepted configuration meets all
+    tolerances, including those of latency and force. With --family, the command chooses only the
+    methods of these families, each separately. Nodes use the chosen method if their parameter is
     `auto`. The exit code is 3 if a tolerance is not met.
     """
     logs_on_stderr()
