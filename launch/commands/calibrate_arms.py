@@ -368,7 +368,7 @@ def _make_arm_base(fit: BaseFit) -> ArmBase:
 
 def list_scene_values(measured: ArmsCalibration) -> dict[str, Any]:
     """Return the calibrated poses of the arm bases, by their dotted paths in a scene file."""
-    values = {}
+    values: dict[str, Any] = {}
     for side, base in (("left", measured.left), ("right", measured.right)):
         if base is not None:
             values |= pose_values(f"arms.{side}.world_from_base", base.world_from_base)

@@ -129,7 +129,7 @@ def commission(
     them and stops with exit code 1.
     """
     from flexsheet.launch.calibration.commission import MissingDataError, StepName
-    from flexsheet.launch.commands.calibrate import FOUR_BITS, _parse_board
+    from flexsheet.launch.commands.calibrate import FOUR_BITS, parse_board
     from flexsheet.launch.commands.commission_steps import open_laboratory
 
     given = {name: Path(path) for name, path in _parse_pairs("--data", data).items()}
@@ -153,8 +153,8 @@ def commission(
         data=given,
         finger_radius_m=None if finger_radius_mm is None else 1e-3 * finger_radius_mm,
         sheet_kg_per_m2=sheet_kg_per_m2,
-        board=_parse_board(board, square_mm, None, FOUR_BITS),
-        flange_board=_parse_board(flange_board, flange_square_mm, None, FOUR_BITS),
+        board=parse_board(board, square_mm, None, FOUR_BITS),
+        flange_board=parse_board(flange_board, flange_square_mm, None, FOUR_BITS),
         seconds=duration,
         seed=seed,
     )

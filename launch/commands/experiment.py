@@ -506,8 +506,10 @@ def _print_stroke_table(table: dict[str, Any]) -> None:
     """Print the mean errors of each variant over all strokes, with their 95 % intervals."""
 
     def with_interval(found: dict[str, Any] | None) -> str:
-        if found is None or found["interval"] is None:
-            return shown(found and found["mean"], ".3f")
+        if found is None:
+            return "-"
+        if found["interval"] is None:
+            return f"{found['mean']:.3f}"
         return f"{found['mean']:.3f} ± {found['interval']:.3f}"
 
     columns = ["variant", "strokes", "Δd, mm", "Δθ, °", "true Δd, mm", "true Δθ, °"]

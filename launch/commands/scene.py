@@ -59,7 +59,7 @@ def export(
     from flexsheet.launch.viewing.urdf import make_urdf
     from flexsheet.messages.files import write_file
 
-    found = form or "urdf"
+    found: str = form or "urdf"
     if output is not None:
         if output.suffix not in SUFFIXES:
             raise CommandError(
